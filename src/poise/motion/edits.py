@@ -1,0 +1,49 @@
+"""Clips made from clips: another rate, a part, a shift. None changes its argument."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.spatial import slerp
+
+
+def resample(clip: Clip, fps: float) -> Clip:
+    """The clip at another frame rate: positions linear, rotations by slerp, the duration kept.
+
+    The last sample falls on or before the clip's last frame (within a thousandth of a frame).
+    """
+    if not (np.isfinite(fps) and fps > 0):
+        raise PoiseError(f"the frame rate must be above 0, got {fps}", clip.name)
+    count = int(np.floor(clip.seconds * fps + 1e-3)) + 1
+    if count < 2:
+        raise PoiseError(
+            f"the clip lasts {clip.seconds:.3f} s, less than one frame at {fps:g} fps", clip.name
+        )
+    at = np.minimum(np.arange(count) / fps * clip.fps, clip.frames - 1)
+    low = np.minimum(np.floor(at + 1e-9).astype(int), clip.frames - 2)
+    t = np.clip(at - low, 0.0, 1.0)
+    root_pos = clip.root_pos[low] * (1 - t[:, None]) + clip.root_pos[low + 1] * t[:, None]
+    rot = slerp(
+        torch.tensor(clip.rot[low]),
+        torch.tensor(clip.rot[low + 1]),
+        torch.tensor(t)[:, None].expand(-1, len(clip.skeleton)),
+    ).numpy()
+    return clip.replaced(root_pos=root_pos, rot=rot, fps=float(fps))
+
+
+def trim(clip: Clip, start: int, stop: int | None = None) -> Clip:
+    """Frames `start` up to but not including `stop`."""
+    return clip.replaced(root_pos=clip.root_pos[start:stop], rot=clip.rot[start:stop], cyclic=False)
+
+
+def shifted(clip: Clip, offset: np.ndarray | tuple[float, float, float]) -> Clip:
+    """The clip moved by `offset` m, one vector `(3,)` or one per frame `(T, 3)`."""
+    return clip.replaced(root_pos=clip.root_pos + np.asarray(offset, dtype=float))
+
+
+def ground_shift(clip: Clip, height: float) -> Clip:
+    """The clip lifted by `height` m along +Z."""
+    return shifted(clip, (0.0, 0.0, height))

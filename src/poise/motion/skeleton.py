@@ -1,0 +1,137 @@
+"""A tree of joints, and what must be remembered to write it back as it came."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from poise.errors import PoiseError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The channels of one joint as its file lists them, in the file's own frame and names.
+
+    order: e.g. ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
+        for BVH, ("rx", "rz") for ASF degrees of freedom.
+    axis: Euler angles in radians and their order ("XYZ") of the joint's own axes relative to the
+        world in the rest pose (ASF `axis`); None where the axes are the parent's.
+    limits: (low, high) in radians per rotation channel, where the file states them.
+    """
+
+    order: tuple[str, ...] = ()
+    axis: tuple[float, float, float] | None = None
+    axis_order: str = "XYZ"
+    limits: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a skeleton came from: enough to write the same hierarchy, names, order and unit.
+
+    format: "bvh", "asf-amc", "deepmimic", or "poise" for one made in code.
+    unit_m: metres in one file unit. up_axis: "Y" or "Z", the file's vertical.
+    channels: one `Channel` per joint. notes: what was guessed or repaired, one sentence each.
+    frame_time: seconds per frame exactly as the file states it.
+    travel_joint: the joint whose position channels carry the travel (Bandai: "Hips", not the root).
+    """
+
+    format: str = "poise"
+    path: str | None = None
+    unit_m: float = 1.0
+    up_axis: str = "Z"
+    channels: tuple[Channel, ...] = ()
+    frame_time: float | None = None
+    travel_joint: str | None = None
+    notes: tuple[str, ...] = ()
+    extra: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Joint names, parents and rest offsets; metres, Z up, right-handed.
+
+    names: `J` unique joint names; the root is joint 0 and parents come before children.
+    parents: index of each joint's parent, -1 for the root.
+    offsets: `(J, 3)` m, each joint's place in its parent's frame; with every local rotation at
+        identity the skeleton stands in its rest pose in the world's axes. Row 0 is zero.
+    ends: `(joint index, (x, y, z) m)` bone tips ("End Site") in the joint's frame.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: np.ndarray
+    ends: tuple[tuple[int, tuple[float, float, float]], ...] = ()
+    source: Source = field(default_factory=Source)
+
+    def __post_init__(self) -> None:
+        offsets = np.array(self.offsets, dtype=np.float64)
+        offsets.flags.writeable = False
+        object.__setattr__(self, "offsets", offsets)
+        count = len(self.names)
+        if len(self.parents) != count or offsets.shape != (count, 3):
+            raise PoiseError(
+                f"a skeleton needs one parent and one offset per joint, got {count} names, "
+                f"{len(self.parents)} parents and offsets of shape {offsets.shape}"
+            )
+        if count == 0:
+            raise PoiseError("a skeleton needs at least one joint")
+        seen: set[str] = set()
+        for name in self.names:
+            if name in seen:
+                raise PoiseError(f"joint name '{name}' appears twice")
+            seen.add(name)
+        for j, parent in enumerate(self.parents):
+            if (j == 0) != (parent == -1) or parent >= j:
+                raise PoiseError(
+                    f"joint '{self.names[j]}' has parent index {parent}; the first joint must be "
+                    "the only root and parents must come before children"
+                )
+        if not np.isfinite(offsets).all():
+            bad = self.names[int(np.argwhere(~np.isfinite(offsets))[0][0])]
+            raise PoiseError(f"joint '{bad}' has an offset that is not finite")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Skeleton)
+            and self.names == other.names
+            and self.parents == other.parents
+            and np.array_equal(self.offsets, other.offsets)
+            and self.ends == other.ends
+            and self.source == other.source
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.names, self.parents, self.offsets.tobytes()))
+
+    def index(self, name: str) -> int:
+        """The index of joint `name`; an unknown name is answered with the nearest one."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise PoiseError(f"there is no joint '{name}'. {did_you_mean(name, self.names)}") from None
+
+    def children(self, joint: int) -> tuple[int, ...]:
+        """Indices of the joints whose parent is `joint`."""
+        return tuple(j for j, p in enumerate(self.parents) if p == joint)
+
+    def rest_positions(self) -> np.ndarray:
+        """`(J, 3)` m, joint positions with every rotation at identity and the root at the origin."""
+        out = np.zeros((len(self), 3))
+        for j, parent in enumerate(self.parents):
+            if parent >= 0:
+                out[j] = out[parent] + self.offsets[j]
+        return out
+
+    def end_positions(self) -> np.ndarray:
+        """`(E, 3)` m, rest positions of the bone tips in `ends`."""
+        rest = self.rest_positions()
+        return np.array([rest[j] + np.array(v) for j, v in self.ends]).reshape(-1, 3)
+
+    def with_source(self, **changes: object) -> Skeleton:
+        """The same skeleton with fields of its `Source` replaced."""
+        return replace(self, source=replace(self.source, **changes))  # type: ignore[arg-type]

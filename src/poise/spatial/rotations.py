@@ -1,0 +1,197 @@
+"""Unit quaternions in wxyz order that rotate local vectors into the parent frame.
+
+Every function takes tensors with any leading batch dimensions and is free of side effects.
+Angles are radians. Products read right to left: `quat_mul(a, b)` applies `b` first.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def normalize(q: Tensor) -> Tensor:
+    """Quaternions or vectors `(..., n)` scaled to unit length (zero stays zero)."""
+    return q / q.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+def quat_mul(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product `(..., 4)`: the rotation `b` followed by `a`."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        -1,
+    )
+
+
+def quat_conj(q: Tensor) -> Tensor:
+    """The inverse of unit quaternions `(..., 4)`."""
+    return torch.cat((q[..., :1], -q[..., 1:]), -1)
+
+
+def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Vectors `v (..., 3)` of the local frame expressed in the parent frame."""
+    # v' = v + 2 w (u x v) + 2 u x (u x v)
+    u = q[..., 1:]
+    t = 2.0 * torch.linalg.cross(u, v)
+    return v + q[..., :1] * t + torch.linalg.cross(u, t)
+
+
+def quat_rotate_inv(q: Tensor, v: Tensor) -> Tensor:
+    """Vectors `v (..., 3)` of the parent frame expressed in the local frame."""
+    u = -q[..., 1:]
+    t = 2.0 * torch.linalg.cross(u, v)
+    return v + q[..., :1] * t + torch.linalg.cross(u, t)
+
+
+def quat_angle(q: Tensor) -> Tensor:
+    """Rotation angle `(...)` of unit quaternions in `[0, pi]`, sign-blind."""
+    return 2.0 * torch.atan2(q[..., 1:].norm(dim=-1), q[..., 0].abs())
+
+
+def axis_angle_to_quat(axis: Tensor, angle: Tensor) -> Tensor:
+    """Quaternions for turns by `angle (...)` about unit `axis (..., 3)`."""
+    half = 0.5 * angle.unsqueeze(-1)
+    return torch.cat((half.cos(), axis * half.sin()), -1)
+
+
+def rotvec_to_quat(v: Tensor) -> Tensor:
+    """Exponential map: rotation vectors `(..., 3)` to quaternions."""
+    angle = v.norm(dim=-1, keepdim=True)
+    # sin(a/2)/a, by its series near zero so that the map stays smooth
+    small = angle < 1e-6
+    safe = torch.where(small, torch.ones_like(angle), angle)
+    s = torch.where(small, 0.5 - angle**2 / 48.0, (0.5 * safe).sin() / safe)
+    return torch.cat(((0.5 * angle).cos(), v * s), -1)
+
+
+def quat_to_rotvec(q: Tensor) -> Tensor:
+    """Logarithm: the shortest rotation vectors `(..., 3)` of unit quaternions, length in `[0, pi]`."""
+    q = torch.where(q[..., :1] < 0, -q, q)
+    s = q[..., 1:].norm(dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(s, q[..., :1])
+    small = s < 1e-9
+    k = torch.where(small, torch.full_like(s, 2.0), angle / torch.where(small, torch.ones_like(s), s))
+    return q[..., 1:] * k
+
+
+def quat_to_matrix(q: Tensor) -> Tensor:
+    """Rotation matrices `(..., 3, 3)` whose columns are the local axes in the parent frame."""
+    w, x, y, z = q.unbind(-1)
+    rows = (
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
+        torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
+        torch.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
+    )
+    return torch.stack(rows, -2)
+
+
+def matrix_to_quat(m: Tensor) -> Tensor:
+    """Unit quaternions of rotation matrices `(..., 3, 3)`, by the largest of four pivots."""
+    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    sq = torch.stack(
+        (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22), -1
+    ).clamp_min(0)
+    a = m[..., 2, 1] - m[..., 1, 2]
+    b = m[..., 0, 2] - m[..., 2, 0]
+    c = m[..., 1, 0] - m[..., 0, 1]
+    d = m[..., 1, 0] + m[..., 0, 1]
+    e = m[..., 0, 2] + m[..., 2, 0]
+    f = m[..., 2, 1] + m[..., 1, 2]
+    w, x, y, z = sq.unbind(-1)
+    candidates = torch.stack(
+        (
+            torch.stack((w, a, b, c), -1),
+            torch.stack((a, x, d, e), -1),
+            torch.stack((b, d, y, f), -1),
+            torch.stack((c, e, f, z), -1),
+        ),
+        -2,
+    )
+    best = sq.argmax(-1)[..., None, None].expand(*sq.shape[:-1], 1, 4)
+    return normalize(candidates.gather(-2, best).squeeze(-2))
+
+
+def euler_to_quat(angles: Tensor, order: str) -> Tensor:
+    """Intrinsic Euler angles `(..., len(order))` to quaternions: "ZXY" is `Rz @ Rx @ Ry`."""
+    q = None
+    for i, letter in enumerate(order.upper()):
+        half = 0.5 * angles[..., i]
+        turn = torch.zeros(*half.shape, 4, dtype=angles.dtype, device=angles.device)
+        turn[..., 0] = half.cos()
+        turn[..., 1 + "XYZ".index(letter)] = half.sin()
+        q = turn if q is None else quat_mul(q, turn)
+    if q is None:
+        q = torch.zeros(*angles.shape[:-1], 4, dtype=angles.dtype, device=angles.device)
+        q[..., 0] = 1.0
+    return q
+
+
+def quat_to_euler(q: Tensor, order: str) -> Tensor:
+    """Intrinsic Euler angles `(..., 3)` of unit quaternions for an order of three different axes.
+
+    The middle angle lies in `[-pi/2, pi/2]`. At gimbal lock (middle angle +-pi/2) the third
+    angle is set to zero and the first takes the whole turn.
+    """
+    i, j, k = ("XYZ".index(c) for c in order.upper())
+    if len({i, j, k}) != 3:
+        raise ValueError(f"order must name three different axes, got '{order}'")
+    s = 1.0 if (j - i) % 3 == 1 else -1.0
+    m = quat_to_matrix(q)
+    # R = Ri(a) Rj(b) Rk(c):  R[i,k] = s sin b,  R[i,i] = cos b cos c,  R[j,k] = -s sin a cos b
+    sin_b = (s * m[..., i, k]).clamp(-1.0, 1.0)
+    cos_b = torch.hypot(m[..., i, i], m[..., i, j])
+    locked = cos_b < 1e-7
+    b = torch.atan2(sin_b, cos_b)
+    a = torch.where(
+        locked,
+        torch.atan2(s * m[..., k, j], m[..., j, j]),
+        torch.atan2(-s * m[..., j, k], m[..., k, k]),
+    )
+    c = torch.where(locked, torch.zeros_like(a), torch.atan2(-s * m[..., i, j], m[..., i, i]))
+    return torch.stack((a, b, c), -1)
+
+
+def slerp(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
+    """Shortest-arc interpolation from `a` to `b (..., 4)` at `t (...)` in `[0, 1]`."""
+    dot = (a * b).sum(-1, keepdim=True)
+    b = torch.where(dot < 0, -b, b)
+    dot = dot.abs().clamp(max=1.0)
+    theta = torch.acos(dot)
+    sin = theta.sin()
+    t = t.unsqueeze(-1)
+    near = sin < 1e-6
+    safe = torch.where(near, torch.ones_like(sin), sin)
+    wa = torch.where(near, 1 - t, ((1 - t) * theta).sin() / safe)
+    wb = torch.where(near, t, (t * theta).sin() / safe)
+    return normalize(wa * a + wb * b)
+
+
+def heading_quat(q: Tensor) -> Tensor:
+    """The turn about +Z that best matches `q`: its twist about Z (swing removed)."""
+    zero = torch.zeros_like(q[..., 0])
+    twist = torch.stack((q[..., 0], zero, zero, q[..., 3]), -1)
+    n = twist.norm(dim=-1, keepdim=True)
+    identity = torch.zeros_like(twist)
+    identity[..., 0] = 1.0
+    return torch.where(n < 1e-8, identity, twist / n.clamp_min(1e-8))
+
+
+def quat_to_sixd(q: Tensor) -> Tensor:
+    """The first two columns of the rotation matrix, `(..., 6)` (Zhou et al. 2019)."""
+    m = quat_to_matrix(q)
+    return torch.cat((m[..., :, 0], m[..., :, 1]), -1)
+
+
+def unwrap_quats(q: Tensor) -> Tensor:
+    """Signs chosen so that consecutive quaternions along dim 0 lie in one hemisphere."""
+    dots = (q[1:] * q[:-1]).sum(-1)
+    flips = torch.where(dots < 0, -1.0, 1.0).to(q.dtype).cumprod(0)
+    return torch.cat((q[:1], q[1:] * flips.unsqueeze(-1)), 0)

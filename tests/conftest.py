@@ -1,0 +1,34 @@
+"""Shared fixtures: the real clips, where they are present."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+
+def _find_data() -> Path | None:
+    """The unpacked clips: $POISE_DATA, the cache, or `../shared/data/unpack` beside the checkout."""
+    for folder in (os.environ.get("POISE_DATA"), Path.home() / ".cache/poise/data"):
+        if folder and (Path(folder) / "INDEX.tsv").exists():
+            return Path(folder)
+    unpack = Path(__file__).resolve().parents[2] / "shared/data/unpack"
+    if unpack.exists():
+        done = subprocess.run(["bash", str(unpack)], capture_output=True, text=True, check=False)
+        if done.returncode == 0 and done.stdout.strip():
+            return Path(done.stdout.strip().splitlines()[-1])
+    return None
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real clips; the test is skipped when it is absent."""
+    found = _find_data()
+    if found is None:
+        pytest.skip("the real clips are not on this machine")
+    return found
