@@ -2,6 +2,8 @@
 
 from poise.motion.clip import Clip
 from poise.motion.edits import ground_shift, resample, shifted, trim
+from poise.motion.info import describe, standing_height
+from poise.motion.io import read_clip, write_bvh, write_clip
 from poise.motion.library import ClipLibrary
 from poise.motion.skeleton import Channel, Skeleton, Source
 
@@ -11,8 +13,13 @@ __all__ = [
     "ClipLibrary",
     "Skeleton",
     "Source",
+    "describe",
     "ground_shift",
+    "read_clip",
     "resample",
     "shifted",
+    "standing_height",
     "trim",
+    "write_bvh",
+    "write_clip",
 ]

@@ -1,0 +1,6 @@
+"""Motion files: BVH (read and write), ASF/AMC, DeepMimic; all conversion to metres and Z up."""
+
+from poise.motion.io.bvh_write import write_bvh
+from poise.motion.io.formats import READERS, WRITERS, read_clip, write_clip
+
+__all__ = ["READERS", "WRITERS", "read_clip", "write_bvh", "write_clip"]

@@ -1,0 +1,20 @@
+"""From a skeleton to a MuJoCo humanoid: parts, parameters, model."""
+
+from poise.body.generate import BodyConfig, generate_table
+from poise.body.humanoid import Humanoid, make_humanoid, make_spec
+from poise.body.parts import Anatomy, Part, find_anatomy
+from poise.body.table import BodyRow, BodyTable, Geom
+
+__all__ = [
+    "Anatomy",
+    "BodyConfig",
+    "BodyRow",
+    "BodyTable",
+    "Geom",
+    "Humanoid",
+    "Part",
+    "find_anatomy",
+    "generate_table",
+    "make_humanoid",
+    "make_spec",
+]

@@ -1,0 +1,131 @@
+"""A table of bodies becomes a MuJoCo model, through `MjSpec`."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from poise.body.table import BodyTable
+from poise.motion import Skeleton
+
+_GEOMS = {
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Humanoid:
+    """A skeleton with a body.
+
+    table: the parameters; row i is MuJoCo body `i + 1`. model: compiled, with a floor at z = 0, a
+    free root and one position actuator per hinge (`ctrl` is its target angle in rad).
+    """
+
+    skeleton: Skeleton
+    table: BodyTable
+    model: mujoco.MjModel
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Body names in the model's order, without the world."""
+        return tuple(r.name for r in self.table.rows)
+
+    @property
+    def hinges(self) -> tuple[str, ...]:
+        """Hinge names in the order of `qpos[7:]`, `qvel[6:]` and `ctrl`."""
+        return tuple(name for r in self.table.rows for name in r.hinge_names())
+
+    @property
+    def mass(self) -> float:
+        """Total mass, kg."""
+        return self.table.mass
+
+    def rows_of(self, *kinds: str) -> tuple[int, ...]:
+        """Row indices of the parts of the given kinds."""
+        return tuple(i for i, r in enumerate(self.table.rows) if r.kind in kinds)
+
+    @property
+    def feet(self) -> tuple[int, ...]:
+        """Row indices of the feet, left first."""
+        rows = self.table.rows
+        return tuple(sorted(self.rows_of("foot"), key=lambda i: rows[i].side))
+
+    @property
+    def end_effectors(self) -> tuple[int, ...]:
+        """Rows of feet, hands and head (the last neck where there is no head): the paper's five."""
+        head = self.rows_of("head") or self.rows_of("neck")[-1:]
+        return (*self.rows_of("foot"), *self.rows_of("hand"), *head)
+
+    @property
+    def identity(self) -> str:
+        """A short hash of names, hinges and sizes: checkpoints carry it and refuse another body."""
+        text = repr([(r.name, r.order, r.parent, np.round(r.pos, 6).tolist()) for r in self.table.rows])
+        text += f"{self.mass:.3f}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def make_spec(table: BodyTable) -> mujoco.MjSpec:
+    """The `MjSpec` of a humanoid on a floor; damping sits in the joints, the torque limit on the
+    actuator's proportional part alone (so that saturation never removes damping)."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "poise"
+    spec.compiler.degree = False
+    spec.compiler.autolimits = True
+    floor = spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], condim=3
+    )
+    floor.friction = [table.friction, 0.1, 0.1]
+    made: list[mujoco.MjsBody] = []
+    for row in table.rows:
+        parent = spec.worldbody if row.parent < 0 else made[row.parent]
+        body = parent.add_body(name=row.name, pos=list(row.pos), quat=list(row.quat))
+        made.append(body)
+        if row.parent < 0:
+            body.add_freejoint(name="root")
+        turn = np.zeros((3, 3))
+        mujoco.mju_quat2Mat(turn.reshape(-1), np.array(row.frame))
+        for letter, name, limits in zip(row.order, row.hinge_names(), row.ranges, strict=True):
+            body.add_joint(
+                name=name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=turn[:, "XYZ".index(letter)].tolist(),
+                range=list(limits),
+                armature=row.armature,
+                damping=[row.kd, 0.0, 0.0],
+            )
+        for i, geom in enumerate(row.geoms):
+            body.add_geom(
+                name=f"{row.name}_{i}" if i else row.name,
+                type=_GEOMS[geom.kind],
+                size=list(geom.size),
+                pos=list(geom.pos),
+                quat=list(geom.quat),
+                mass=row.mass / len(row.geoms),
+                condim=1,
+                friction=[table.friction, 0.1, 0.1],
+            )
+    for a, b in table.contact_exclusions:
+        spec.add_exclude(bodyname1=a, bodyname2=b)
+    for row in table.rows:
+        for name in row.hinge_names():
+            actuator = spec.add_actuator(
+                name=name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=name,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                forcerange=[-row.torque, row.torque],
+            )
+            actuator.gainprm[0] = row.kp
+            actuator.biasprm[1] = -row.kp
+    return spec
+
+
+def make_humanoid(skeleton: Skeleton, table: BodyTable) -> Humanoid:
+    """Compiles a table into a model."""
+    return Humanoid(skeleton, table, make_spec(table).compile())

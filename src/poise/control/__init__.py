@@ -1,0 +1,15 @@
+"""Control laws: what turns a state and an action into a `Drive`."""
+
+from poise.control.drive import Drive
+from poise.control.pd import PDTargets, stable_pd_torque
+from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
+
+__all__ = [
+    "Drive",
+    "ExplicitResidual",
+    "ImplicitResidual",
+    "PDTargets",
+    "Residual",
+    "Wrench",
+    "stable_pd_torque",
+]

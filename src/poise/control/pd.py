@@ -1,0 +1,66 @@
+"""Joint targets for the position actuators, and the paper's stable PD as a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.control.drive import Drive
+from poise.errors import PoiseError
+
+
+@dataclass(frozen=True)
+class PDTargets:
+    """Actions become target angles `u` of the PD servos (RFC Eq. 1).
+
+    mode: "additive" u = q_ref + scale * a (RFC Sec. 5, the reference of the NEXT frame);
+        "absolute" u = offset + scale * a (RFC Sec. 3).
+    scale: rad per unit of action. offset: `(n)` rad, used by "absolute" only (zeros if None).
+    """
+
+    mode: str = "additive"
+    scale: float = 1.0
+    offset: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("additive", "absolute"):
+            raise PoiseError(f"the action must be additive or absolute, got '{self.mode}'")
+
+    def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
+        """Add the targets for `action (N, n)` to `drive.ctrl`."""
+        base = q_ref_next if self.mode == "additive" else self.offset
+        target = action * self.scale
+        drive.ctrl.add_(target if base is None else target + base)
+
+
+def stable_pd_torque(
+    mass: Tensor,
+    bias: Tensor,
+    kp: Tensor,
+    kd: Tensor,
+    q: Tensor,
+    qvel: Tensor,
+    target: Tensor,
+    dt: float,
+    limit: Tensor,
+) -> Tensor:
+    """Torques `(..., n)` of a stable PD controller (Tan et al. 2011), as in the paper at 450 Hz.
+
+        tau = -Kp (q + dt q' - u) - Kd (q' + dt q'')
+        (M + Kd dt) q'' = -C - Kp (q + dt q' - u) - Kd q'
+
+    Args:
+        mass: `(..., nv, nv)` joint-space inertia M with a six-dimensional root first.
+        bias: `(..., nv)` Coriolis, centrifugal and gravity forces C.
+        kp, kd: `(n)` gains. q: `(..., n)` hinge angles. qvel: `(..., nv)`. target: `(..., n)` rad.
+        dt: physics step in s. limit: `(n)` N m, torques are clipped after the implicit solve.
+    """
+    n, nv = kp.shape[-1], qvel.shape[-1]
+    zeros = qvel.new_zeros(*qvel.shape[:-1], nv - n)
+    p = torch.cat((zeros, kp * (q + dt * qvel[..., nv - n :] - target)), -1)
+    d = torch.cat((qvel.new_zeros(nv - n), kd.expand(n)), -1)
+    acc = torch.linalg.solve(mass + torch.diag(d * dt), -bias - p - d * qvel)
+    tau = -p - d * (qvel + dt * acc)
+    return torch.maximum(torch.minimum(tau[..., nv - n :], limit), -limit)

@@ -1,0 +1,146 @@
+"""Residual forces (Yuan and Kitani 2020): the help that a policy may ask for, within a limit.
+
+Both kinds turn a residual action into forces on a `Drive` and report what they applied, so that every
+newton can be audited. The limits bound norms: the sum over bodies of the force never exceeds
+`limit_n`, that of the torque never `limit_nm`; zero switches the help off altogether.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from poise.control.drive import Drive
+from poise.errors import PoiseError
+from poise.spatial import heading_quat, quat_rotate
+
+
+class Wrench(NamedTuple):
+    """What was applied. M bodies (one for the implicit form).
+
+    force `(N, M, 3)` N and torque `(N, M, 3)` N m in world axes, at `point (N, M, 3)` m, world.
+    body: `M` rows of the humanoid's table.
+    """
+
+    force: Tensor
+    torque: Tensor
+    point: Tensor
+    body: tuple[int, ...]
+
+
+class Residual(Protocol):
+    """A kind of residual force."""
+
+    limit_n: float
+    limit_nm: float
+
+    @property
+    def dims(self) -> int:
+        """Length of the residual action."""
+        ...
+
+    def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
+        """Add the residual forces of `action (N, dims)` to `drive`; body arrays are MuJoCo's."""
+        ...
+
+    def regularizer(self, action: Tensor) -> Tensor:
+        """r_reg `(N,)` of the unscaled action, in (0, 1]; 1 without help."""
+        ...
+
+
+def _check_limits(limit_n: float, limit_nm: float) -> None:
+    for name, value in (("force", limit_n), ("torque", limit_nm)):
+        if not 0.0 <= value < float("inf"):
+            raise PoiseError(f"the residual {name} limit must be at least 0, got {value}")
+
+
+def _capped(vectors: Tensor) -> Tensor:
+    """Vectors `(N, M, 3)` scaled down where the sum over M of their norms exceeds 1."""
+    total = vectors.norm(dim=-1).sum(-1)
+    return vectors / total.clamp_min(1.0)[:, None, None]
+
+
+@dataclass(frozen=True)
+class ImplicitResidual:
+    """RFC-Implicit: a wrench on the root's six degrees of freedom (paper Eqs. 4 and 5).
+
+    Action (6): force in the root's heading frame and torque in the root's own frame, in units of
+    the limits; held over the control step.
+    limit_n: N. limit_nm: N m. k_r: weight in the regularizer exp(-k_r |a|^2).
+    """
+
+    limit_n: float = 100.0
+    limit_nm: float = 100.0
+    k_r: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_limits(self.limit_n, self.limit_nm)
+
+    @property
+    def dims(self) -> int:
+        """Six numbers: force, torque."""
+        return 6
+
+    def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
+        """Adds the root's generalized force eta_r; body row 0 is the root (MuJoCo body 1)."""
+        root = xquat[:, 1].to(action.dtype)
+        unit = action.reshape(-1, 2, 3)
+        force = quat_rotate(heading_quat(root), _capped(unit[:, :1])[:, 0] * self.limit_n)
+        torque_b = _capped(unit[:, 1:])[:, 0] * self.limit_nm
+        drive.qfrc_applied[:, 0:3].add_(force)
+        drive.qfrc_applied[:, 3:6].add_(torque_b)
+        torque = quat_rotate(root, torque_b)
+        return Wrench(force[:, None], torque[:, None], xpos[:, 1:2].to(action.dtype), (0,))
+
+    def regularizer(self, action: Tensor) -> Tensor:
+        """exp(-k_r |eta_r|^2) of the unscaled action (Eq. 5)."""
+        return torch.exp(-self.k_r * action.square().sum(-1))
+
+
+@dataclass(frozen=True)
+class ExplicitResidual:
+    """RFC-Explicit: a wrench at a learned contact point on each chosen body (Eqs. 2 and 3).
+
+    Action (9 per body): contact point e (m), force and torque xi in units of the limits, all in the
+    body's own frame. bodies: rows of the humanoid's table. reach_m: bound on |e|.
+    """
+
+    bodies: tuple[int, ...] = (0,)
+    limit_n: float = 100.0
+    limit_nm: float = 100.0
+    k_f: float = 1.0
+    k_cp: float = 4.0
+    reach_m: float = 0.3
+
+    def __post_init__(self) -> None:
+        _check_limits(self.limit_n, self.limit_nm)
+        if not self.bodies or len(set(self.bodies)) != len(self.bodies):
+            raise PoiseError(f"explicit residual forces need different bodies, got rows {self.bodies}")
+
+    @property
+    def dims(self) -> int:
+        """Nine numbers per body: point, force, torque."""
+        return 9 * len(self.bodies)
+
+    def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
+        """Adds sum_j J_ej^T xi_j, through MuJoCo's Cartesian applied forces."""
+        index = [b + 1 for b in self.bodies]
+        parts = action.reshape(-1, len(index), 3, 3)
+        reach = parts[:, :, 0]
+        reach = reach * (self.reach_m / reach.norm(dim=-1, keepdim=True).clamp_min(self.reach_m))
+        quat = xquat[:, index].to(action.dtype)
+        point = xpos[:, index].to(action.dtype) + quat_rotate(quat, reach)
+        force = quat_rotate(quat, _capped(parts[:, :, 1]) * self.limit_n)
+        torque = quat_rotate(quat, _capped(parts[:, :, 2]) * self.limit_nm)
+        drive.add_wrench_at(index, point, force, torque, xipos=xipos)
+        return Wrench(force, torque, point, self.bodies)
+
+    def regularizer(self, action: Tensor) -> Tensor:
+        """exp(-sum_j (k_f |xi_j|^2 + k_cp |e_j|^2)) of the unscaled action (Eq. 3)."""
+        parts = action.reshape(-1, len(self.bodies), 9).square()
+        return torch.exp(
+            -(self.k_f * parts[..., 3:].sum((-1, -2)) + self.k_cp * parts[..., :3].sum((-1, -2)))
+        )

@@ -1,0 +1,84 @@
+"""What a term sees: the simulated and the reference character at one control step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """The state of N characters; float32, world frame unless said otherwise.
+
+    qpos `(N, 7 + n)`, qvel `(N, 6 + n)` in MuJoCo's convention (root angular velocity in the root's
+    frame); pos `(N, B, 3)` m, quat `(N, B, 4)` wxyz, linvel `(N, B, 3)` m/s and angvel `(N, B, 3)`
+    rad/s of every body's origin; com `(N, 3)` m; local `(N, J, 4)` wxyz, each hinged joint's turn.
+    heading `(N, 4)`: the root's turn about +Z.
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    pos: Tensor
+    quat: Tensor
+    linvel: Tensor
+    angvel: Tensor
+    com: Tensor
+    local: Tensor
+    heading: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Everything that a term may use; tensors only.
+
+    sim: the character now. ref: the reference at the same time. ahead: the reference one control
+    step later (None while rewards are computed). phase `(N,)` in [0, 1]: place in the clip.
+    residual `(N, k)`: unscaled residual action of the last step. reg `(N,)`: its regularizer.
+    min_height `(N,)` m: lowest root height of the reference clip.
+    """
+
+    sim: Pose
+    ref: Pose
+    ahead: Pose | None
+    phase: Tensor
+    residual: Tensor
+    reg: Tensor
+    min_height: Tensor
+
+
+TermFunction = Callable[..., Tensor]
+
+
+@dataclass(frozen=True)
+class ObsTerm:
+    """`fn(frame, **params)` gives `(N, k)` observations."""
+
+    name: str
+    fn: TermFunction
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RewardTerm:
+    """`fn(frame, **params)` gives `(N,)` in [0, 1]; the reward is the weighted sum.
+
+    imitation: whether the term counts for the imitation reward that is reported (regularizers do not).
+    """
+
+    name: str
+    fn: TermFunction
+    weight: float
+    params: Mapping[str, Any] = field(default_factory=dict)
+    imitation: bool = True
+
+
+@dataclass(frozen=True)
+class DoneTerm:
+    """`fn(frame, **params)` gives `(N,)` bool: the episode failed."""
+
+    name: str
+    fn: TermFunction
+    params: Mapping[str, Any] = field(default_factory=dict)

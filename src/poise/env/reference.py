@@ -1,0 +1,154 @@
+"""A library of motion in one humanoid's coordinates, packed so that one gather serves any batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.env.frame import Pose
+from poise.errors import PoiseError
+from poise.kin import Kinematics, qpos_velocity
+from poise.spatial import heading_quat, quat_conj, quat_mul, quat_rotate
+
+
+class Reference:
+    """Reference motion at the control rate, all clips end to end.
+
+    Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. A cyclic clip goes on after its
+    last frame with its first, moved and turned to where the last frame stands.
+    """
+
+    def __init__(
+        self,
+        humanoid: Humanoid,
+        motions: Sequence[np.ndarray],
+        rate_hz: float,
+        names: Sequence[str],
+        cyclic: Sequence[bool] | None = None,
+    ):
+        cyclic = [False] * len(motions) if cyclic is None else list(cyclic)
+        if not motions or len(names) != len(motions) or len(cyclic) != len(motions):
+            raise PoiseError(
+                f"a reference needs as many names as motions, got {len(names)} and {len(motions)}"
+            )
+        for name, q in zip(names, motions, strict=True):
+            if len(q) < 3:
+                raise PoiseError(
+                    f"the clip has {len(q)} frames at {rate_hz:g} Hz and needs at least 3", name
+                )
+        self.humanoid, self.rate_hz, self.names = humanoid, rate_hz, tuple(names)
+        self.kinematics = Kinematics(humanoid.table)
+        self._fast = Kinematics(humanoid.table, torch.float32)
+        qpos = torch.tensor(np.concatenate(motions), dtype=torch.float64)
+        qvel = torch.tensor(np.concatenate([qpos_velocity(q, rate_hz) for q in motions]))
+        self.qpos, self.qvel = qpos, qvel
+        self.pose = self._pose(qpos, qvel)
+        self.length = torch.tensor([len(q) for q in motions])
+        self.start = torch.cumsum(self.length, 0) - self.length
+        self.cyclic = torch.tensor(cyclic)
+        self.min_height = torch.stack(
+            [p.min() for p in torch.split(qpos[:, 2].float(), self.length.tolist())]
+        )
+        self.any_cyclic = bool(self.cyclic.any())
+        # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
+        first, last = qpos[self.start], qpos[self.start + self.length - 1]
+        self.cycle_turn = quat_mul(heading_quat(last[:, 3:7]), quat_conj(heading_quat(first[:, 3:7])))
+        travel = last[:, :3] - quat_rotate(self.cycle_turn, first[:, :3])
+        travel[:, 2] = 0.0
+        self.cycle_travel = travel
+
+    def _pose(self, qpos: Tensor, qvel: Tensor) -> Pose:
+        body = self.kinematics(qpos, qvel)
+        quat32 = qpos[:, 3:7].float()
+        return Pose(
+            qpos.float(),
+            qvel.float(),
+            body.pos.float(),
+            body.quat.float(),
+            body.linvel.float(),
+            body.angvel.float(),
+            self._com(body.pos, body.quat),
+            self.local(qpos.float()),
+            heading_quat(quat32),
+        )
+
+    def _com(self, pos: Tensor, quat: Tensor) -> Tensor:
+        model = self.humanoid.model
+        mass = torch.tensor(model.body_mass[1:])
+        inertial = torch.tensor(model.body_ipos[1:])
+        centre = pos + quat_rotate(quat, inertial.expand_as(pos))
+        return ((centre * mass[:, None]).sum(-2) / mass.sum()).float()
+
+    def local(self, qpos: Tensor) -> Tensor:
+        """`(N, J, 4)` wxyz local turns of hinged bodies."""
+        return self._fast.local_quats(qpos)
+
+    @property
+    def frames(self) -> int:
+        """Total number of frames."""
+        return len(self.qpos)
+
+    @property
+    def seconds(self) -> float:
+        """Total duration."""
+        return float((self.length - 1).sum()) / self.rate_hz
+
+    def rows(self, clip: Tensor, frame: Tensor) -> Tensor:
+        """Row of `frame (N)` of `clip (N)`; frames of cyclic clips wrap, others hold the last."""
+        last = self.length[clip] - 1
+        if self.any_cyclic:
+            frame = torch.where(self.cyclic[clip], torch.remainder(frame, last), frame)
+        return self.start[clip] + torch.minimum(frame, last)
+
+    def phase(self, clip: Tensor, frame: Tensor) -> Tensor:
+        """Place in the clip, 0 to 1 `(N)` float32."""
+        last = self.length[clip] - 1
+        if self.any_cyclic:
+            frame = torch.where(self.cyclic[clip], torch.remainder(frame, last), frame)
+        return torch.minimum(frame, last).float() / last.float()
+
+    def gather(self, clip: Tensor, frame: Tensor) -> Pose:
+        """The reference pose of `frame (N)` of `clip (N)`; cyclic clips are carried on."""
+        rows = self.rows(clip, frame)
+        p = self.pose
+        out = Pose(*(getattr(p, name)[rows] for name in p.__dataclass_fields__))
+        if not self.any_cyclic:
+            return out
+        cycles = torch.where(
+            self.cyclic[clip], frame // (self.length[clip] - 1), torch.zeros_like(frame)
+        )
+        return self._carried(out, clip, cycles) if bool((cycles > 0).any()) else out
+
+    def _carried(self, pose: Pose, clip: Tensor, cycles: Tensor) -> Pose:
+        """Poses moved on by whole cycles: turned and shifted by the clip's own travel, repeatedly."""
+        turn = torch.zeros(len(clip), 4, dtype=torch.float64)
+        turn[:, 0] = 1.0
+        move = torch.zeros(len(clip), 3, dtype=torch.float64)
+        for k in range(int(cycles.max())):
+            more = (cycles > k)[:, None]
+            # x -> turn1 x + travel1, applied once per cycle
+            move = torch.where(
+                more, quat_rotate(self.cycle_turn[clip], move) + self.cycle_travel[clip], move
+            )
+            turn = torch.where(more, quat_mul(self.cycle_turn[clip], turn), turn)
+        t, m = turn.float(), move.float()
+        tb = t[:, None].expand(*pose.pos.shape[:-1], 4)
+        pos = quat_rotate(tb, pose.pos) + m[:, None]
+        quat = quat_mul(tb, pose.quat)
+        qpos = torch.cat((pos[:, 0], quat[:, 0], pose.qpos[:, 7:]), -1)
+        qvel = torch.cat((quat_rotate(t, pose.qvel[:, :3]), pose.qvel[:, 3:]), -1)
+        return Pose(
+            qpos,
+            qvel,
+            pos,
+            quat,
+            quat_rotate(tb, pose.linvel),
+            quat_rotate(tb, pose.angvel),
+            quat_rotate(t, pose.com) + m,
+            pose.local,
+            quat_mul(t, pose.heading),
+        )

@@ -1,0 +1,24 @@
+"""Kinematics of a humanoid: clips to generalized coordinates and back, forward kinematics, ground."""
+
+from poise.kin.contacts import contact_labels
+from poise.kin.coords import clip_to_qpos, qpos_to_clip
+from poise.kin.fit import FitReport, fit_humanoid
+from poise.kin.fk import Kinematics
+from poise.kin.ground import GroundFit, fit_ground, lowest_height
+from poise.kin.hinges import chain_angles, chain_quat
+from poise.kin.velocity import qpos_velocity
+
+__all__ = [
+    "FitReport",
+    "GroundFit",
+    "Kinematics",
+    "chain_angles",
+    "chain_quat",
+    "clip_to_qpos",
+    "contact_labels",
+    "fit_ground",
+    "fit_humanoid",
+    "lowest_height",
+    "qpos_to_clip",
+    "qpos_velocity",
+]

@@ -1,0 +1,178 @@
+"""One humanoid for a library of clips, the clips in its coordinates, and what that took."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+
+from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
+from poise.errors import PoiseError
+from poise.kin.coords import clip_to_qpos
+from poise.kin.fk import Kinematics
+from poise.kin.ground import GroundFit, fit_ground
+from poise.motion import Clip, ClipLibrary, resample
+from poise.spatial import quat_conj, quat_mul, quat_to_euler
+
+#: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
+OVERLAP_M = 0.01
+#: Middle Euler angle (rad) beyond which another hinge order is looked for.
+GIMBAL = 1.2
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What was measured and changed so that one body can do the motion.
+
+    names: the clips. ground: one fit per clip. joint_error_mm: mean distance between the clip's
+    joints and the humanoid's after conversion (turns that a chain cannot make), per clip. widened:
+    hinges whose range had to grow, with the growth in degrees. excluded: body pairs that overlap in
+    the reference. fastest: (hinge, rad/s), the largest joint speed.
+    """
+
+    names: tuple[str, ...]
+    ground: tuple[GroundFit, ...]
+    joint_error_mm: tuple[float, ...]
+    widened: tuple[tuple[str, float], ...]
+    excluded: tuple[tuple[str, str], ...]
+    fastest: tuple[str, float]
+
+    def sentences(self) -> list[str]:
+        """The report in words, one line each."""
+        out = []
+        for name, ground, error in zip(self.names, self.ground, self.joint_error_mm, strict=True):
+            out.append(f"{name}: {ground.sentence()}")
+            out.append(f"{name}: the humanoid's joints lie {error:.1f} mm from the clip's on average.")
+        if self.widened:
+            worst = max(self.widened, key=lambda w: w[1])
+            out.append(
+                f"{len(self.widened)} joint ranges were widened to reach the motion, "
+                f"most {worst[0]} by {worst[1]:.0f} degrees."
+            )
+        if self.excluded:
+            pairs = ", ".join(f"{a}-{b}" for a, b in self.excluded[:4])
+            more = f" and {len(self.excluded) - 4} more" if len(self.excluded) > 4 else ""
+            out.append(f"Collisions off where the clip's own limbs overlap: {pairs}{more}.")
+        return out
+
+
+def fit_humanoid(
+    library: ClipLibrary | Clip, config: BodyConfig | None = None, rate_hz: float = 30.0
+) -> tuple[Humanoid, list[np.ndarray], FitReport]:
+    """A humanoid that can reach every frame of the library.
+
+    Args:
+        library: clips of one hierarchy; the body is made from the first one's bone lengths.
+        config: see `BodyConfig`. rate_hz: the control rate at which the clips are sampled.
+
+    Returns:
+        the humanoid, one `qpos (T, 7 + hinges)` per clip at `rate_hz` standing on the floor, and a
+        report of every repair.
+    """
+    library = ClipLibrary.of(library) if isinstance(library, Clip) else library
+    config = config or BodyConfig()
+    clips = [resample(c, rate_hz) for c in library]
+    table = generate_table(clips[0].skeleton, config, clips)
+    table = _choose_orders(table, clips)
+    motions = [clip_to_qpos(c, table) for c in clips]
+    for clip, q in zip(clips, motions, strict=True):
+        if not np.isfinite(q).all():
+            raise PoiseError("its coordinates are not finite", clip.name)
+    table, widened = _widen(table, motions, config.margin)
+    error = [_joint_error(c, q, table) for c, q in zip(clips, motions, strict=True)]
+    fits = [fit_ground(q, table, rate_hz, c.cyclic) for c, q in zip(clips, motions, strict=True)]
+    motions = [q for q, _ in fits]
+    humanoid = make_humanoid(clips[0].skeleton, table)
+    overlaps = _overlaps(humanoid, motions)
+    if overlaps:
+        table = replace(table, contact_exclusions=table.contact_exclusions + overlaps)
+        humanoid = make_humanoid(clips[0].skeleton, table)
+    report = FitReport(
+        library.names,
+        tuple(f for _, f in fits),
+        tuple(error),
+        widened,
+        overlaps,
+        _fastest(humanoid, motions, rate_hz),
+    )
+    return humanoid, motions, report
+
+
+def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
+    """Hinge orders whose middle angle stays far from +-90 degrees, where speeds would explode.
+
+    An order is changed only where the motion comes nearer than `GIMBAL` to the lock.
+    """
+    worlds = [torch.tensor(c.world()[1]) for c in clips]
+    rows = list(table.rows)
+    for i, row in enumerate(rows):
+        if len(row.order) != 3:
+            continue
+        anchor = rows[row.parent].joint
+        rest = torch.tensor(row.quat, dtype=torch.float64)
+        frame = torch.tensor(row.frame, dtype=torch.float64)
+        rel = torch.cat([quat_mul(quat_conj(w[:, anchor]), w[:, row.joint]) for w in worlds])
+        turns = quat_mul(quat_mul(quat_conj(quat_mul(rest, frame)).expand_as(rel), rel), frame)
+        orders = [row.order, *("".join(p) for p in itertools.permutations("XYZ"))]
+        reach = [float(quat_to_euler(turns, o)[:, 1].abs().max()) for o in orders]
+        if reach[0] > GIMBAL:
+            rows[i] = replace(row, order=orders[int(np.argmin(np.round(reach, 2)))])
+    return replace(table, rows=tuple(rows))
+
+
+def _widen(
+    table: BodyTable, motions: list[np.ndarray], margin: float
+) -> tuple[BodyTable, tuple[tuple[str, float], ...]]:
+    """Ranges grown to hold the motion plus `margin` rad."""
+    low = np.min([q[:, 7:].min(0) for q in motions], 0) - margin
+    high = np.max([q[:, 7:].max(0) for q in motions], 0) + margin
+    rows, widened, at = [], [], 0
+    for row in table.rows:
+        ranges = []
+        for name, (a, b) in zip(row.hinge_names(), row.ranges, strict=True):
+            grown = max(a - low[at], high[at] - b, 0.0)
+            if grown > 0:
+                widened.append((name, math.degrees(grown)))
+            ranges.append((float(min(a, low[at])), float(max(b, high[at]))))
+            at += 1
+        rows.append(replace(row, ranges=tuple(ranges)))
+    return replace(table, rows=tuple(rows)), tuple(widened)
+
+
+def _joint_error(clip: Clip, qpos: np.ndarray, table: BodyTable) -> float:
+    """Mean distance in mm between the clip's joints and the humanoid's bodies."""
+    here = Kinematics(table)(torch.tensor(qpos)).pos.numpy()
+    there = clip.positions()[:, [r.joint for r in table.rows]]
+    return float(np.linalg.norm(here - there, axis=-1).mean() * 1000)
+
+
+def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str, str], ...]:
+    """Pairs of bodies whose shapes overlap by more than `OVERLAP_M` in some reference frame."""
+    model = humanoid.model
+    data = mujoco.MjData(model)
+    found: set[tuple[str, str]] = set()
+    for q in motions:
+        for frame in q:
+            data.qpos[:] = frame
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_collision(model, data)
+            if not data.ncon:
+                continue
+            deep = data.contact.dist < -OVERLAP_M
+            for g1, g2 in data.contact.geom[deep]:
+                a, b = model.geom_bodyid[g1], model.geom_bodyid[g2]
+                if a and b:
+                    found.add((humanoid.bodies[a - 1], humanoid.bodies[b - 1]))
+    return tuple(sorted(found))
+
+
+def _fastest(humanoid: Humanoid, motions: list[np.ndarray], rate_hz: float) -> tuple[str, float]:
+    """The hinge with the largest speed between frames, and that speed in rad/s."""
+    speeds = np.max([np.abs(np.diff(q[:, 7:], axis=0)).max(0) for q in motions], 0) * rate_hz
+    k = int(speeds.argmax())
+    return humanoid.hinges[k], float(speeds[k])

@@ -1,0 +1,94 @@
+"""Batched forward kinematics and velocities of a humanoid in torch."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.spatial import euler_to_quat, quat_mul, quat_rotate
+
+
+class BodyState(NamedTuple):
+    """World state of every body; rows as in the table.
+
+    pos `(..., B, 3)` m, quat `(..., B, 4)` wxyz, linvel `(..., B, 3)` m/s of the body's origin,
+    angvel `(..., B, 3)` rad/s; all in world axes.
+    """
+
+    pos: Tensor
+    quat: Tensor
+    linvel: Tensor
+    angvel: Tensor
+
+
+class Kinematics:
+    """Forward kinematics of one `BodyTable` for any batch of coordinates."""
+
+    def __init__(self, table: BodyTable, dtype: torch.dtype = torch.float64):
+        self.table, self.dtype = table, dtype
+        self._rows = []
+        at = 0
+        for row in table.rows:
+            frame = torch.tensor(row.frame, dtype=dtype)
+            axes = [
+                quat_rotate(frame, torch.eye(3, dtype=dtype)["XYZ".index(letter)])
+                for letter in row.order
+            ]
+            pos, quat = torch.tensor(row.pos, dtype=dtype), torch.tensor(row.quat, dtype=dtype)
+            self._rows.append((row.parent, pos, quat, frame, row.order, axes, at))
+            at += len(row.order)
+        self.hinges = at
+        #: Rows that have hinges, in order.
+        self.hinged = tuple(i for i, r in enumerate(self._rows) if r[4])
+        self._groups = []
+        for order in dict.fromkeys(self._rows[i][4] for i in self.hinged):
+            places = [k for k, i in enumerate(self.hinged) if self._rows[i][4] == order]
+            starts = [7 + self._rows[self.hinged[k]][6] for k in places]
+            columns = torch.tensor([[s + d for d in range(len(order))] for s in starts])
+            self._groups.append((order, torch.tensor(places), columns))
+
+    def __call__(self, qpos: Tensor, qvel: Tensor | None = None) -> BodyState:
+        """World body states of `qpos (..., 7 + n)` and, where given, `qvel (..., 6 + n)`."""
+        qpos = qpos.to(self.dtype)
+        batch = qpos.shape[:-1]
+        zero = torch.zeros(*batch, 3, dtype=self.dtype)
+        vel = None if qvel is None else qvel.to(self.dtype)
+        pos, quat, lin, ang = [], [], [], []
+        for parent, offset, rest, _frame, _order, axes, at in self._rows:
+            if parent < 0:
+                p, q = qpos[..., :3], qpos[..., 3:7]
+                v = zero if vel is None else vel[..., :3]
+                w = zero if vel is None else quat_rotate(q, vel[..., 3:6])
+            else:
+                arm = quat_rotate(quat[parent], offset.expand(*batch, 3))
+                p = pos[parent] + arm
+                v = lin[parent] + torch.linalg.cross(ang[parent], arm)
+                w = ang[parent]
+                q = quat_mul(quat[parent], rest.expand(*batch, 4))
+                for i, axis in enumerate(axes):
+                    angle = qpos[..., 7 + at + i]
+                    if vel is not None:
+                        # The hinge's axis is fixed in the frame before its own turn.
+                        w = w + quat_rotate(q, axis.expand(*batch, 3)) * vel[..., 6 + at + i, None]
+                    half = 0.5 * angle.unsqueeze(-1)
+                    q = quat_mul(q, torch.cat((half.cos(), axis * half.sin()), -1))
+            pos.append(p)
+            quat.append(q)
+            lin.append(v)
+            ang.append(w)
+        return BodyState(*(torch.stack(x, -2) for x in (pos, quat, lin, ang)))
+
+    def local_quats(self, qpos: Tensor) -> Tensor:
+        """`(..., J, 4)` wxyz, the turn of every hinged body away from its rest orientation.
+
+        Rows follow `hinged`. Conjugation by the hinges' fixed frame keeps relative angles, so the
+        turns are stated in that frame.
+        """
+        qpos = qpos.to(self.dtype)
+        out = qpos.new_empty(*qpos.shape[:-1], len(self.hinged), 4)
+        for order, places, columns in self._groups:
+            out[..., places, :] = euler_to_quat(qpos[..., columns], order)
+        return out

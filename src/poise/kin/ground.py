@@ -1,0 +1,88 @@
+"""Where the floor lies under a motion, and the lift that sets the feet on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.kin.fk import Kinematics
+from poise.spatial import quat_rotate
+
+
+@dataclass(frozen=True)
+class GroundFit:
+    """How a motion was set on the floor.
+
+    lift_m: constant lift of the whole clip. clear_m: `(T,)` further lift per frame that keeps every
+    shape above the floor (smooth; zero where nothing sank in). before_m, after_m: deepest point under
+    the floor, before and after.
+    """
+
+    lift_m: float
+    clear_m: np.ndarray
+    before_m: float
+    after_m: float
+
+    def sentence(self) -> str:
+        """The fit in words."""
+        return (
+            f"Lifted by {self.lift_m * 1000:+.0f} mm to stand on the floor, and by up to "
+            f"{self.clear_m.max() * 1000:.0f} mm more where a part sank in "
+            f"(deepest point {-self.before_m * 1000:.0f} mm, now {-self.after_m * 1000:.1f} mm)."
+        )
+
+
+def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
+    """`(..., B)` m, the lowest point of each body's shapes, from world body poses."""
+    out = []
+    for i, row in enumerate(table.rows):
+        heights = [_lowest(g, pos[..., i, :], quat[..., i, :]) for g in row.geoms]
+        out.append(torch.stack(heights, -1).min(-1).values)
+    return torch.stack(out, -1)
+
+
+def _lowest(geom, pos: Tensor, quat: Tensor) -> Tensor:
+    local = torch.tensor(geom.pos, dtype=pos.dtype).expand_as(pos)
+    centre = pos[..., 2] + quat_rotate(quat, local)[..., 2]
+    size = geom.size
+    turn = torch.tensor(geom.quat, dtype=pos.dtype)
+    ups = [
+        quat_rotate(quat, quat_rotate(turn, torch.eye(3, dtype=pos.dtype)[k]).expand_as(pos))[..., 2]
+        for k in range(3)
+    ]
+    if geom.kind == "sphere":
+        return centre - size[0]
+    if geom.kind == "capsule":
+        return centre - ups[2].abs() * size[1] - size[0]
+    return centre - sum(up.abs() * s for up, s in zip(ups, size, strict=True))
+
+
+def fit_ground(
+    qpos: np.ndarray, table: BodyTable, fps: float, cyclic: bool = False
+) -> tuple[np.ndarray, GroundFit]:
+    """The motion set on the floor z = 0, and by how much it was moved.
+
+    The constant lift puts the tenth percentile of the lowest point per frame on the floor: it is
+    robust to a few bad frames and right for walks and flights alike. What still sinks in is lifted
+    frame by frame, by the running maximum of the depth over 0.1 s smoothed over 0.2 s.
+    """
+    state = Kinematics(table)(torch.tensor(qpos))
+    low = lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
+    lift = -float(np.quantile(low, 0.1))
+    depth = np.maximum(-(low + lift), 0.0)
+    reach = max(1, round(0.1 * fps))
+    padded = np.pad(depth, reach, mode="wrap" if cyclic else "edge")
+    hull = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(-1)
+    window = np.hanning(2 * reach + 3)[1:-1]
+    clear = np.convolve(
+        np.pad(hull, reach, mode="wrap" if cyclic else "edge"), window / window.sum(), "valid"
+    )
+    clear = np.maximum(clear, 0.0) * float(depth.max() > 1e-4)
+    out = np.array(qpos)
+    out[:, 2] += lift + clear
+    after = low + lift + clear
+    return out, GroundFit(lift, clear, float(low.min()), float(min(after.min(), 0.0)))

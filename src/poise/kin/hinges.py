@@ -1,0 +1,68 @@
+"""Rotations as chains of hinges, with angles that never jump from one frame to the next."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.spatial import euler_to_quat, quat_conj, quat_mul, quat_to_euler
+
+
+def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
+    """Rotation `(..., 4)` of a hinge chain: `frame * R_order(angles) * frame^-1`.
+
+    angles: `(..., n)` rad, outermost hinge first. order: axis letters of `frame`, "" to "ZYX".
+    """
+    return quat_mul(quat_mul(frame, euler_to_quat(angles, order)), quat_conj(frame))
+
+
+def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None = None) -> Tensor:
+    """Hinge angles `(T, n)` rad whose chain comes nearest to `rot (T, 4)`, continuous in time.
+
+    Three hinges reproduce any rotation. Of the two Euler branches (a, b, c) and
+    (a + pi, pi - b, c + pi) the sequence with the smallest sum of squared steps is found by dynamic
+    programming; whole turns are unwrapped, so a pirouette counts up. Two hinges drop the missing
+    third angle and one hinge takes the twist about its axis: both exact for rotations that lie in
+    the chain. The whole sequence is shifted by full turns to lie nearest `prefer (n)` (default 0).
+    """
+    local = quat_mul(quat_mul(quat_conj(frame), rot), frame)
+    if not order:
+        return local.new_zeros(*local.shape[:-1], 0)
+    if len(order) == 1:
+        axis = 1 + "XYZ".index(order)
+        raw = 2.0 * torch.atan2(local[:, axis], local[:, 0])
+        path = raw.unsqueeze(-1)
+    elif len(order) == 2:
+        missing = next(c for c in "XYZ" if c not in order)
+        path = quat_to_euler(local, order[0] + missing + order[1])[:, [0, 2]]
+    else:
+        path = _best_branch(quat_to_euler(local, order), prefer)
+    path = torch.tensor(np.unwrap(path.numpy(), axis=0))
+    centre = torch.zeros(len(order), dtype=path.dtype) if prefer is None else prefer
+    turns = torch.round((path.median(0).values - centre) / (2 * math.pi))
+    return path - turns * 2 * math.pi
+
+
+def _best_branch(first: Tensor, prefer: Tensor | None) -> Tensor:
+    """The smoothest sequence `(T, 3)` through the two Euler branches, by Viterbi's algorithm."""
+    second = torch.stack((first[:, 0] + math.pi, math.pi - first[:, 1], first[:, 2] + math.pi), -1)
+    both = torch.stack((first, second), 1).numpy()  # (T, 2, 3)
+    step = np.remainder(both[1:, None, :, :] - both[:-1, :, None, :] + np.pi, 2 * np.pi) - np.pi
+    price = (step**2).sum(-1)  # (T-1, from, to)
+    centre = np.zeros(3) if prefer is None else prefer.numpy()
+    home = np.remainder(both - centre + np.pi, 2 * np.pi) - np.pi
+    # A slight pull toward the preferred pose breaks ties and chooses the branch of a still clip.
+    pull = 1e-4 * (home**2).sum(-1)
+    cost, back = pull[0].copy(), np.zeros((len(both), 2), dtype=np.int64)
+    for t in range(1, len(both)):
+        total = cost[:, None] + price[t - 1]
+        back[t] = total.argmin(0)
+        cost = total.min(0) + pull[t]
+    pick = np.zeros(len(both), dtype=np.int64)
+    pick[-1] = int(cost.argmin())
+    for t in range(len(both) - 1, 0, -1):
+        pick[t - 1] = back[t, pick[t]]
+    return torch.tensor(both[np.arange(len(both)), pick])

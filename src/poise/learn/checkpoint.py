@@ -1,0 +1,145 @@
+"""Checkpoints: one file of weights with its JSON inside, written whole or not at all.
+
+The file is safetensors; its metadata holds one JSON object, so weights and settings can never
+belong to different moments. It is written beside its place, flushed to the disk and renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as parse_tensors
+from safetensors.torch import save as serialise_tensors
+from torch import Tensor
+
+from poise import __version__
+from poise.errors import PoiseError
+
+FORMAT = 1
+LATEST = "checkpoint.safetensors"
+BEST = "best.safetensors"
+_TEMPORARY = ".partial"
+
+
+def save_checkpoint(path: str | Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
+    """Writes a checkpoint atomically: a crash leaves either the old file or the new one.
+
+    Args:
+        path: the file to write; its folder is made.
+        tensors: named tensors of any device and dtype.
+        meta: JSON data; "format" and "poise" (the version) are added.
+    """
+    path = Path(path)
+    own = {k: v.detach().to("cpu", copy=True).contiguous() for k, v in tensors.items()}
+    record = {**meta, "format": FORMAT, "poise": __version__, "crc32": _checksum(own)}
+    data = serialise_tensors(own, {"poise": json.dumps(record)})
+    try:
+        write_atomic(path, data)
+    except OSError as error:
+        raise PoiseError(
+            f"the checkpoint could not be written ({error.strerror})", path, "Check the disk"
+        ) from error
+
+
+def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors (on the CPU) and the metadata of a checkpoint.
+
+    A missing, damaged or foreign file and another format version raise a `PoiseError`.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PoiseError(
+            f"the checkpoint could not be read ({error.strerror})", path, "Check the path"
+        ) from error
+    damaged = PoiseError(
+        "the file is damaged or no checkpoint of Poise", path, "Use another checkpoint or train again"
+    )
+    try:
+        size = int.from_bytes(data[:8], "little")
+        meta = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["poise"])
+        version = meta["format"]
+    except (ValueError, KeyError, TypeError):
+        raise damaged from None
+    if version != FORMAT:
+        raise PoiseError(
+            f"the checkpoint has format {version} (written by Poise {meta.get('poise', 'unknown')}) and "
+            f"this version, {__version__}, reads format {FORMAT}",
+            path,
+            "Install the version that wrote it, or train again",
+        )
+    try:
+        # Clones own aligned memory, where views into the file's bytes would not.
+        tensors = {k: v.clone() for k, v in parse_tensors(data).items()}
+    except (SafetensorError, ValueError, RuntimeError):
+        raise damaged from None
+    if _checksum(tensors) != meta.get("crc32"):
+        raise damaged
+    return tensors, meta
+
+
+def check_fits(meta: Mapping[str, Any], path: str | Path | None = None, **expected: Any) -> None:
+    """Raises a `PoiseError` unless each given, not None, entry of `meta` is as expected."""
+    for name, want in expected.items():
+        found = meta.get(name)
+        if want is None or found == want:
+            continue
+        words = {
+            "character": f"the checkpoint belongs to the character '{found}', not to '{want}'",
+            "num_obs": f"the checkpoint's policy takes {found} observations, the environment has {want}",
+            "num_actions": f"the checkpoint's policy gives {found} actions, the environment has {want}",
+        }
+        raise PoiseError(
+            words.get(name, f"the checkpoint was made with {name} = {found}, not {want}"),
+            path,
+            "Use the settings it was made with, or start a new run in another folder",
+        )
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Replaces a file by `data`, durably: temporary file, fsync, rename, fsync of the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}{_TEMPORARY}")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise
+    if os.name == "posix":
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes what a killed process left half written."""
+    for file in folder.glob(f".*{_TEMPORARY}"):
+        with contextlib.suppress(OSError):
+            file.unlink()
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> int:
+    """CRC-32 over all names and bytes: safetensors itself does not notice a flipped bit."""
+    crc = 0
+    for name in sorted(tensors):
+        crc = zlib.crc32(name.encode(), crc)
+        flat = tensors[name].reshape(-1)
+        if flat.numel():
+            crc = zlib.crc32(flat.view(torch.uint8).numpy().data, crc)
+    return crc

@@ -1,0 +1,298 @@
+"""Proximal policy optimisation (Schulman et al. 2017) with a separate policy and critic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.learn.config import PPOConfig
+from poise.learn.gae import gae
+from poise.learn.guard import TrainingError
+from poise.learn.policy import PolicyBundle
+from poise.learn.rollout import Rollout
+from poise.learn.state import (
+    State,
+    load_module,
+    load_optimizer_state,
+    make_generator,
+    optimizer_state,
+    prefixed,
+    take,
+    under,
+)
+from poise.nets import MLP, RunningNorm, gaussian_entropy, gaussian_kl, gaussian_log_prob
+
+_SUMS: tuple[str, ...] = ("policy loss", "value loss", "kl", "clip fraction", "policy gradient")
+RETURN_WINDOW = 10  # Batches over which the scale of the returns is remembered.
+
+
+@dataclass(frozen=True)
+class UpdateStats:
+    """What one update did. Means are over its minibatches; 0 for the policy while it waits."""
+
+    policy_loss: float
+    value_loss: float
+    """Squared error of the critic, in units of the normalised return if returns are normalised."""
+    kl: float
+    """KL(old || new) in nats, summed over the actions, mean over the last trained epoch."""
+    clip_fraction: float
+    policy_grad_norm: float
+    """Before clipping."""
+    explained_variance: float
+    """1 - Var(R - V) / Var(R) of the critic before the update."""
+    std: float
+    """Mean deviation of the action noise."""
+    policy_lr: float
+
+
+def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """The policy loss: -mean min(r A, clip(r, 1 - e, 1 + e) A) with r = pi / pi_old; a scalar."""
+    ratio = (log_prob - old_log_prob).exp()
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    return -torch.minimum(ratio * advantage, clipped * advantage).mean()
+
+
+class PPO:
+    """Policy, critic, normalisers and optimiser; learns from one filled `Rollout` at a time.
+
+    Args:
+        num_obs, num_actions: O and A.
+        config: the settings.
+        seed: seeds the first weights, the action noise and the shuffling, each apart.
+        device: where everything lives.
+    """
+
+    def __init__(
+        self,
+        num_obs: int,
+        num_actions: int,
+        config: PPOConfig,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ):
+        self.config = config
+        init = make_generator(seed, "weights")
+        self.actor = PolicyBundle.make(
+            num_obs,
+            num_actions,
+            config.policy_hidden,
+            config.activation,
+            config.std,
+            config.learn_std,
+            config.obs_clip,
+            generator=init,
+        )
+        self.critic = MLP(num_obs, config.value_hidden, 1, config.activation, generator=init).to(device)
+        self.return_norm = RunningNorm(1, clip=math.inf).to(device)
+        self.actor.norm.to(device)
+        self.actor.policy.to(device)
+        self.noise = make_generator(seed, "noise", device)
+        self.shuffle = make_generator(seed, "shuffle", device)
+        self._policy_params = [p for p in self.actor.policy.parameters() if p.requires_grad]
+        self._value_params = list(self.critic.parameters())
+        groups = [
+            {"params": self._policy_params, "lr": config.policy_lr},
+            {"params": self._value_params, "lr": config.value_lr},
+        ]
+        self.optimizer = torch.optim.Adam(groups, lr=config.policy_lr, fused=True)
+
+    def value(self, obs: Tensor) -> Tensor:
+        """V of normalised observations `(..., O)` in units of reward, `(...)`."""
+        return self.return_norm.inverse(self.critic(obs)).squeeze(-1)
+
+    @torch.no_grad()
+    def estimate(self, rollout: Rollout) -> None:
+        """Fills the rollout's values, advantages and returns."""
+        config = self.config
+        value = self.value(rollout.obs)
+        rollout.value.copy_(value[:-1])
+        rollout.next_value.copy_(value[1:])
+        terminated = rollout.terminated
+        if config.bootstrap_timeouts:
+            # Where the episode was cut, s_{t+1} is the state reached and not the next start.
+            if len(rollout.cut_at):
+                rollout.next_value.view(-1)[rollout.cut_at] = self.value(rollout.cut_obs)
+        else:
+            terminated = terminated | rollout.truncated
+        advantage, returns = gae(
+            rollout.reward,
+            rollout.value,
+            rollout.next_value,
+            terminated,
+            rollout.truncated,
+            config.gamma,
+            config.lam,
+        )
+        rollout.advantage.copy_(advantage)
+        rollout.returns.copy_(returns)
+
+    def update(self, rollout: Rollout, train_policy: bool = True) -> UpdateStats:
+        """Learns from a collected rollout, then takes the new observation statistics into use.
+
+        A loss or weight that is not finite raises a `TrainingError` and puts back the weights,
+        moments and generators from before this update.
+        """
+        before = self.state()
+        try:
+            self.estimate(rollout)
+            explained = _explained_variance(rollout.returns, rollout.value)
+            if self.config.normalise_returns:
+                self._rescale_critic(rollout.returns)
+            sums, kl = self._fit(rollout, train_policy)
+            self._adapt_lr(kl)
+        except TrainingError:
+            self.load_state(before)
+            raise
+        self.actor.norm.freeze()
+        return UpdateStats(
+            policy_loss=sums["policy loss"],
+            value_loss=sums["value loss"],
+            kl=kl,
+            clip_fraction=sums["clip fraction"],
+            policy_grad_norm=sums["policy gradient"],
+            explained_variance=explained,
+            std=float(self.actor.policy.log_std.detach().exp().mean()),
+            policy_lr=self.optimizer.param_groups[0]["lr"],
+        )
+
+    def _fit(self, rollout: Rollout, train_policy: bool) -> tuple[dict[str, float], float]:
+        """All epochs; the mean of each sum and the KL of the last epoch of the policy."""
+        config, kl = self.config, 0.0
+        obs = rollout.obs[:-1].flatten(0, 1)
+        advantage = rollout.advantage.flatten()
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        target = self.return_norm(rollout.returns.view(-1, 1))
+        action, mean_0 = rollout.action.flatten(0, 1), rollout.mean.flatten(0, 1)
+        log_prob = rollout.log_prob.flatten()
+        old_log_std = self.actor.policy.log_std.detach().clone()
+        parts = max(1, round(rollout.samples / config.minibatch))
+        means: list[dict[str, float]] = []
+        for _ in range(config.epochs):
+            order = torch.randperm(rollout.samples, generator=self.shuffle, device=obs.device)
+            sums = torch.zeros(len(_SUMS), device=obs.device)
+            for index in order.tensor_split(parts):
+                batch_obs = obs.index_select(0, index)
+                value_loss = (self.critic(batch_obs) - target.index_select(0, index)).square().mean()
+                loss, terms = value_loss, [value_loss.new_zeros(())] * 3
+                if train_policy:
+                    policy_loss, *terms = self._policy_loss(
+                        batch_obs,
+                        advantage.index_select(0, index),
+                        action.index_select(0, index),
+                        log_prob.index_select(0, index),
+                        mean_0.index_select(0, index),
+                        old_log_std,
+                    )
+                    loss = loss + policy_loss
+                norm = self._step(loss, train_policy)
+                sums += torch.stack([terms[0], value_loss.detach(), terms[1], terms[2], norm])
+            # The only wait for the numbers, once per epoch.
+            mean: dict[str, float] = dict(zip(_SUMS, (sums / parts).tolist(), strict=True))
+            self._check(mean)
+            means.append(mean)
+            if train_policy:
+                kl = mean["kl"]
+                train_policy = config.kl_stop is None or kl <= config.kl_stop
+        return {name: sum(m[name] for m in means) / len(means) for name in _SUMS}, kl
+
+    def _policy_loss(
+        self,
+        obs: Tensor,
+        advantage: Tensor,
+        action: Tensor,
+        old_log_prob: Tensor,
+        old_mean: Tensor,
+        old_log_std: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The loss to descend, and for the log: itself, the KL and the share of clipped ratios."""
+        config, policy = self.config, self.actor.policy
+        mean, log_std = policy(obs), policy.log_std
+        log_prob = gaussian_log_prob(action, mean, log_std)
+        loss = clipped_surrogate(log_prob, old_log_prob, advantage, config.clip)
+        if config.entropy_weight:
+            loss = loss - config.entropy_weight * gaussian_entropy(log_std)
+        if config.bound_weight:
+            excess = (mean.abs() - config.bound_limit).relu()
+            loss = loss + config.bound_weight * excess.square().sum(-1).mean()
+        with torch.no_grad():
+            kl = gaussian_kl(old_mean, old_log_std, mean, log_std).mean()
+            # |r - 1| > e
+            clipped = ((log_prob - old_log_prob).expm1().abs() > config.clip).float().mean()
+        return loss, loss.detach(), kl, clipped
+
+    def _step(self, loss: Tensor, train_policy: bool) -> Tensor:
+        """One Adam step; returns the policy's gradient norm before clipping."""
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        config, norm = self.config, loss.new_zeros(())
+        if train_policy:
+            limit = math.inf if config.policy_grad_norm is None else config.policy_grad_norm
+            norm = torch.nn.utils.clip_grad_norm_(self._policy_params, limit, foreach=True)
+        if config.value_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self._value_params, config.value_grad_norm, foreach=True)
+        # Parameters without a gradient, as the policy's in a warm-up, are left alone.
+        self.optimizer.step()
+        return norm
+
+    @torch.no_grad()
+    def _rescale_critic(self, returns: Tensor) -> None:
+        """Updates the scale of the returns and leaves what the critic predicts unchanged."""
+        norm, last = self.return_norm, self.critic.last
+        first, (mean, std) = float(norm.count) == 0, (norm.shift.clone(), norm.std.clone())
+        norm.window = RETURN_WINDOW * returns.numel()
+        norm.observe(returns.reshape(-1, 1))
+        norm.freeze()
+        if not first:
+            # std' (w' h + b') + mean' = std (w h + b) + mean
+            last.weight.mul_(std / norm.std)
+            last.bias.mul_(std).add_(mean - norm.shift).div_(norm.std)
+
+    def _adapt_lr(self, kl: float) -> None:
+        """Moves the policy's lr so that the KL of an update stays near its target."""
+        target, (low, high) = self.config.kl_target, self.config.lr_range
+        if target is None or kl == 0.0:
+            return
+        group = self.optimizer.param_groups[0]
+        if kl > 2 * target:
+            group["lr"] = max(low, group["lr"] / 1.5)
+        elif kl < target / 2:
+            group["lr"] = min(high, group["lr"] * 1.5)
+
+    def _check(self, means: Mapping[str, float]) -> None:
+        bad = [name for name, value in means.items() if not math.isfinite(value)]
+        params = [*self._policy_params, *self._value_params]
+        if not bad and not math.isfinite(sum(float(p.detach().sum()) for p in params)):
+            bad = ["sum of the weights"]
+        if bad:
+            raise TrainingError(
+                f"the {' and the '.join(bad)} became infinite or not a number in the update",
+                hint="The weights before it are kept; lower policy_lr or value_lr, or bound the reward",
+            )
+
+    def state(self) -> State:
+        """Copies of weights, normalisers, moments and generators."""
+        return (
+            self.actor.state()
+            | prefixed("critic", self.critic.state_dict())
+            | prefixed("return_norm", self.return_norm.state_dict())
+            | prefixed("adam", optimizer_state(self.optimizer))
+            | {"generator/noise": self.noise.get_state(), "generator/shuffle": self.shuffle.get_state()}
+        )
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Restores what `state` returned; other network sizes raise a `PoiseError`."""
+        self.actor.load_state(state)
+        load_module(self.critic, state, "critic")
+        load_module(self.return_norm, state, "return_norm")
+        load_optimizer_state(self.optimizer, under("adam", state))
+        self.noise.set_state(take(state, "generator/noise").cpu())
+        self.shuffle.set_state(take(state, "generator/shuffle").cpu())
+
+
+def _explained_variance(returns: Tensor, value: Tensor) -> float:
+    spread = float(returns.var())
+    return 1 - float((returns - value).var()) / spread if spread > 0 else 0.0

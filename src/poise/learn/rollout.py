@@ -1,0 +1,121 @@
+"""Collects T control steps of N environments into buffers that are made once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from poise.learn.guard import check_finite
+from poise.learn.protocols import VecEnv
+from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
+
+
+class Rollout:
+    """One batch of experience: T steps by N rows, reused every iteration.
+
+    `obs (T+1, N, O)` normalised, the last row follows the last step; `action`, `mean (T, N, A)`;
+    `log_prob`, `reward`, `value`, `next_value`, `advantage`, `returns (T, N)`; `terminated`,
+    `truncated (T, N)` bool. `cut_at (K,)` are the flat indices t N + n of the steps that were
+    truncated and `cut_obs (K, O)` the normalised observations that they reached. `terms` are the
+    means of the environment's log.
+    """
+
+    def __init__(
+        self, horizon: int, num_envs: int, num_obs: int, num_actions: int, device: torch.device
+    ):
+        def make(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(*shape, dtype=dtype, device=device)
+
+        T, N = horizon, num_envs
+        self.obs = make(T + 1, N, num_obs)
+        self.action, self.mean = make(T, N, num_actions), make(T, N, num_actions)
+        self.log_prob, self.reward = make(T, N), make(T, N)
+        self.value, self.next_value = make(T, N), make(T, N)
+        self.advantage, self.returns = make(T, N), make(T, N)
+        self.terminated, self.truncated = make(T, N, dtype=torch.bool), make(T, N, dtype=torch.bool)
+        self.cut_at = make(0, dtype=torch.int64)
+        self.cut_obs = make(0, num_obs)
+        self.terms: dict[str, float] = {}
+
+    @property
+    def samples(self) -> int:
+        """T x N."""
+        return self.reward.numel()
+
+
+class Episodes:
+    """Counts the running episodes; what it holds is part of the trainer's state."""
+
+    def __init__(self, num_envs: int, device: torch.device):
+        self.length = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.total = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self.finished_length = self.finished_total = self.failures = 0.0
+        self.finished = 0
+
+    def begin(self) -> None:
+        """Forgets the finished episodes, at the start of an iteration."""
+        self.finished_length = self.finished_total = self.failures = 0.0
+        self.finished = 0
+
+    def count(self, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
+        """Adds one step of every row, `(N,)` each."""
+        self.length += 1
+        self.total += reward
+        done = terminated | truncated
+        ended = int(done.sum())
+        if ended:
+            self.finished += ended
+            self.finished_length += float(self.length[done].sum())
+            self.finished_total += float(self.total[done].sum())
+            self.failures += float(terminated.sum())
+            self.length[done] = 0
+            self.total[done] = 0.0
+
+
+@torch.no_grad()
+def collect(
+    env: VecEnv,
+    policy: GaussianPolicy,
+    norm: RunningNorm,
+    rollout: Rollout,
+    obs: Tensor,
+    episodes: Episodes,
+    noise: torch.Generator,
+) -> Tensor:
+    """Fills the rollout's `obs` to `truncated` with on-policy steps from the raw `obs (N, O)`.
+
+    Raw observations are gathered in `norm`, which is not frozen here. Returns the raw observation
+    to go on from. A number that is not finite raises a `TrainingError`.
+    """
+    episodes.begin()
+    terms: dict[str, float] = {}
+    cut_at: list[Tensor] = []
+    cut_obs: list[Tensor] = []
+    horizon, num_envs = rollout.reward.shape
+    check_finite("observation", obs)
+    for t in range(horizon):
+        norm.observe(obs)
+        rollout.obs[t] = norm(obs)
+        action, rollout.mean[t] = policy.sample(rollout.obs[t], noise)
+        rollout.action[t] = action
+        step = env.step(action)
+        check_finite("observation", step.obs)
+        check_finite("reward", step.reward, step.log)
+        rollout.reward[t], rollout.terminated[t] = step.reward, step.terminated
+        rollout.truncated[t] = step.truncated
+        rows = (step.truncated & ~step.terminated).nonzero().squeeze(-1)
+        if len(rows):
+            reached = step.final_obs[rows]
+            check_finite("final observation of a timed-out episode", reached)
+            cut_at.append(rows + t * num_envs)
+            cut_obs.append(norm(reached))
+        episodes.count(step.reward, step.terminated, step.truncated)
+        for name, value in step.log.items():
+            terms[name] = terms.get(name, 0.0) + value / horizon
+        obs = step.obs
+    rollout.obs[horizon] = norm(obs)
+    rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, policy.log_std))
+    rollout.cut_at = torch.cat(cut_at) if cut_at else rollout.cut_at[:0]
+    rollout.cut_obs = torch.cat(cut_obs) if cut_obs else rollout.cut_obs[:0]
+    rollout.terms = terms
+    return obs

@@ -1,0 +1,235 @@
+"""The trainer: collect, learn, and a state from which training goes on bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from poise.errors import PoiseError
+from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
+from poise.learn.config import PPOConfig
+from poise.learn.policy import PolicyBundle
+from poise.learn.ppo import PPO, UpdateStats
+from poise.learn.protocols import VecEnv
+from poise.learn.rollout import Episodes, Rollout, collect
+from poise.learn.state import State, load_module, prefixed, take, under
+
+
+@dataclass(frozen=True)
+class IterationStats:
+    """What one iteration did; all numbers but the times are the same for the same seed."""
+
+    iteration: int
+    """Iterations finished, this one included."""
+    samples: int
+    """Control steps learned from, over all iterations."""
+    reward: float
+    """Mean reward per control step."""
+    episode_length: float
+    """Mean control steps of the episodes that ended in this iteration; if none did, of the last
+    iteration where one did (NaN before the first)."""
+    episode_reward: float
+    """Mean sum of rewards of the same episodes."""
+    failure_rate: float
+    """Share of the same episodes that ended by failure."""
+    episodes: int
+    """Episodes that ended in this iteration."""
+    update: UpdateStats
+    terms: Mapping[str, float]
+    """Means of the environment's log over this iteration."""
+    seconds: float
+    """Training time since the first iteration, over all resumed runs."""
+    collect_seconds: float
+    update_seconds: float
+
+    @property
+    def samples_per_s(self) -> float:
+        """Samples of this iteration over its time, collection and update together."""
+        return self.batch / (self.collect_seconds + self.update_seconds)
+
+    batch: int = 0
+    """Control steps of this iteration."""
+
+    def row(self) -> dict[str, float]:
+        """All numbers under flat names for a log; the times come last, under "time/"."""
+        names = ("iteration", "samples", "reward", "episode_length", "episode_reward", "failure_rate")
+        row: dict[str, float] = {name: getattr(self, name) for name in (*names, "episodes")}
+        row |= {f"update/{k}": v for k, v in dataclasses.asdict(self.update).items()}
+        row |= {f"env/{k}": v for k, v in self.terms.items()}
+        return row | {
+            "time/seconds": self.seconds,
+            "time/collect": self.collect_seconds,
+            "time/update": self.update_seconds,
+            "time/samples_per_s": self.samples_per_s,
+        }
+
+
+class Trainer:
+    """PPO on one vectorised environment.
+
+    Args:
+        env: the environment; it is reset here.
+        config: settings of PPO.
+        seed: seeds the learner (the environment has a seed of its own).
+        character: identity of the body that is trained, such as a hash; a checkpoint of another
+            one is refused.
+        metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
+        warm_start: a policy whose weights and observation statistics to start from; the action
+            noise stays the config's.
+    """
+
+    def __init__(
+        self,
+        env: VecEnv,
+        config: PPOConfig | None = None,
+        seed: int = 0,
+        character: str = "",
+        metadata: Mapping[str, Any] | None = None,
+        warm_start: PolicyBundle | None = None,
+    ):
+        self.env, self.config, self.seed = env, config or PPOConfig(), seed
+        self.character, self.metadata = character, dict(metadata or {})
+        self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device)
+        if warm_start is not None:
+            load_module(self.ppo.actor.norm, prefixed("norm", warm_start.norm.state_dict()), "norm")
+            mean = prefixed("policy/mean", warm_start.policy.mean.state_dict())
+            load_module(self.ppo.actor.policy.mean, mean, "policy/mean")
+        self.rollout = Rollout(
+            self.config.horizon, env.num_envs, env.num_obs, env.num_actions, torch.device(env.device)
+        )
+        self.episodes = Episodes(env.num_envs, torch.device(env.device))
+        self.iteration, self.samples, self.seconds = 0, 0, 0.0
+        # Length, reward and failure share of the last episodes that ended.
+        self._ended = (math.nan, math.nan, math.nan)
+        self._obs: Tensor | None = None
+
+    def iterate(self) -> IterationStats:
+        """Collects one batch and learns from it.
+
+        A number that is not finite raises a `TrainingError`; the policy then is still that of
+        the last good iteration, but the environment has moved on.
+        """
+        start = time.perf_counter()
+        obs = self._begin() if self._obs is None else self._obs
+        ppo, rollout = self.ppo, self.rollout
+        self._obs = collect(
+            self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise
+        )
+        collected = time.perf_counter()
+        update = ppo.update(rollout, train_policy=self.iteration >= self.config.critic_warmup)
+        done = time.perf_counter()
+        self.iteration += 1
+        self.samples += rollout.samples
+        self.seconds += done - start
+        ended = self.episodes
+        if ended.finished:
+            sums = (ended.finished_length, ended.finished_total, ended.failures)
+            self._ended = (sums[0] / ended.finished, sums[1] / ended.finished, sums[2] / ended.finished)
+        return IterationStats(
+            iteration=self.iteration,
+            samples=self.samples,
+            reward=float(rollout.reward.mean()),
+            episode_length=self._ended[0],
+            episode_reward=self._ended[1],
+            failure_rate=self._ended[2],
+            episodes=ended.finished,
+            update=update,
+            terms=rollout.terms,
+            seconds=self.seconds,
+            collect_seconds=collected - start,
+            update_seconds=done - collected,
+            batch=rollout.samples,
+        )
+
+    def _begin(self) -> Tensor:
+        """The first observation, after some steps that only gather statistics."""
+        obs, norm = self.env.reset(), self.ppo.actor.norm
+        if float(norm.count) > 0:
+            return obs
+        for _ in range(self.config.norm_warmup):
+            norm.observe(obs)
+            with torch.no_grad():
+                obs = self.env.step(self.ppo.actor.policy.act(norm(obs), self.ppo.noise)).obs
+        norm.freeze()
+        return obs
+
+    def policy(self) -> PolicyBundle:
+        """A copy of the present policy, which later training does not change."""
+        return self.ppo.actor.copy()
+
+    def state(self) -> State:
+        """Copies of everything that training goes on from."""
+        if self._obs is None:
+            self._obs = self._begin()
+        counters = (self.iteration, self.samples, self.seconds, *self._ended)
+        return (
+            self.ppo.state()
+            | prefixed("env", self.env.state())
+            | {
+                "trainer/obs": self._obs.clone(),
+                "trainer/episode_length": self.episodes.length.clone(),
+                "trainer/episode_reward": self.episodes.total.clone(),
+                "trainer/counters": torch.tensor(counters, dtype=torch.float64),
+            }
+        )
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from what `state` returned, with the same environment and network sizes."""
+        device = torch.device(self.env.device)
+        obs = take(state, "trainer/obs")
+        if obs.shape != (self.env.num_envs, self.env.num_obs):
+            raise PoiseError(
+                f"the saved state is of {obs.shape[0]} environments with {obs.shape[1]} observations, "
+                f"this run has {self.env.num_envs} with {self.env.num_obs}",
+                hint="Resume with the number of environments and the terms it was saved with",
+            )
+        self.ppo.load_state(state)
+        self.env.load_state(under("env", state))
+        self._obs = obs.to(device, copy=True)
+        self.episodes.length.copy_(take(state, "trainer/episode_length"))
+        self.episodes.total.copy_(take(state, "trainer/episode_reward"))
+        iteration, samples, self.seconds, a, b, c = take(state, "trainer/counters").tolist()
+        self.iteration, self.samples, self._ended = int(iteration), int(samples), (a, b, c)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the whole state as a checkpoint, from which `load` or `load_policy` reads."""
+        meta = {
+            "kind": "trainer",
+            **self.ppo.actor.identity(self.character),
+            "num_envs": self.env.num_envs,
+            "seed": self.seed,
+            "config": dataclasses.asdict(self.config),
+            "iteration": self.iteration,
+            "samples": self.samples,
+            "seconds": self.seconds,
+            "metadata": self.metadata,
+        }
+        save_checkpoint(path, self.state(), meta)
+
+    def load(self, path: str | Path) -> dict[str, Any]:
+        """Goes on from a checkpoint and returns its metadata.
+
+        Another character, observation, action or network size raises a `PoiseError`; other
+        settings may differ, the present ones hold from here on.
+        """
+        tensors, meta = load_checkpoint(path)
+        check_fits(
+            meta,
+            path,
+            kind="trainer",
+            character=self.character,
+            num_obs=self.env.num_obs,
+            num_actions=self.env.num_actions,
+            num_envs=self.env.num_envs,
+            policy=self.ppo.actor.shape,
+        )
+        self.load_state(tensors)
+        return meta

@@ -1,0 +1,228 @@
+"""Does a motion look physical: sliding, penetration, floating, jerk; no reference is needed.
+
+The same functions serve reference kinematics and simulation, so before and after compare. Heights
+are metres above the ground, Z up; results are millimetres, or as stated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.errors import PoiseError
+from poise.metrics.help import GRAVITY
+from poise.metrics.masking import masked_mean, span_mask
+from poise.metrics.tracking import MM, PHC_FPS
+
+CONTACT_HEIGHT = 0.02
+"""m; a foot point above this is not in contact."""
+CONTACT_RISE = 0.2
+"""m/s; a foot point that rises or falls faster is landing or leaving, not in contact."""
+BALLISTIC_TOLERANCE = 0.4
+"""Share of g by which the vertical acceleration may differ from -g in flight."""
+BALLISTIC_WINDOW = 0.1
+"""s; time over which the vertical acceleration of the centre of mass is fitted."""
+
+
+class Penetration(NamedTuple):
+    """mean_mm over all valid frames, max_mm, and the share of frames below the ground, each `(...)`."""
+
+    mean_mm: Tensor
+    max_mm: Tensor
+    share: Tensor
+
+
+def _full(mask: Tensor | None, like: Tensor) -> Tensor:
+    return torch.ones_like(like, dtype=torch.bool) if mask is None else mask.expand_as(like)
+
+
+def foot_contacts(
+    foot_points: Tensor,
+    fps: float,
+    *,
+    height: float = CONTACT_HEIGHT,
+    rise: float = CONTACT_RISE,
+    ground: float = 0.0,
+    mask: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Horizontal speed in mm/s and contact of each foot point between frames, both `(..., T - 1, F)`.
+
+    A point `(..., T, F, 3)` is in contact from t to t+1 when it is within `height` of the ground in
+    both frames (deeper counts as in contact) and its vertical speed is at most `rise`.
+    """
+    if foot_points.ndim < 3 or foot_points.shape[-1] != 3:
+        raise PoiseError(f"foot points must be (..., T, F, 3), got {tuple(foot_points.shape)}")
+    step = torch.diff(foot_points, dim=-3) * fps
+    low = foot_points[..., 2] - ground <= height
+    contact = low[..., 1:, :] & low[..., :-1, :] & (step[..., 2].abs() <= rise)
+    if mask is not None:
+        contact = contact & span_mask(mask, 1).unsqueeze(-1)
+    return step[..., :2].norm(dim=-1) * MM, contact
+
+
+def foot_slide(
+    foot_points: Tensor,
+    fps: float,
+    *,
+    height: float = CONTACT_HEIGHT,
+    rise: float = CONTACT_RISE,
+    ground: float = 0.0,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Poise's foot slide, mm/s: mean horizontal speed of foot points while in contact; `(...)`.
+
+    Contact as in `foot_contacts`; the mean runs over all (frame, point) pairs in contact. NaN
+    without any contact. A swinging foot that skims lower than `height` counts, on both sides alike.
+    """
+    speed, contact = foot_contacts(foot_points, fps, height=height, rise=rise, ground=ground, mask=mask)
+    return masked_mean(speed, contact, (-2, -1))
+
+
+def uhc_skate(foot_points: Tensor, ground: float = 0.0, mask: Tensor | None = None) -> Tensor:
+    """UHC's skate, mm per frame: per-frame mean XY displacement of points at z <= 0 in both frames.
+
+    A frame without such points counts zero; the mean runs over the T - 1 steps. No rate is applied
+    (UHC's data are at 30 Hz).
+    """
+    low = foot_points[..., 2] <= ground
+    contact = low[..., 1:, :] & low[..., :-1, :]
+    moved = torch.diff(foot_points[..., :2], dim=-3).norm(dim=-1) * MM
+    per_frame = torch.nan_to_num(masked_mean(moved, contact, -1), nan=0.0)
+    return masked_mean(per_frame, None if mask is None else span_mask(mask, 1), -1)
+
+
+def uhc_penetration(points: Tensor, ground: float = 0.0, mask: Tensor | None = None) -> Tensor:
+    """UHC's penetration, mm: mean depth of the points with z < 0 (zero without any), mean of frames."""
+    depth = (ground - points[..., 2]) * MM
+    per_frame = torch.nan_to_num(masked_mean(depth, depth > 0, -1), nan=0.0)
+    return masked_mean(per_frame, mask, -1)
+
+
+def physdiff_penetrate(lowest: Tensor, tolerance: float = 0.005, mask: Tensor | None = None) -> Tensor:
+    """PhysDiff's penetrate, mm: depth of the lowest point, zero within `tolerance` m, mean of frames."""
+    depth = torch.where(lowest < -tolerance, -lowest, torch.zeros_like(lowest))
+    return masked_mean(depth, mask, -1) * MM
+
+
+def physdiff_float(lowest: Tensor, tolerance: float = 0.005, mask: Tensor | None = None) -> Tensor:
+    """PhysDiff's float, mm: height of the lowest point, zero within `tolerance` m; flight counts too."""
+    gap = torch.where(lowest > tolerance, lowest, torch.zeros_like(lowest))
+    return masked_mean(gap, mask, -1) * MM
+
+
+def s2h_foot_penetration(height: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Skeleton2Humanoid's FP (mm, negative) and FQ (share) of joint heights `(..., T, J)` in m.
+
+    The paper gives no formula; read as the means of `min(0, h)` and `[h < 0]` over all frames and
+    the joints handed in (feet for FP and FQ, all joints for JQ).
+    """
+    valid = _full(None if mask is None else mask.unsqueeze(-1), height)
+    fp = masked_mean(height.clamp(max=0), valid, (-2, -1)) * MM
+    return fp, masked_mean((height < 0).to(height.dtype), valid, (-2, -1))
+
+
+def penetration(lowest: Tensor, mask: Tensor | None = None, ground: float = 0.0) -> Penetration:
+    """Depth of the lowest point `(..., T)` m below the ground; results `(...)`.
+
+    mean over all valid frames of `max(0, ground - h)`, frames without penetration counting zero.
+    """
+    valid = _full(mask, lowest)
+    depth = (ground - lowest).clamp_min(0) * MM
+    held = torch.where(valid, depth, torch.zeros_like(depth))
+    return Penetration(
+        masked_mean(depth, valid, -1), held.amax(-1), masked_mean((depth > 0).to(depth.dtype), valid, -1)
+    )
+
+
+def _window_any(flags: Tensor, half: int) -> Tensor:
+    """True within `half` frames of a true flag, along the last dim."""
+    if half == 0 or flags.shape[-1] == 0:
+        return flags
+    flat = flags.reshape(-1, 1, flags.shape[-1]).to(torch.float32)
+    spread = torch.nn.functional.max_pool1d(flat, 2 * half + 1, stride=1, padding=half)
+    return spread.reshape(flags.shape) > 0.5
+
+
+def ballistic(
+    com_height: Tensor,
+    fps: float,
+    *,
+    tolerance: float = BALLISTIC_TOLERANCE,
+    window: float = BALLISTIC_WINDOW,
+    gravity: float = GRAVITY,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Frames `(..., T)` in free flight, told from the centre of mass height `(..., T)` m alone.
+
+    A parabola is fitted to every window of `window` seconds (an odd number of frames, at least 3).
+    Where its acceleration is -g within `tolerance` g, all frames of the window are in flight. The
+    fit tells a jump from a character that hovers, whose acceleration is near zero.
+    """
+    half = max(1, int(window * fps / 2 + 1e-6))
+    frames = com_height.shape[-1]
+    flags = torch.zeros_like(com_height, dtype=torch.bool)
+    if frames < 2 * half + 1:
+        return flags
+    # Savitzky-Golay: z'' = 2 sum_k c_k z_{t+k},  c_k = (k^2 - m) / sum (k^2 - m)^2,  m = mean k^2
+    k2 = torch.arange(-half, half + 1, dtype=com_height.dtype, device=com_height.device).square()
+    c = k2 - k2.mean()
+    c = 2.0 * c / c.square().sum() * fps**2
+    # Heights are taken relative to the window's middle, which keeps float32 exact enough.
+    windows = com_height.unfold(-1, 2 * half + 1, 1)
+    acceleration = ((windows - windows[..., half : half + 1]) * c).sum(-1)
+    falling = (acceleration + gravity).abs() <= tolerance * gravity
+    if mask is not None:
+        falling = falling & span_mask(mask, 2 * half)
+    flags[..., half : frames - half] = falling
+    return _window_any(flags, half)
+
+
+def float_gaps(
+    lowest: Tensor,
+    com_height: Tensor,
+    fps: float,
+    *,
+    mask: Tensor | None = None,
+    ground: float = 0.0,
+    tolerance: float = BALLISTIC_TOLERANCE,
+) -> tuple[Tensor, Tensor]:
+    """Gap in mm between the lowest point and the ground, and where contact is due, both `(..., T)`.
+
+    Contact is due in every frame that is not `ballistic`: nothing but the ground can hold a body
+    that does not fall freely.
+    """
+    due = _full(mask, lowest) & ~ballistic(com_height, fps, tolerance=tolerance, mask=mask)
+    return (lowest - ground).clamp_min(0) * MM, due
+
+
+def floating(
+    lowest: Tensor,
+    com_height: Tensor,
+    fps: float,
+    *,
+    mask: Tensor | None = None,
+    ground: float = 0.0,
+    tolerance: float = BALLISTIC_TOLERANCE,
+) -> Tensor:
+    """Mean gap, mm, between the lowest point `(..., T)` m and the ground where contact is due; `(...)`.
+
+    See `float_gaps`. Frames that touch count zero; NaN when all frames are in flight.
+    """
+    gap, due = float_gaps(lowest, com_height, fps, mask=mask, ground=ground, tolerance=tolerance)
+    return masked_mean(gap, due, -1)
+
+
+def jerk(pos: Tensor, fps: float) -> Tensor:
+    """Mean over bodies of `||third difference|| fps^3`, m/s^3; `(..., T, B, 3)` gives `(..., T - 3)`."""
+    return torch.diff(pos, n=3, dim=-3).norm(dim=-1).mean(-1) * fps**3
+
+
+def smoothness(pos: Tensor, fps: float = PHC_FPS) -> Tensor:
+    """Skeleton2Humanoid's SM: mean joint step, mm per frame at 30 Hz; `(..., T - 1)`.
+
+    Compare it with the reference's value: a frozen character scores zero, so lower is not better.
+    Other rates are rescaled by `fps / 30`.
+    """
+    return torch.diff(pos, dim=-3).norm(dim=-1).mean(-1) * (MM * fps / PHC_FPS)

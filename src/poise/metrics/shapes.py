@@ -1,0 +1,195 @@
+"""Where a character's geoms touch: lowest points, surface points of the feet, centre of mass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from poise.errors import PoiseError
+from poise.spatial import normalize, quat_mul, quat_rotate, quat_to_matrix
+
+SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 2, 3, 4, 5, 6
+"""Geom kinds by MuJoCo's `mjtGeom` numbers."""
+KINDS = {"sphere": SPHERE, "capsule": CAPSULE, "ellipsoid": ELLIPSOID, "cylinder": CYLINDER, "box": BOX}
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """The G collision geoms of a character, in MuJoCo's conventions.
+
+    kind: `(G,)` int, `mjtGeom`: sphere 2, capsule 3, ellipsoid 4, cylinder 5, box 6.
+    size: `(G, 3)` m: radius; radius and half length along local Z (capsule, cylinder); half axes.
+    pos, quat: `(G, 3)` m and `(G, 4)` wxyz, the geom in its body's frame.
+    body: `(G,)` int, index of the geom's body along dim -2 of the body poses.
+    mass: `(G,)` kg, or None for one density throughout.
+    """
+
+    kind: Tensor
+    size: Tensor
+    pos: Tensor
+    quat: Tensor
+    body: Tensor
+    mass: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("kind", "size", "pos", "quat", "body"):
+            object.__setattr__(self, name, torch.as_tensor(getattr(self, name)))
+        object.__setattr__(self, "kind", self.kind.long())
+        object.__setattr__(self, "body", self.body.long())
+        if self.mass is not None:
+            object.__setattr__(self, "mass", torch.as_tensor(self.mass))
+        count = len(self.kind)
+        want = {
+            "kind": (count,),
+            "size": (count, 3),
+            "pos": (count, 3),
+            "quat": (count, 4),
+            "body": (count,),
+        }
+        if self.mass is not None:
+            want["mass"] = (count,)
+        for name, shape in want.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise PoiseError(
+                    f"shapes.{name} must be {shape} for {count} geoms, "
+                    f"got {tuple(getattr(self, name).shape)}"
+                )
+        known = (self.kind >= SPHERE) & (self.kind <= BOX)
+        if count == 0 or not bool(known.all()):
+            what = "no geom" if count == 0 else f"a geom of kind {int(self.kind[~known][0])}"
+            raise PoiseError(f"shapes hold {what}", hint=f"Known kinds: {KINDS}")
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def of_bodies(self, bodies: Sequence[int]) -> Shapes:
+        """The geoms that belong to `bodies`."""
+        keep = torch.isin(self.body, torch.as_tensor(list(bodies), dtype=torch.long))
+        if not bool(keep.any()):
+            raise PoiseError(f"none of the bodies {list(bodies)} has a geom")
+        mass = None if self.mass is None else self.mass[keep]
+        parts = (a[keep] for a in (self.kind, self.size, self.pos, self.quat, self.body))
+        return Shapes(*parts, mass=mass)
+
+
+def _placed(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> tuple[Tensor, Tensor, Tensor]:
+    """World geom centres `(..., G, 3)` and rotations `(..., G, 4)`, sizes `(G, 3)`; one dtype."""
+    if (*body_pos.shape[:-1], 4) != tuple(body_quat.shape) or body_pos.shape[-1] != 3:
+        raise PoiseError(
+            f"body poses must be (..., B, 3) and (..., B, 4), got {tuple(body_pos.shape)} "
+            f"and {tuple(body_quat.shape)}"
+        )
+    if int(shapes.body.max()) >= body_pos.shape[-2]:
+        raise PoiseError(
+            f"shapes name body {int(shapes.body.max())}, but the poses hold {body_pos.shape[-2]} bodies"
+        )
+    pos, quat, size = (a.to(body_pos) for a in (shapes.pos, shapes.quat, shapes.size))
+    quat = normalize(quat)
+    owner = shapes.body.to(body_pos.device)
+    p, q = body_pos[..., owner, :], body_quat[..., owner, :]
+    return p + quat_rotate(q, pos.expand_as(p)), quat_mul(q, quat.expand_as(q)), size
+
+
+def geom_heights(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
+    """Lowest world z of every geom, m, exact; `(..., B, 3)` and `(..., B, 4)` give `(..., G)`.
+
+    The support function of each solid in direction -z; `n` is the world's z in geom axes.
+    """
+    centre, quat, size = _placed(body_pos, body_quat, shapes)
+    n = quat_to_matrix(quat)[..., 2, :].abs()
+    kind = shapes.kind.to(body_pos.device)
+    r, half = size[:, 0], size[:, 1]
+    # sphere r;  capsule r + h |n_z|;  ellipsoid sqrt(sum (s_i n_i)^2);
+    # cylinder r sqrt(1 - n_z^2) + h |n_z|;  box sum s_i |n_i|
+    reach = torch.stack(
+        (
+            r.expand_as(n[..., 0]),
+            r + half * n[..., 2],
+            (size * n).square().sum(-1).sqrt(),
+            r * (1 - n[..., 2].square()).clamp_min(0).sqrt() + half * n[..., 2],
+            (size * n).sum(-1),
+        ),
+        -1,
+    )
+    picked = reach.gather(-1, (kind - SPHERE).expand_as(n[..., 0]).unsqueeze(-1)).squeeze(-1)
+    return centre[..., 2] - picked
+
+
+def lowest_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
+    """Lowest world z over all geoms per frame, m: `(..., B, 3)` and `(..., B, 4)` give `(...)`."""
+    return geom_heights(body_pos, body_quat, shapes).amin(-1)
+
+
+_CORNERS = tuple(product((-1.0, 1.0), repeat=3))
+_AXES = (
+    (1.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (0.0, 0.0, -1.0),
+)
+_BALL = (*(tuple(c / math.sqrt(3) for c in corner) for corner in _CORNERS), *_AXES)
+_RIM = tuple(
+    (math.cos(a), math.sin(a), z) for a in (k * math.pi / 4 for k in range(8)) for z in (-1.0, 1.0)
+)
+
+
+def _surface(kind: int, size: Tensor) -> Tensor:
+    """Material points `(P, 3)` on one geom's surface, in its own frame."""
+    r, half = size[0], size[1]
+    if kind == BOX:
+        return size.new_tensor(_CORNERS) * size
+    if kind == CYLINDER:
+        return size.new_tensor(_RIM) * torch.stack((r, r, half))
+    ball = size.new_tensor(_BALL)
+    if kind == ELLIPSOID:
+        return ball * size
+    if kind == SPHERE:
+        return ball * r
+    ends = size.new_tensor(((0.0, 0.0, -1.0), (0.0, 0.0, 1.0))) * half
+    return (ends[:, None] + ball * r).reshape(-1, 3)
+
+
+def foot_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes, feet: Sequence[int]) -> Tensor:
+    """World positions `(..., F, 3)` m of material points on the geoms of the foot bodies `feet`.
+
+    A box gives its 8 corners, a cylinder 16 rim points, a sphere or ellipsoid 14 surface points, a
+    capsule 14 on each end ball. The points ride on the body, so a foot that rolls without slipping
+    has no speed where it touches.
+    """
+    owned = shapes.of_bodies(feet)
+    centre, quat, size = _placed(body_pos, body_quat, owned)
+    points = []
+    for g in range(len(owned)):
+        local = _surface(int(owned.kind[g]), size[g])
+        q = quat[..., g, None, :].expand(*quat.shape[:-2], len(local), 4)
+        points.append(centre[..., g, None, :] + quat_rotate(q, local.expand(*q.shape[:-1], 3)))
+    return torch.cat(points, -2)
+
+
+def centre_of_mass(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
+    """Centre of mass `(..., 3)` m from the geoms' masses, or from their volumes (one density)."""
+    centre, _, size = _placed(body_pos, body_quat, shapes)
+    if shapes.mass is not None:
+        weight = shapes.mass.to(size)
+    else:
+        a, b, c = size.unbind(-1)
+        ball = 4.0 / 3.0 * math.pi
+        volumes = torch.stack(
+            (
+                ball * a**3,
+                ball * a**3 + 2 * math.pi * a**2 * b,
+                ball * a * b * c,
+                2 * math.pi * a**2 * b,
+                8 * a * b * c,
+            ),
+            -1,
+        )
+        weight = volumes.gather(-1, (shapes.kind.to(size.device) - SPHERE).unsqueeze(-1)).squeeze(-1)
+    return (centre * weight.unsqueeze(-1)).sum(-2) / weight.sum()

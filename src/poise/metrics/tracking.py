@@ -1,0 +1,185 @@
+"""How closely a motion follows its reference: position, velocity and acceleration errors, success.
+
+Positions are `(..., T, B, 3)` in metres, world, Z up; errors come out in millimetres per frame.
+The definitions are those of UHC's and PHC's evaluation (Luo et al. 2021, 2023).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.errors import PoiseError, did_you_mean
+
+MM = 1000.0
+PHC_FPS = 30.0
+"""PHC's velocity and acceleration errors are differences between frames at this rate."""
+
+
+def _check_pair(pos: Tensor, ref: Tensor) -> None:
+    if pos.shape != ref.shape or pos.ndim < 3 or pos.shape[-1] != 3:
+        raise PoiseError(
+            "positions and reference must both be (..., T, B, 3), "
+            f"got {tuple(pos.shape)} and {tuple(ref.shape)}"
+        )
+
+
+def _check_fps(fps: float) -> None:
+    if not 0 < fps < float("inf"):
+        raise PoiseError(f"the frame rate must be above 0, got {fps}")
+
+
+def mpjpe_global(pos: Tensor, ref: Tensor) -> Tensor:
+    """Mean per-joint position error in the world, mm: `mean_j ||p_j - p_ref,j||`; returns `(..., T)`."""
+    _check_pair(pos, ref)
+    return (pos - ref).norm(dim=-1).mean(-1) * MM
+
+
+def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
+    """MPJPE after each side's own root position is subtracted, mm; returns `(..., T)`.
+
+    The root itself counts with error zero, as in PHC. Heading is not aligned.
+    """
+    _check_pair(pos, ref)
+    local = pos - pos[..., root : root + 1, :]
+    local_ref = ref - ref[..., root : root + 1, :]
+    return (local - local_ref).norm(dim=-1).mean(-1) * MM
+
+
+def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
+    """MPJPE after the best similarity (rotation, translation, scale) per frame, mm; returns `(..., T)`.
+
+    Procrustes: with centred X, Y and `X^T Y = U S V^T`, `R = V D U^T`, `D = diag(1, 1, det(V U^T))`,
+    `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
+    """
+    _check_pair(pos, ref)
+    x, y = pos.double(), ref.double()
+    x, y = x - x.mean(-2, keepdim=True), y - y.mean(-2, keepdim=True)
+    u, s, vh = torch.linalg.svd(x.mT @ y)
+    v = vh.mT
+    sign = torch.linalg.det(v @ u.mT).sign()
+    d = torch.ones_like(s)
+    d[..., 2] = torch.where(sign < 0, -1.0, 1.0)
+    rotation = v @ (d.unsqueeze(-1) * u.mT)
+    size = x.square().sum((-1, -2))
+    scale = (s * d).sum(-1) / size.clamp_min(1e-18)
+    fitted = scale[..., None, None] * (x @ rotation.mT)
+    return ((fitted - y).norm(dim=-1).mean(-1) * MM).to(pos.dtype)
+
+
+def velocity_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor:
+    """Velocity error in PHC's unit, mm per frame at 30 Hz; returns `(..., T - 1)`.
+
+    `mean_j ||(p_{t+1} - p_t) - (p_ref,t+1 - p_ref,t)||`. Motions at another rate are rescaled to
+    the 30 Hz definition by `fps / 30` (mm in 1/30 s); they are not resampled, so noise above
+    15 Hz counts at high rates and cannot be seen at 30 Hz.
+    """
+    _check_pair(pos, ref)
+    _check_fps(fps)
+    return torch.diff(pos - ref, dim=-3).norm(dim=-1).mean(-1) * (MM * fps / PHC_FPS)
+
+
+def acceleration_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor:
+    """Acceleration error in PHC's unit, mm per frame^2 at 30 Hz; returns `(..., T - 2)`.
+
+    `mean_j ||second difference of (p - p_ref)||`, rescaled by `(fps / 30)^2` for other rates
+    (see `velocity_error` for what that means).
+    """
+    _check_pair(pos, ref)
+    _check_fps(fps)
+    return torch.diff(pos - ref, n=2, dim=-3).norm(dim=-1).mean(-1) * (MM * (fps / PHC_FPS) ** 2)
+
+
+@dataclass(frozen=True)
+class SuccessRule:
+    """A named failure test; an episode succeeds when no frame fails.
+
+    measure: "mean" or "max" over bodies of `||p - p_ref||` must stay within `limit_m`;
+        "below_min": the root must not sink more than `limit_m` below the lowest reference root;
+        "below_ref": nor more than `limit_m` below the reference root of the same frame.
+    """
+
+    name: str
+    measure: Literal["mean", "max", "below_min", "below_ref"]
+    limit_m: float
+    source: str
+
+
+RULES: Mapping[str, SuccessRule] = MappingProxyType(
+    {
+        r.name: r
+        for r in (
+            SuccessRule("phc", "mean", 0.5, "mean over bodies: UHC's and PHC's evaluation"),
+            SuccessRule("phc_strict", "max", 0.5, "any body: the strict evaluation of PHC's code"),
+            SuccessRule("any_25cm", "max", 0.25, "any body: where PHC's code ends training"),
+            SuccessRule("rfc_height", "below_min", 0.1, "root height: RFC's code"),
+            SuccessRule("s2h_root", "below_ref", 0.5, "root height: Skeleton2Humanoid, CRP"),
+        )
+    }
+)
+"""Success rules by name. Rates under different rules must not be compared: always name the rule."""
+
+
+def success_rule(rule: str | SuccessRule) -> SuccessRule:
+    """The rule of that name; an unknown name is answered with the nearest one."""
+    if isinstance(rule, SuccessRule):
+        return rule
+    if rule not in RULES:
+        raise PoiseError(f"there is no success rule '{rule}'", hint=did_you_mean(rule, tuple(RULES)))
+    return RULES[rule]
+
+
+class Outcome(NamedTuple):
+    """success: `(...)` bool. first_fail: `(...)` long, the first failing frame, -1 where none fails."""
+
+    success: Tensor
+    first_fail: Tensor
+
+
+def success(
+    pos: Tensor,
+    ref: Tensor,
+    lengths: Tensor,
+    rule: str | SuccessRule = "phc",
+    *,
+    bodies: Sequence[int] | None = None,
+    root: int = 0,
+    ref_min_height: Tensor | None = None,
+) -> Outcome:
+    """Which episodes follow their reference to the end, and where the others first fail.
+
+    Args:
+        pos, ref: `(..., T, B, 3)` m, padded after `lengths (...)` frames; padding is not looked at.
+        rule: a name in `RULES`, or a rule. A distance equal to the limit still passes; a position
+            that is not finite fails. An episode without frames does not succeed.
+        bodies: indices the distances are taken over (PHC leaves out toes and hands); all by default.
+        root: index of the root body, for the height rules.
+        ref_min_height: `(...)` m, lowest reference root height of the whole clip ("rfc_height");
+            by default the lowest within the episode.
+    """
+    _check_pair(pos, ref)
+    chosen = success_rule(rule)
+    if lengths.shape != pos.shape[:-3]:
+        raise PoiseError(f"lengths must be {tuple(pos.shape[:-3])}, got {tuple(lengths.shape)}")
+    valid = torch.arange(pos.shape[-3], device=pos.device) < lengths.unsqueeze(-1)
+    if chosen.measure in ("mean", "max"):
+        picked = slice(None) if bodies is None else list(bodies)
+        distance = (pos - ref)[..., picked, :].norm(dim=-1)
+        measured = distance.mean(-1) if chosen.measure == "mean" else distance.amax(-1)
+    else:
+        level = ref[..., root, 2]
+        if chosen.measure == "below_min":
+            if ref_min_height is None:
+                ref_min_height = torch.where(valid, level, torch.full_like(level, torch.inf)).amin(-1)
+            level = ref_min_height.unsqueeze(-1)
+        measured = level - pos[..., root, 2]
+    # Written as "not within" so that NaN counts as a failure.
+    bad = ~(measured <= chosen.limit_m) & valid
+    failed = bad.any(-1)
+    first = torch.where(failed, bad.long().argmax(-1), torch.full_like(lengths.long(), -1))
+    return Outcome(~failed & (lengths > 0), first)

@@ -1,0 +1,309 @@
+"""BVH files: the text, its hierarchy and its rows of numbers, with the line of every mistake."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.motion.io.text import (
+    MAX_HEADER_LINES,
+    MAX_JOINTS,
+    MAX_VALUE,
+    append_numbers,
+    at_line,
+    decode,
+    first_bad,
+    number,
+    read_bytes,
+    shown,
+)
+
+POSITIONS = ("Xposition", "Yposition", "Zposition")
+ROTATIONS = ("Xrotation", "Yrotation", "Zrotation")
+_CANONICAL = {name.lower(): name for name in POSITIONS + ROTATIONS}
+
+
+@dataclass
+class BvhJoint:
+    """One joint of the hierarchy as written, file units."""
+
+    name: str
+    parent: int
+    line: int
+    offset: tuple[float, float, float] | None = None
+    channels: tuple[str, ...] | None = None
+    tips: list[tuple[float, float, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class BvhFile:
+    """A parsed file: joints in file order and `values (T, C)`, degrees and file units."""
+
+    joints: list[BvhJoint]
+    values: np.ndarray
+    frame_time: float
+    notes: tuple[str, ...]
+
+
+class _Tokens:
+    """The header's words, each with its line."""
+
+    def __init__(self, lines: list[bytes], path: Path):
+        self.path, self.words, self.at = path, [], 0
+        self.words: list[tuple[str, int]] = []
+        self.motion_line: int | None = None
+        for i, line in enumerate(lines):
+            if i >= MAX_HEADER_LINES:
+                raise PoiseError(f"no MOTION in the first {MAX_HEADER_LINES} lines", path)
+            parts = decode(line, path, i + 1).replace("{", " { ").replace("}", " } ").split()
+            if parts and parts[0].upper() == "MOTION":
+                self.motion_line = i
+                return
+            self.words += [(part, i + 1) for part in parts]
+            self.last = i + 1
+
+    def done(self) -> bool:
+        return self.at >= len(self.words)
+
+    def place(self) -> str:
+        line = self.words[min(self.at, len(self.words) - 1)][1] if self.words else 1
+        return at_line(self.path, line)
+
+    def next(self, wanted: str) -> str:
+        if self.done():
+            cut = "MOTION starts" if self.motion_line is not None else "the file ends"
+            raise PoiseError(f"{cut} where {wanted} was expected", self.place(), "The file seems cut off")
+        word = self.words[self.at][0]
+        self.at += 1
+        return word
+
+    def expect(self, word: str) -> None:
+        got = self.next(f"'{word}'")
+        if got.upper() != word.upper():
+            self.at -= 1
+            raise PoiseError(f"'{word}' was expected, got {shown(got)}", self.place())
+
+    def vector(self) -> tuple[float, float, float]:
+        out = []
+        for _ in range(3):
+            word = self.next("a number")
+            self.at -= 1
+            out.append(number(word, self.place()))
+            self.at += 1
+        return out[0], out[1], out[2]
+
+    def name(self) -> str:
+        """All words up to the brace, so that names may hold blanks."""
+        words = [self.next("a joint name")]
+        if words[0] in "{}":
+            self.at -= 1
+            raise PoiseError("a joint has no name", self.place())
+        while not self.done() and self.words[self.at][0] != "{" and len(words) < 20:
+            words.append(self.next("'{'"))
+        return " ".join(words)
+
+
+def parse_bvh(path: Path) -> BvhFile:
+    """Reads a BVH file's hierarchy and motion; every refusal names the line."""
+    lines = read_bytes(path).splitlines()
+    tokens = _Tokens(lines, path)
+    joints = _hierarchy(tokens)
+    if tokens.motion_line is None:
+        raise PoiseError("the file ends before MOTION", path, "The file seems cut off")
+    return _motion(lines, tokens.motion_line + 1, joints, path)
+
+
+def _hierarchy(tokens: _Tokens) -> list[BvhJoint]:
+    tokens.expect("HIERARCHY")
+    joints: list[BvhJoint] = []
+    known: dict[str, int] = {}
+    # The open braces: a joint's index, or -1 for an End Site.
+    stack: list[int] = []
+    while not tokens.done():
+        place = tokens.place()
+        word = tokens.next("a joint").upper()
+        if word in ("ROOT", "JOINT"):
+            _open_joint(tokens, word, place, joints, known, stack)
+        elif word == "END":
+            tokens.next("'Site'")
+            tokens.expect("{")
+            if not stack or stack[-1] < 0:
+                raise PoiseError("an End Site stands outside a joint", place)
+            stack.append(-1)
+        elif word == "}":
+            if not stack:
+                raise PoiseError("a closing brace has no opening one", place)
+            stack.pop()
+        elif word == "OFFSET":
+            vector = tokens.vector()
+            _set_offset(joints, stack, vector, place)
+        elif word == "CHANNELS":
+            _set_channels(tokens, joints, stack, place)
+        else:
+            raise PoiseError(
+                f"{shown(word)} is not a BVH keyword",
+                place,
+                "Known: ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION",
+            )
+    _check_closed(tokens, joints, stack)
+    return joints
+
+
+def _open_joint(
+    tokens: _Tokens,
+    word: str,
+    place: str,
+    joints: list[BvhJoint],
+    known: dict[str, int],
+    stack: list[int],
+) -> None:
+    line = tokens.words[tokens.at - 1][1]
+    name = tokens.name()
+    if word == "ROOT" and joints:
+        raise PoiseError(f"a second ROOT, '{name}'", place, "Give each body its own file")
+    if word == "JOINT" and (not stack or stack[-1] < 0):
+        raise PoiseError(f"joint '{name}' stands outside any other joint", place)
+    if name in known:
+        raise PoiseError(
+            f"joint name '{name}' appears twice (first in line {known[name]})", place, "Rename one of them"
+        )
+    if len(joints) >= MAX_JOINTS:
+        raise PoiseError(f"more than {MAX_JOINTS} joints", place)
+    tokens.expect("{")
+    known[name] = line
+    joints.append(BvhJoint(name, stack[-1] if stack else -1, line))
+    stack.append(len(joints) - 1)
+
+
+def _set_offset(
+    joints: list[BvhJoint], stack: list[int], vector: tuple[float, float, float], place: str
+) -> None:
+    if not stack:
+        raise PoiseError("an OFFSET stands outside any joint", place)
+    if stack[-1] < 0:
+        joints[stack[-2]].tips.append(vector)
+    elif joints[stack[-1]].offset is not None:
+        raise PoiseError(f"joint '{joints[stack[-1]].name}' has two OFFSETs", place)
+    else:
+        joints[stack[-1]].offset = vector
+
+
+def _set_channels(tokens: _Tokens, joints: list[BvhJoint], stack: list[int], place: str) -> None:
+    if not stack or stack[-1] < 0:
+        raise PoiseError("CHANNELS stand outside any joint", place)
+    joint = joints[stack[-1]]
+    count = tokens.next("the number of channels")
+    if not (count.isdigit() and count.isascii()) or int(count) > 6:
+        raise PoiseError(
+            f"joint '{joint.name}' must have 0 to 6 channels, got {shown(count)}", place
+        )
+    if joint.channels is not None:
+        raise PoiseError(f"joint '{joint.name}' has two CHANNELS lines", place)
+    channels = []
+    for _ in range(int(count)):
+        word = tokens.next("a channel name")
+        if word.lower() not in _CANONICAL:
+            raise PoiseError(
+                f"{shown(word)} is not a channel of joint '{joint.name}'",
+                place,
+                f"Known: {', '.join(_CANONICAL.values())}",
+            )
+        channels.append(_CANONICAL[word.lower()])
+    if len(set(channels)) != len(channels):
+        raise PoiseError(f"joint '{joint.name}' names a channel twice", place)
+    joint.channels = tuple(channels)
+
+
+def _check_closed(tokens: _Tokens, joints: list[BvhJoint], stack: list[int]) -> None:
+    if not joints:
+        raise PoiseError("the hierarchy has no ROOT", tokens.place(), "The file seems cut off")
+    if stack:
+        open_joint = next(joints[j].name for j in reversed(stack) if j >= 0)
+        raise PoiseError(
+            f"the brace of joint '{open_joint}' is never closed", tokens.place(), "The file seems cut off"
+        )
+    for joint in joints:
+        for what, value in (("OFFSET", joint.offset), ("CHANNELS", joint.channels)):
+            if value is None:
+                raise PoiseError(f"joint '{joint.name}' has no {what}", at_line(tokens.path, joint.line))
+
+
+def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) -> BvhFile:
+    """The frames: count, time, and the rows with exactly one number per channel."""
+    width = sum(len(j.channels or ()) for j in joints)
+    rows = ((i + 1, line.split()) for i, line in enumerate(lines[start:], start) if line.strip())
+    count_line, count_text = _entry(rows, b"Frames:", path, len(lines))
+    if not count_text.isdigit():
+        raise PoiseError(
+            f"the number of frames is {shown(count_text)}, which is no whole number",
+            at_line(path, count_line),
+        )
+    # More digits than this cannot be met by any file within the size limit.
+    stated = int(count_text[:12])
+    time_line, time_text = _entry(rows, b"Frame Time:", path, len(lines))
+    frame_time = number(time_text, at_line(path, time_line))
+    if frame_time <= 0:
+        raise PoiseError(
+            f"the frame time is {frame_time:g} s, which must be above 0", at_line(path, time_line)
+        )
+    if width == 0:
+        raise PoiseError("no joint has any channel, so nothing moves", path)
+    values: array[float] = array("d")
+    numbers: list[int] = []
+    extra = 0
+    for line, tokens in rows:
+        if len(numbers) == stated:
+            extra += 1
+            continue
+        if len(tokens) != width:
+            raise PoiseError(
+                f"the row of frame {len(numbers)} has {len(tokens)} numbers, but the channels need {width}",
+                at_line(path, line),
+            )
+        append_numbers(values, tokens, at_line(path, line))
+        numbers.append(line)
+    if len(numbers) < stated:
+        raise PoiseError(
+            f"{stated} frames are stated, but only {len(numbers)} rows follow",
+            at_line(path, count_line),
+            "The file seems cut off",
+        )
+    table = np.array(values).reshape(-1, width)
+    _check_values(table, joints, numbers, path)
+    rows_more = f"{extra} row{'s' if extra > 1 else ''}"
+    notes = (f"{rows_more} after the stated {stated} frames were left out",) if extra else ()
+    return BvhFile(joints, table, frame_time, notes)
+
+
+def _entry(rows, key: bytes, path: Path, end: int) -> tuple[int, bytes]:  # type: ignore[no-untyped-def]
+    """The line and value of "Frames: N" or "Frame Time: S"."""
+    line, tokens = next(rows, (end, None))
+    if tokens is None:
+        raise PoiseError(f"the file ends before '{key.decode()}'", path, "The file seems cut off")
+    text = b" ".join(tokens)
+    if not text.lower().startswith(key.lower()):
+        raise PoiseError(f"'{key.decode()}' was expected, got {shown(text)}", at_line(path, line))
+    value = text[len(key) :].strip()
+    if not value:
+        raise PoiseError(f"'{key.decode()}' has no value", at_line(path, line))
+    return line, value
+
+
+def _check_values(table: np.ndarray, joints: list[BvhJoint], lines: list[int], path: Path) -> None:
+    bad = first_bad(table)
+    if bad is None:
+        return
+    frame, column = bad
+    owners = [(j.name, c) for j in joints for c in j.channels or ()]
+    name, channel = owners[column]
+    value = table[frame, column]
+    what = f"larger than {MAX_VALUE:g}" if np.isfinite(value) else "not a finite number"
+    raise PoiseError(
+        f"{channel} of joint '{name}' at frame {frame} is {value:g}, {what}", at_line(path, lines[frame])
+    )
+
+

@@ -1,0 +1,165 @@
+"""Guesses about what motion files do not state, each with its evidence in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from poise.errors import PoiseError
+from poise.motion.info import landmarks
+from poise.motion.io.text import listed
+from poise.spatial import quat_angle, quat_conj, quat_mul
+
+ASF_UNIT_M = 0.0254 / 0.45
+"""Metres in the unit of the CMU library's ASF files (`length 0.45`, inches)."""
+
+UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
+_ALL_UNITS = {**UNITS, "ASF units": ASF_UNIT_M}
+# Rare units must fit clearly better than the common ones (a penalty on the log of the height).
+_RARE = {"inches": 0.25, "ASF units": 0.25}
+_TYPICAL_M = 1.65
+_GUESS_BAND = (0.5, 3.0)
+_STATED_BAND = (0.3, 4.0)
+
+_REST_ANGLE = np.radians(15.0)
+_TELEPORT_SPEED = 6.0
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A value and the sentence that tells why, empty where the value is a stated one."""
+
+    value: float | str
+    note: str = ""
+
+
+def stated_unit(height: float, unit_m: float, path: Path) -> Guess:
+    """The unit the user stated, refused if the person's size becomes absurd."""
+    size = height * unit_m
+    if _STATED_BAND[0] <= size <= _STATED_BAND[1]:
+        return Guess(unit_m)
+    best, metres = _closest(height)
+    raise PoiseError(
+        f"with {unit_m:g} m per unit the person would be {_size(size)} tall",
+        path,
+        f"Give another --unit METRES_PER_UNIT; {best} ({metres:.6g}) would make it "
+        f"{_size(height * metres)}",
+    )
+
+
+def guess_unit(height: float, how: str, hint: float | None, path: Path) -> Guess:
+    """Metres per unit from the skeleton's height in file units.
+
+    A unit that the file itself suggests (`hint`) is kept if it makes a plausible person.
+    """
+    if hint is not None and _GUESS_BAND[0] <= height * hint <= _GUESS_BAND[1]:
+        return Guess(
+            hint,
+            f"One file unit is taken as {hint:.6g} m by the file's `length` entry: the person is then "
+            f"{height * hint:.2f} m tall ({how})",
+        )
+    best, metres = _closest(height)
+    size = height * metres
+    if not _GUESS_BAND[0] <= size <= _GUESS_BAND[1]:
+        raise PoiseError(
+            f"the person is {height:.4g} file units tall, which is no human size in any known unit: "
+            f"the nearest guess, {best}, makes it {_size(size)}",
+            path,
+            "State the unit with --unit METRES_PER_UNIT",
+        )
+    return Guess(
+        metres,
+        f"The file states no unit: {best} taken, which make the person {size:.2f} m tall ({how})",
+    )
+
+
+def _closest(height: float) -> tuple[str, float]:
+    """The unit under which a height comes nearest to a typical person's."""
+
+    def misfit(name: str) -> float:
+        return abs(np.log(height * _ALL_UNITS[name] / _TYPICAL_M)) + _RARE.get(name, 0.0)
+
+    best = min(_ALL_UNITS, key=misfit)
+    return best, _ALL_UNITS[best]
+
+
+def _size(metres: float) -> str:
+    return f"{metres:.3g} m" if metres >= 0.1 else f"{metres * 1e3:.3g} mm"
+
+
+def guess_up(names: Sequence[str], positions: np.ndarray) -> Guess:
+    """The vertical of a file, "Y" or "Z", from sampled poses `(S, J, 3)` in file axes.
+
+    People mostly stand: the mean direction from the ankles to the head, the first frames
+    counted as much as all others, or the longer side of the body where names tell nothing.
+    """
+    heads, necks, ankles = landmarks(names)
+    tops = heads or necks
+    first = max(1, len(positions) // 10)
+    if tops and ankles:
+        upright = positions[:, tops[0]] - positions[:, ankles].mean(1)
+        upright = upright / np.maximum(np.linalg.norm(upright, axis=-1, keepdims=True), 1e-12)
+        sides = np.abs(upright[:first].mean(0) + upright.mean(0)) / 2
+        why = "the way from the ankles to the head"
+    else:
+        extent = positions.max(1) - positions.min(1)
+        sides = extent[:first].mean(0) + extent.mean(0)
+        sides = sides / max(float(sides.max()), 1e-12)
+        why = "the body's length"
+    axis = "Y" if sides[1] >= sides[2] else "Z"
+    low, high = sorted((float(sides[1]), float(sides[2])))
+    sure = high > 0 and low < 0.7 * high
+    note = f"The file states no vertical: {axis} taken, since {why} lies along it"
+    if not sure:
+        note += f" (uncertain: Y {sides[1]:.2f}, Z {sides[2]:.2f}; override with --up Y or --up Z)"
+    return Guess(axis, note)
+
+
+def inserted_rest_frame(rot: np.ndarray) -> str | None:
+    """A sentence if frame 0 is a rest pose put before the motion (as some conversions do).
+
+    It is when its root is unturned and its joints are near their rest rotations, and from it to
+    frame 1 the root (or the mean joint) turns far more than from frame to frame afterwards.
+    """
+    if len(rot) < 4:
+        return None
+    q = torch.tensor(rot[:40], dtype=torch.float64)
+    steps = quat_angle(quat_mul(quat_conj(q[:-1]), q[1:])).numpy()
+    from_rest = quat_angle(q[0]).numpy()
+    if from_rest[0] > np.radians(0.5) or from_rest.mean() > _REST_ANGLE:
+        return None
+    root, joints = steps[:, 0], steps[:, 1:].mean(-1) if steps.shape[1] > 1 else steps[:, 0]
+    root_jumps = root[0] > 6.0 * np.median(root[1:12]) + np.radians(5.0)
+    joints_jump = joints[0] > 6.0 * np.median(joints[1:12]) + np.radians(2.0)
+    if not (root_jumps or joints_jump):
+        return None
+    note = "Frame 0 is a rest pose that was put before the motion; it was dropped"
+    easing = int(np.cumprod(joints[1:20] > 3.0 * np.median(joints[20:]) + np.radians(0.2)).sum()) if (
+        len(joints) > 24
+    ) else 0
+    if easing:
+        note += f" (the joints still ease out of it in the first {easing} frames that are left)"
+    return note
+
+
+def teleports(root_pos: np.ndarray, fps: float) -> list[str]:
+    """A sentence about frames where the root jumps faster than a body can: frames, metres.
+
+    A jump exceeds 6 m/s and five times the usual step of the frames around it.
+    """
+    step = np.linalg.norm(np.diff(root_pos, axis=0), axis=-1)
+    if len(step) < 3:
+        return []
+    half = max(3, round(0.25 * fps))
+    padded = np.pad(step, half, mode="reflect" if len(step) > half else "edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
+    usual = np.concatenate([np.median(part, axis=-1) for part in np.array_split(windows, 16)])
+    found = np.flatnonzero((step * fps > _TELEPORT_SPEED) & (step > 5.0 * usual))
+    if not len(found):
+        return []
+    jumps = listed((f"{f + 1} ({step[f]:.2f} m)" for f in found), 12)
+    return [f"The root jumps at frame{'' if len(found) == 1 else 's'} {jumps}; the jumps were kept"]

@@ -1,0 +1,188 @@
+"""Motion as a file holds it, and its way into metres and Z up (and back)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.motion.info import body_height, sampled
+from poise.motion.io.guess import (
+    Guess,
+    guess_unit,
+    guess_up,
+    inserted_rest_frame,
+    stated_unit,
+    teleports,
+)
+from poise.motion.io.text import MAX_JOINTS, listed
+from poise.motion.skeleton import Channel, Skeleton, Source
+from poise.spatial import forward_kinematics, normalize, unwrap_quats
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the caller states instead of leaving it to a guess; None where it is not stated."""
+
+    skeleton: Path | None = None
+    fps: float | None = None
+    unit_m: float | None = None
+    up_axis: str | None = None
+
+
+@dataclass(frozen=True)
+class RawMotion:
+    """One motion in its file's own unit and axes.
+
+    offsets `(J, 3)`, ends, root_pos `(T, 3)`: file units. rot: `(T, J, 4)` wxyz, local.
+    unit_m, up_axis: what the format itself states, None where it states nothing.
+    unit_hint: a unit the file suggests, checked with the person's height.
+    strays: `(joint, largest distance)` of position channels that did not stay constant.
+    """
+
+    format: str
+    path: Path
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: np.ndarray
+    ends: tuple[tuple[int, tuple[float, float, float]], ...]
+    root_pos: np.ndarray
+    rot: np.ndarray
+    fps: float
+    channels: tuple[Channel, ...]
+    frame_time: float | None = None
+    unit_m: float | None = None
+    unit_hint: float | None = None
+    up_axis: str | None = None
+    travel_joint: str | None = None
+    cyclic: bool = False
+    notes: tuple[str, ...] = ()
+    strays: tuple[tuple[str, float], ...] = ()
+    extra: tuple[tuple[str, str], ...] = ()
+
+
+def vectors_to_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
+    """Vectors `(..., 3)` of a file with vertical `up_axis` in Z-up axes (+90 deg about X)."""
+    return v if up_axis == "Z" else np.stack((v[..., 0], -v[..., 2], v[..., 1]), -1)
+
+
+def vectors_from_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
+    """The inverse of `vectors_to_z_up`."""
+    return v if up_axis == "Z" else np.stack((v[..., 0], v[..., 2], -v[..., 1]), -1)
+
+
+def quats_to_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
+    """Rotations `(..., 4)` conjugated by the same turn: C q C^-1 turns the vector part."""
+    return np.concatenate((q[..., :1], vectors_to_z_up(q[..., 1:], up_axis)), -1)
+
+
+def quats_from_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
+    """The inverse of `quats_to_z_up`."""
+    return np.concatenate((q[..., :1], vectors_from_z_up(q[..., 1:], up_axis)), -1)
+
+
+def check_options(options: Options) -> None:
+    """Refuses overrides that make no sense."""
+    for name, value in (("unit", options.unit_m), ("fps", options.fps)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise PoiseError(f"--{name} must be above 0, got {value}")
+    if options.up_axis is not None and options.up_axis.upper() not in ("Y", "Z"):
+        raise PoiseError(f"--up must be Y or Z, got '{options.up_axis}'")
+
+
+def assemble(raw: RawMotion, options: Options) -> Clip:
+    """The clip in metres, Z up, with every guess and repair in its source's notes."""
+    _check(raw)
+    notes = list(raw.notes)
+    raw = _drop_rest_frame(raw, notes)
+    rot = unwrap_quats(normalize(torch.tensor(raw.rot, dtype=torch.float64))).numpy()
+    up, unit = _up_and_unit(raw, rot, options)
+    notes += [guess.note for guess in (up, unit) if guess.note]
+    scale = float(unit.value)  # type: ignore[arg-type]
+    axis = str(up.value)
+    for name, stray in raw.strays:
+        notes.append(
+            f"Joint '{name}' moves against its parent by up to {stray * scale * 1e3:.1f} mm; its bone "
+            "is kept rigid at the median"
+        )
+    fps = float(options.fps or raw.fps)
+    root_pos = vectors_to_z_up(raw.root_pos, axis) * scale
+    notes += teleports(root_pos, fps)
+    skeleton = Skeleton(
+        raw.names,
+        raw.parents,
+        vectors_to_z_up(raw.offsets, axis) * scale,
+        tuple((j, _metres(tip, axis, scale)) for j, tip in raw.ends),
+        Source(
+            format=raw.format,
+            path=str(raw.path),
+            unit_m=scale,
+            up_axis=axis,
+            channels=raw.channels,
+            frame_time=raw.frame_time,
+            travel_joint=raw.travel_joint,
+            notes=tuple(notes),
+            extra=raw.extra,
+        ),
+    )
+    return Clip(skeleton, root_pos, quats_to_z_up(rot, axis), fps, raw.path.stem, raw.cyclic)
+
+
+def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[float, float, float]:
+    x, y, z = (vectors_to_z_up(np.array(tip), axis) * scale).tolist()
+    return x, y, z
+
+
+def _check(raw: RawMotion) -> None:
+    if len(raw.names) > MAX_JOINTS:
+        raise PoiseError(f"it has {len(raw.names)} joints, more than the limit of {MAX_JOINTS}", raw.path)
+    if len(raw.root_pos) < 2:
+        count = len(raw.root_pos)
+        raise PoiseError(
+            f"the clip has {count} frame{'' if count == 1 else 's'}; motion needs at least 2", raw.path
+        )
+    if not np.abs(raw.offsets).max() > 0:
+        raise PoiseError("no bone of the skeleton has any length (all offsets are zero)", raw.path)
+
+
+def _drop_rest_frame(raw: RawMotion, notes: list[str]) -> RawMotion:
+    note = None if raw.format == "deepmimic" else inserted_rest_frame(raw.rot)
+    if note is None:
+        return raw
+    notes.append(note)
+    return replace(raw, root_pos=raw.root_pos[1:], rot=raw.rot[1:])
+
+
+def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: Options) -> tuple[Guess, Guess]:
+    """The vertical and the metres per unit, stated or guessed, each with its evidence."""
+    at = sampled(len(rot))
+    offsets = torch.tensor(raw.offsets)
+    pos = forward_kinematics(
+        raw.parents, offsets, torch.tensor(raw.root_pos[at]), torch.tensor(rot[at])
+    )[0].numpy()
+    height, how = body_height(raw.names, raw.parents, raw.offsets, pos)
+    if not height > 0:
+        raise PoiseError("the skeleton has no height (all joints lie in one place)", raw.path)
+    if options.unit_m is not None:
+        unit = stated_unit(height, options.unit_m, raw.path)
+    elif raw.unit_m is not None:
+        unit = Guess(raw.unit_m)
+    else:
+        unit = guess_unit(height, how, raw.unit_hint, raw.path)
+    if options.up_axis is not None:
+        up = Guess(options.up_axis.upper())
+    elif raw.up_axis is not None:
+        up = Guess(raw.up_axis)
+    else:
+        up = guess_up(raw.names, pos)
+    return up, unit
+
+
+def zero_length_note(names: list[str]) -> str:
+    """The sentence about joints that lie on their parents."""
+    one = len(names) == 1
+    return f"Joint{'' if one else 's'} {listed(names)} {'has a bone' if one else 'have bones'} of no length"

@@ -1,0 +1,175 @@
+"""Bounded reading of text files, and numbers with the place of every mistake."""
+
+from __future__ import annotations
+
+import stat
+from array import array
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from poise.errors import PoiseError
+
+MAX_FILE_BYTES = 1 << 30
+"""Larger files are refused before they are read."""
+MAX_LINE_BYTES = 4 << 20
+"""Longer lines are refused while they are read."""
+MAX_HEADER_LINES = 200_000
+"""More lines than this before the motion starts are refused."""
+MAX_JOINTS = 2000
+"""Skeletons with more joints are refused."""
+MAX_VALUE = 1e8
+"""Numbers larger than this, in any unit, are taken for damage."""
+
+_CHUNK = 1 << 20
+
+
+def at_line(path: Path, line: int) -> str:
+    """The place "FILE, line N" of an error."""
+    return f"{path}, line {line}"
+
+
+def check_file(path: Path) -> int:
+    """The size in bytes of a regular file that is there, not empty and not too large."""
+    try:
+        info = path.stat()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        if isinstance(error, FileNotFoundError):
+            raise PoiseError("there is no such file", path) from None
+        raise PoiseError(f"the file cannot be opened ({reason})", path) from None
+    if stat.S_ISDIR(info.st_mode):
+        raise PoiseError("this is a folder, not a motion file", path, "Name one file in it")
+    if not stat.S_ISREG(info.st_mode):
+        raise PoiseError("this is not a regular file", path)
+    if info.st_size == 0:
+        raise PoiseError("the file is empty", path)
+    if info.st_size > MAX_FILE_BYTES:
+        raise PoiseError(
+            f"the file has {info.st_size / 1e9:.2f} GB, more than the limit of "
+            f"{MAX_FILE_BYTES / 1e9:.2f} GB",
+            path,
+            "Cut it into shorter clips",
+        )
+    return info.st_size
+
+
+def read_head(path: Path, size: int = 4096) -> bytes:
+    """The first bytes of a file, after `check_file`."""
+    check_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+
+
+def read_bytes(path: Path) -> bytes:
+    """All bytes of a text file; binary data, other encodings and endless lines are refused.
+
+    The file is scanned in pieces of 1 MiB, so that a bad one is refused early and cheaply.
+    """
+    check_file(path)
+    chunks: list[bytes] = []
+    run, line, total = 0, 1, 0
+    try:
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                if total == 0:
+                    chunk = _without_mark(chunk, path)
+                total += len(chunk)
+                if total > MAX_FILE_BYTES:
+                    raise PoiseError("the file grew beyond the limit while it was read", path)
+                nul = chunk.find(b"\0")
+                if nul >= 0:
+                    place = at_line(path, line + chunk.count(b"\n", 0, nul))
+                    raise PoiseError("binary data in a text file", place)
+                first, last = _breaks(chunk)
+                if run + first > MAX_LINE_BYTES:
+                    raise PoiseError(
+                        f"the line is longer than {MAX_LINE_BYTES / 1e6:.1f} MB, which no frame needs",
+                        at_line(path, line),
+                    )
+                run = len(chunk) - last - 1 if last >= 0 else run + len(chunk)
+                line += chunk.count(b"\n")
+                chunks.append(chunk)
+    except OSError as error:
+        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+    return b"".join(chunks)
+
+
+def _without_mark(chunk: bytes, path: Path) -> bytes:
+    if chunk[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise PoiseError("the text is encoded as UTF-16", at_line(path, 1), "Save it as UTF-8")
+    return chunk.removeprefix(b"\xef\xbb\xbf")
+
+
+def _breaks(chunk: bytes) -> tuple[int, int]:
+    """Places of the first and the last line break, (length, -1) where there is none."""
+    found = [i for i in (chunk.find(b"\n"), chunk.find(b"\r")) if i >= 0]
+    first = min(found) if found else len(chunk)
+    return first, max(chunk.rfind(b"\n"), chunk.rfind(b"\r"))
+
+
+def decode(line: bytes, path: Path, number: int) -> str:
+    """One line as text; bytes that are not UTF-8 are refused with their place."""
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise PoiseError(
+            f"byte 0x{line[error.start]:02x} is not UTF-8 text", at_line(path, number), "Save it as UTF-8"
+        ) from None
+
+
+def shown(token: bytes | str) -> str:
+    """A token for an error message: printable and short."""
+    text = token.decode("utf-8", "replace") if isinstance(token, bytes) else token
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
+
+
+def number(token: str | bytes, where: str) -> float:
+    """One finite number; anything else is refused with its place."""
+    try:
+        if ("_" if isinstance(token, str) else b"_") in token:  # type: ignore[operator]
+            raise ValueError
+        value = float(token)
+    except ValueError:
+        raise PoiseError(f"{shown(token)} is not a number", where) from None
+    if not abs(value) <= MAX_VALUE:
+        raise PoiseError(f"{shown(token)} is not a usable number", where)
+    return value
+
+
+def append_numbers(values: array[float], tokens: list[bytes], where: str) -> None:
+    """Adds the numbers of one row in one go; on a mistake, names the token at fault.
+
+    NaN and inf pass, so that the caller can name the joint and frame.
+    """
+    size = len(values)
+    try:
+        values.extend(map(float, tokens))
+    except ValueError:
+        del values[size:]
+        for token in tokens:
+            try:
+                float(token)
+            except ValueError:
+                raise PoiseError(f"{shown(token)} is not a number", where) from None
+
+
+def first_bad(table: np.ndarray) -> tuple[int, int] | None:
+    """(row, column) of the first value that is not finite or is absurdly large, else None."""
+    bad = ~(np.abs(table) <= MAX_VALUE)
+    if not bad.any():
+        return None
+    row, column = np.argwhere(bad)[0]
+    return int(row), int(column)
+
+
+def listed(items: Iterable[object], limit: int = 8) -> str:
+    """Up to `limit` items, comma-separated, then how many more."""
+    all_items = [str(i) for i in items]
+    more = len(all_items) - limit
+    return ", ".join(all_items[:limit]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,15 @@
+"""Networks: perceptrons, diagonal Gaussian policies, running normalisation."""
+
+from poise.nets.gaussian import GaussianPolicy, gaussian_entropy, gaussian_kl, gaussian_log_prob
+from poise.nets.mlp import ACTIVATIONS, MLP
+from poise.nets.norm import RunningNorm
+
+__all__ = [
+    "ACTIVATIONS",
+    "MLP",
+    "GaussianPolicy",
+    "RunningNorm",
+    "gaussian_entropy",
+    "gaussian_kl",
+    "gaussian_log_prob",
+]

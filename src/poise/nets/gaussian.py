@@ -1,0 +1,80 @@
+"""Diagonal Gaussians, written out by hand so that one minibatch costs few small operations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from poise.errors import PoiseError
+from poise.nets.mlp import MLP
+
+
+def gaussian_log_prob(x: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Log density of `x (..., A)` under N(mean, diag(exp(log_std))^2), summed over A: `(...)`.
+
+    log p = -1/2 sum_i ((x_i - mu_i) / sigma_i)^2 - sum_i log sigma_i - A/2 log 2 pi
+    """
+    z = (x - mean) * (-log_std).exp()
+    constant = log_std.expand(x.shape[-1]).sum() + 0.5 * x.shape[-1] * math.log(2 * math.pi)
+    return -0.5 * (z * z).sum(-1) - constant
+
+
+def gaussian_entropy(log_std: Tensor) -> Tensor:
+    """Entropy in nats, summed over the actions: sum_i (log sigma_i + 1/2 log(2 pi e)); a scalar."""
+    return (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
+
+
+def gaussian_kl(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Tensor) -> Tensor:
+    """KL(p || q) of diagonal Gaussians in nats, summed over the last dimension: `(...)`.
+
+    KL = sum_i [ log(sigma_q / sigma_p) + (sigma_p^2 + (mu_p - mu_q)^2) / (2 sigma_q^2) - 1/2 ]
+    """
+    square = (2 * log_std_p).exp() + (mean_p - mean_q) ** 2
+    return (log_std_q - log_std_p + 0.5 * square * (-2 * log_std_q).exp() - 0.5).sum(-1)
+
+
+class GaussianPolicy(nn.Module):
+    """A policy pi(a | s) = N(mean(s), diag(sigma)^2) with a sigma that does not depend on s.
+
+    Args:
+        mean: the network of the mean; its output layer should start small (`last_scale=0.1`).
+        std: sigma, one number or one per action.
+        learn_std: whether log sigma is a parameter to learn or a constant.
+    """
+
+    def __init__(self, mean: MLP, std: float | Sequence[float], learn_std: bool = False):
+        super().__init__()
+        stds = torch.as_tensor(std, dtype=torch.float64).reshape(-1)
+        if len(stds) not in (1, mean.num_out) or not bool((stds > 0).all()):
+            raise PoiseError(
+                f"the action noise must be one positive number or one for each of the {mean.num_out} "
+                f"actions, got {std}"
+            )
+        self.mean = mean
+        log_std = stds.expand(mean.num_out).log().float().clone()
+        self.log_std = nn.Parameter(log_std, requires_grad=learn_std)
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """The mean action `(..., A)` for normalised observations `(..., O)`."""
+        return self.mean(obs)
+
+    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A drawn action and the mean action, each `(..., A)`."""
+        mean = self.mean(obs)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+        return mean + noise * self.log_std.exp(), mean
+
+    def act(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A drawn action `(..., A)`, or the mean action without a generator."""
+        return self.mean(obs) if generator is None else self.sample(obs, generator)[0]
+
+    def log_prob(self, obs: Tensor, action: Tensor) -> Tensor:
+        """log pi(action | obs), `(...)`."""
+        return gaussian_log_prob(action, self.mean(obs), self.log_std)
+
+    def entropy(self) -> Tensor:
+        """Entropy of pi in nats, the same for all observations; a scalar."""
+        return gaussian_entropy(self.log_std)

@@ -1,0 +1,76 @@
+"""Running mean and deviation of a stream, with a frozen copy that is used between updates."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+MIN_STD = 1e-4  # An entry that varies less is taken for a constant: it is shifted, not scaled.
+
+
+class RunningNorm(nn.Module):
+    """y = clip((x - mean) / std, -clip, clip) with statistics gathered in float64.
+
+    `observe` only gathers; what `forward` uses changes at `freeze`, so that a rollout and the
+    update that learns from it see the same function. Before the first `freeze`, y = clip(x).
+
+    Args:
+        size: width of the last dimension.
+        clip: bound of |y|; infinity for none.
+        window: number of samples that are remembered at most, for a stream that drifts; with None
+            every sample counts the same for ever.
+    """
+
+    count: Tensor
+    mean: Tensor
+    m2: Tensor
+    shift: Tensor
+    std: Tensor
+
+    def __init__(self, size: int, clip: float = 5.0, window: float | None = None):
+        super().__init__()
+        self.clip, self.window = clip, window
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("m2", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("shift", torch.zeros(size))
+        self.register_buffer("std", torch.ones(size))
+
+    @torch.no_grad()
+    def observe(self, x: Tensor) -> None:
+        """Merges the samples `x (..., size)` into the statistics (Chan et al. 1979)."""
+        x = x.reshape(-1, x.shape[-1]).double()
+        n_b, mean_b = float(len(x)), x.mean(0)
+        m2_b = ((x - mean_b) ** 2).sum(0)
+        # n = n_a + n_b;  d = mean_b - mean_a
+        n_a = self.count
+        n = n_a + n_b
+        d = mean_b - self.mean
+        # mean = mean_a + d n_b / n;  M2 = M2_a + M2_b + d^2 n_a n_b / n
+        self.mean.add_(d * (n_b / n))
+        self.m2.add_(m2_b + d * d * (n_a * n_b / n))
+        if self.window is not None and float(n) > self.window:
+            # Fewer samples with the same mean and variance: older ones fade away.
+            self.m2.mul_(self.window / n)
+            n = torch.full_like(n, self.window)
+        self.count.copy_(n)
+
+    @torch.no_grad()
+    def freeze(self) -> None:
+        """Takes the gathered statistics into use; without samples it changes nothing."""
+        if float(self.count) == 0:
+            return
+        std = (self.m2 / self.count).sqrt()
+        self.shift.copy_(self.mean)
+        self.std.copy_(torch.where(std < MIN_STD, torch.ones_like(std), std))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalised values, the shape of `x (..., size)`."""
+        y = (x - self.shift) / self.std
+        return y if math.isinf(self.clip) else y.clamp_(-self.clip, self.clip)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        """x = y std + mean, for values inside the clip."""
+        return y * self.std + self.shift

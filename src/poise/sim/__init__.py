@@ -1,0 +1,38 @@
+"""Simulation: many worlds of one model, one protocol, one backend per kind of machine."""
+
+from poise.sim.backend import (
+    STANDARD_FIELDS,
+    Backend,
+    SimState,
+    body_angular_velocity_w,
+    body_com_velocity_w,
+    body_linear_velocity_w,
+)
+from poise.sim.config import CONES, INTEGRATORS, SOLVERS, SimConfig
+from poise.sim.contacts import add_contact_sensors, contact_columns
+from poise.sim.cpu import CpuBackend
+from poise.sim.diagnose import Cause, diagnose
+from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
+
+__all__ = [
+    "CONES",
+    "INTEGRATORS",
+    "SOLVERS",
+    "STANDARD_FIELDS",
+    "Backend",
+    "Cause",
+    "CpuBackend",
+    "Failure",
+    "NanGuard",
+    "Replay",
+    "SimConfig",
+    "SimState",
+    "UnstableError",
+    "add_contact_sensors",
+    "body_angular_velocity_w",
+    "body_com_velocity_w",
+    "body_linear_velocity_w",
+    "contact_columns",
+    "diagnose",
+    "replay_dump",
+]

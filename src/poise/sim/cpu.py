@@ -1,0 +1,230 @@
+"""The CPU backend: `mujoco.batch` steps all worlds on C threads, with no copy to torch."""
+
+from __future__ import annotations
+
+import os
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
+from torch import Tensor
+
+from poise.control.drive import Drive
+from poise.errors import PoiseError, did_you_mean
+from poise.sim.backend import SimState
+from poise.sim.contacts import contact_columns
+
+_NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
+_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
+_BAD = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+    int(mujoco.mjtWarning.mjWARN_BADCTRL),
+]
+
+
+class CpuBackend:
+    """`num_envs` worlds of one model on `threads` threads (0: all cores); see `Backend`.
+
+    All numbers are float64 and the same, bit for bit, at any number of threads and as in a
+    plain `mj_step` loop. The drive's tensors are views of the state rows, so a snapshot holds
+    what was applied as well.
+    """
+
+    def __init__(
+        self, spec_or_model: mujoco.MjSpec | mujoco.MjModel, num_envs: int, threads: int = 0
+    ) -> None:
+        if num_envs < 1 or threads < 0:
+            raise PoiseError(
+                f"num_envs must be above 0 and threads not below, got {num_envs}, {threads}"
+            )
+        self._model = _compiled(spec_or_model)
+        threads = min(threads or len(os.sched_getaffinity(0)), num_envs)
+        self._batch: Batch | None = Batch(self._model, num_envs, threads)
+        self._num_envs = num_envs
+        self._rows = torch.from_numpy(self._batch.state)
+        self._outputs: dict[str, Tensor] = {}
+        self._state = SimState(self._views)
+        self._drive = Drive(**self._views(["ctrl", "qfrc_applied", "xfrc_applied"]))
+        bodies, columns = contact_columns(self._model)
+        self._contact_bodies, self._contact_columns = torch.from_numpy(bodies), torch.from_numpy(columns)
+        if len(bodies):
+            self._state.bind(["sensordata"])
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self._model
+
+    @property
+    def num_envs(self) -> int:
+        return self._num_envs
+
+    @property
+    def state(self) -> SimState:
+        return self._state
+
+    @property
+    def drive(self) -> Drive:
+        return self._drive
+
+    def write(self, rows: Tensor | None, qpos: Tensor, qvel: Tensor) -> None:
+        ids, order = self._ids(rows)
+        n = self._num_envs if ids is None else len(ids)
+        if qpos.shape != (n, self._model.nq) or qvel.shape != (n, self._model.nv):
+            raise PoiseError(
+                f"write needs qpos ({n}, {self._model.nq}) and qvel ({n}, {self._model.nv}), "
+                f"got {tuple(qpos.shape)} and {tuple(qvel.shape)}"
+            )
+        for name, value in (("qpos", qpos), ("qvel", qvel)):
+            if not bool(value.isfinite().all()):
+                row, column = torch.nonzero(~value.isfinite())[0].tolist()
+                raise PoiseError(f"{name} is not finite in row {row}, column {column}", "write")
+        if n == 0:
+            return
+        self._run("reset", ids, stage=_NONE)
+        to = slice(None) if ids is None else torch.from_numpy(ids).long()
+        source = slice(None) if order is None else order
+        self._state.qpos[to] = qpos.detach()[source].to(self._state.qpos)
+        self._state.qvel[to] = qvel.detach()[source].to(self._state.qvel)
+        self._run("forward", ids)
+
+    def step(self, nstep: int = 1) -> None:
+        # The velocity stage afterwards makes positions, velocities and what depends on them
+        # describe the new state, where mj_step alone leaves them one physics step behind.
+        self._run("step", None, nstep=nstep, stage=_VEL)
+
+    def forward(self, rows: Tensor | None = None) -> None:
+        self._run("forward", self._ids(rows)[0])
+
+    def snapshot(self, derived: bool = True, out: Tensor | None = None) -> Tensor:
+        parts = [self._rows]
+        if derived:
+            outputs = (self._outputs[name] for name in sorted(self._outputs))
+            parts += [value.reshape(self._num_envs, -1).to(torch.float64) for value in outputs]
+        return torch.cat(parts, 1, out=out)
+
+    def restore(self, snapshot: Tensor, rows: Tensor | None = None) -> None:
+        ids, order = self._ids(rows)
+        n = self._num_envs if ids is None else len(ids)
+        names = sorted(self._outputs)
+        widths = [self._rows.shape[1], *(self._outputs[name][0].numel() for name in names)]
+        if snapshot.shape not in ((n, sum(widths)), (n, widths[0])):
+            raise PoiseError(
+                f"the snapshot has shape {tuple(snapshot.shape)}, but this backend needs "
+                f"({n}, {sum(widths)}), or ({n}, {widths[0]}) without derived fields",
+                hint="Restore into the same model, with the same state fields bound.",
+            )
+        to = slice(None) if ids is None else torch.from_numpy(ids).long()
+        source = snapshot if order is None else snapshot[order]
+        self._rows[to] = source[:, : widths[0]].to(self._rows)
+        if snapshot.shape[1] == widths[0]:
+            self._run("forward", ids)
+            return
+        for name, value in zip(names, source.split(widths, dim=1)[1:], strict=True):
+            target = self._outputs[name]
+            target[to] = value.reshape(n, *target.shape[1:]).to(target.dtype)
+
+    def expand(self, field: str) -> Tensor:
+        if field not in MODEL_FIELDS:
+            raise PoiseError(
+                f"'{field}' is not a model field that can differ between worlds",
+                hint=did_you_mean(field, sorted(MODEL_FIELDS)),
+            )
+        return torch.from_numpy(self._live.expand(field))
+
+    def set_const(self, rows: Tensor | None = None) -> None:
+        self._run("set_const", self._ids(rows)[0])
+
+    def contacts(self) -> Tensor:
+        if not len(self._contact_bodies):
+            raise PoiseError(
+                "the model has no contact force sensors",
+                hint="Call poise.sim.add_contact_sensors(spec) before making the backend.",
+            )
+        out = self._rows.new_zeros(self._num_envs, self._model.nbody, 3)
+        # The sensed force is what the first body exerts on the others, so the sign turns.
+        out[:, self._contact_bodies] = -self._state["sensordata"][:, self._contact_columns]
+        return out
+
+    def unstable(self) -> Tensor:
+        counts = self._live.warning[:, _BAD, 1]
+        bad = counts.any(axis=1)
+        if bad.any():
+            # MuJoCo's reset of a bad world sets its counters back to one, so that a second
+            # failure would not show as a rise: they are cleared here instead.
+            self._live.warning[bad] = 0
+        return torch.from_numpy(bad)
+
+    def get_model(self, env: int) -> mujoco.MjModel:
+        return self._live.get_model(env)
+
+    def get_data(self, env: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
+        return self._live.get_data(env, data)
+
+    def close(self) -> None:
+        self._batch = None
+
+    @property
+    def _live(self) -> Batch:
+        if self._batch is None:
+            raise PoiseError("the backend is closed")
+        return self._batch
+
+    def _views(self, names: list[str]) -> dict[str, Tensor]:
+        views = {name: self._view(name) for name in names}
+        if not self._outputs.keys().isdisjoint(names):
+            # A new output reads zero until the next call, so it is computed now.
+            self._run("forward", None)
+        return views
+
+    def _view(self, name: str) -> Tensor:
+        if name not in DATA_FIELDS:
+            raise PoiseError(
+                f"'{name}' is not a MuJoCo data field that can be bound",
+                hint=did_you_mean(name, sorted(DATA_FIELDS)),
+            )
+        array = self._live.bind(name)
+        if array.flags.writeable:
+            return torch.from_numpy(array)  # A part of the state rows.
+        # Outputs of a call are marked read-only for users; torch knows no such mark and would
+        # warn, and restore() has to write them.
+        array = array.view()
+        array.flags.writeable = True
+        self._outputs[name] = torch.from_numpy(array)
+        return self._outputs[name]
+
+    def _ids(self, rows: Tensor | None) -> tuple[np.ndarray | None, Tensor | None]:
+        """Sorted int32 ids for Batch, and the order that sorts the caller's rows likewise."""
+        if rows is None:
+            return None, None
+        rows = torch.as_tensor(rows)
+        if rows.dtype == torch.bool:
+            if rows.shape != (self._num_envs,):
+                raise PoiseError(f"a row mask must be ({self._num_envs},), got {tuple(rows.shape)}")
+            return torch.nonzero(rows)[:, 0].to(torch.int32).numpy(), None
+        values, order = rows.reshape(-1).long().sort()
+        if len(values) and (values[0] < 0 or values[-1] >= self._num_envs or (values.diff() == 0).any()):
+            raise PoiseError(
+                f"rows must be distinct and in 0 to {self._num_envs - 1}, got {rows.tolist()[:12]}"
+            )
+        return values.to(torch.int32).numpy(), order
+
+    def _run(self, call: str, ids: np.ndarray | None, **options: int) -> None:
+        try:
+            getattr(self._live, call)(ids, **options)
+        except SimulationError as error:
+            raise PoiseError(
+                f"MuJoCo failed in {call}: {error}", f"worlds {error.ids.tolist()[:8]}",
+                "These worlds kept their state from before the call.",
+            ) from error  # fmt: skip
+
+
+def _compiled(spec_or_model: mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
+    if isinstance(spec_or_model, mujoco.MjModel):
+        return spec_or_model
+    try:
+        return spec_or_model.compile()
+    except ValueError as error:
+        raise PoiseError(f"MuJoCo cannot compile the model: {error}") from error

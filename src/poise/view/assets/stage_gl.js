@@ -1,0 +1,196 @@
+// The replay in WebGL, with three.js. Same four functions as the canvas stage: draw, project, resize, theme.
+Poise.stageGL = (host, data, extent) => {
+  const T = THREE;
+  const canvas = document.createElement("canvas");
+  const renderer = new T.WebGLRenderer({ canvas, antialias: true, alpha: false });
+  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+  renderer.shadowMap.enabled = true;
+  host.prepend(canvas);
+  const scene = new T.Scene();
+  const camera = new T.PerspectiveCamera(26, 1, 0.05, 200);
+  camera.up.set(0, 0, 1);
+  const controls = new T.OrbitControls(camera, canvas);
+  controls.enableDamping = true;
+  controls.dampingFactor = 0.12;
+  controls.maxPolarAngle = 1.56;
+  controls.minDistance = 1;
+  controls.maxDistance = 30;
+
+  const sky = new T.HemisphereLight(0xffffff, 0xa39d98, 2.3);
+  sky.position.set(0, 0, 1);
+  const sun = new T.DirectionalLight(0xffffff, 2.1);
+  sun.castShadow = true;
+  sun.shadow.mapSize.set(2048, 2048);
+  sun.shadow.radius = 5;
+  sun.shadow.bias = -0.0004;
+  sun.shadow.normalBias = 0.02;
+  const reach = 2.2 + extent.gap;
+  Object.assign(sun.shadow.camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: 1, far: 20 });
+  scene.add(sky, sun, sun.target);
+
+  const grid = new T.ShaderMaterial({
+    transparent: true,
+    depthWrite: false,
+    uniforms: { center: { value: new T.Vector3() }, ink: { value: new T.Color() }, strength: { value: 0.3 } },
+    vertexShader: `varying vec3 at; void main() { vec4 w = modelMatrix * vec4(position, 1.0); at = w.xyz;
+      gl_Position = projectionMatrix * viewMatrix * w; }`,
+    fragmentShader: `varying vec3 at; uniform vec3 center; uniform vec3 ink; uniform float strength;
+      float mesh(vec2 p) { vec2 w = fwidth(p); vec2 d = abs(fract(p - 0.5) - 0.5) / max(w, vec2(1e-6));
+        vec2 seen = (1.0 - smoothstep(vec2(0.0), vec2(1.4), d)) * (1.0 - smoothstep(0.08, 0.4, w));
+        return max(seen.x, seen.y); }
+      void main() { float far = 1.0 - smoothstep(1.0, 7.5, distance(at.xy, center.xy));
+        float a = max(mesh(at.xy), 0.35 * mesh(at.xy * 4.0));
+        gl_FragColor = vec4(ink, a * far * strength);
+        #include <colorspace_fragment>
+      }`,
+  });
+  const plane = new T.PlaneGeometry(60, 60);
+  const floor = new T.Mesh(plane, grid);
+  const shade = new T.Mesh(plane, new T.ShadowMaterial({ opacity: 0.22 }));
+  floor.position.z = 0.001;
+  shade.receiveShadow = true;
+  scene.add(shade, floor);
+
+  function geometry(shape) {
+    const [a, b, c] = shape.size;
+    if (shape.kind === "box") return new T.BoxGeometry(2 * a, 2 * b, 2 * c);
+    if (shape.kind === "sphere") return new T.SphereGeometry(a, 28, 20);
+    return new T.CapsuleGeometry(a, 2 * b, 10, 24).rotateX(Math.PI / 2);
+  }
+
+  const solid = () => new T.MeshStandardMaterial({ roughness: 0.62, metalness: 0.0 });
+  const ghost = new T.ShaderMaterial({
+    transparent: true,
+    uniforms: { tint: { value: new T.Color() }, rim: { value: new T.Color() } },
+    vertexShader: `varying vec3 n; varying vec3 v; void main() { vec4 p = modelViewMatrix * vec4(position, 1.0);
+      n = normalMatrix * normal; v = -p.xyz; gl_Position = projectionMatrix * p; }`,
+    fragmentShader: `varying vec3 n; varying vec3 v; uniform vec3 tint; uniform vec3 rim;
+      void main() { float facing = clamp(dot(normalize(n), normalize(v)), 0.0, 1.0);
+        float edge = pow(1.0 - facing, 1.6);
+        gl_FragColor = vec4(mix(tint, rim, edge), 0.42 + 0.5 * edge);
+        #include <colorspace_fragment>
+      }`,
+  });
+  const veil = new T.MeshBasicMaterial({ colorWrite: false, transparent: true });
+  const shapes = data.shapes.map((shape) => ({ shape, geo: geometry(shape) }));
+  const feet = [0, 1].map((side) => new Set(data.feet[side]));
+
+  // The ghost is drawn twice, first into the depth buffer alone, so that its inner parts stay hidden.
+  function character(isGhost) {
+    const root = new T.Group();
+    const parts = data.bodies.map(() => new T.Group());
+    const mats = [solid(), solid(), solid()];
+    for (const { shape, geo } of shapes) {
+      const side = feet[0].has(shape.body) ? 1 : feet[1].has(shape.body) ? 2 : 0;
+      for (const material of isGhost ? [veil, ghost] : [mats[side]]) {
+        const mesh = new T.Mesh(geo, material);
+        mesh.position.set(...shape.pos);
+        mesh.quaternion.set(shape.quat[1], shape.quat[2], shape.quat[3], shape.quat[0]);
+        mesh.castShadow = material !== veil;
+        mesh.receiveShadow = !isGhost;
+        mesh.renderOrder = material === veil ? 1 : material === ghost ? 2 : 0;
+        parts[shape.body].add(mesh);
+      }
+    }
+    root.add(...parts);
+    scene.add(root);
+    return { root, parts, mats };
+  }
+  const reference = character(true);
+  const simulated = character(false);
+
+  const arrowMaterial = new T.MeshBasicMaterial({ depthTest: false, transparent: true });
+  const shaft = new T.Mesh(new T.CylinderGeometry(0.016, 0.016, 1, 16).translate(0, 0.5, 0), arrowMaterial);
+  const tip = new T.Mesh(new T.ConeGeometry(0.045, 0.11, 20).translate(0, 0.055, 0), arrowMaterial);
+  const arrow = new T.Group().add(shaft, tip);
+  shaft.renderOrder = tip.renderOrder = 5;
+  scene.add(arrow);
+  const [up, along] = [new T.Vector3(0, 1, 0), new T.Vector3()];
+
+  function pose(who, state, dx, dy) {
+    who.root.position.set(dx, dy, 0);
+    who.parts.forEach((part, b) => {
+      part.position.fromArray(state.pos, b * 3);
+      part.quaternion.set(state.quat[b * 4 + 1], state.quat[b * 4 + 2], state.quat[b * 4 + 3], state.quat[b * 4]);
+    });
+  }
+
+  const colors = {};
+  let placed = false;
+  const target = new T.Vector3();
+  const moved = new T.Vector3();
+  const stage = {
+    kind: "webgl",
+    canvas,
+    theme() {
+      scene.background = new T.Color(Poise.css("--stage"));
+      scene.fog = new T.Fog(scene.background, 14, 40);
+      grid.uniforms.ink.value.set(Poise.css("--ink"));
+      grid.uniforms.strength.value = parseFloat(Poise.css("--grid")) || 0.2;
+      shade.material.opacity = parseFloat(Poise.css("--shade")) || 0.2;
+      ghost.uniforms.tint.value.set(Poise.css("--ref"));
+      ghost.uniforms.rim.value.set(Poise.css("--ref-rim"));
+      arrowMaterial.color.set(Poise.css("--help"));
+      colors.sim = new T.Color(Poise.css("--sim"));
+      colors.lit = new T.Color(Poise.css("--contact"));
+    },
+    resize(width, height) {
+      renderer.setSize(width, height, false);
+      camera.aspect = width / Math.max(height, 1);
+      camera.updateProjectionMatrix();
+    },
+    // Looks from the front and the side, far enough for both characters.
+    home() {
+      const view = 2 * Math.tan((camera.fov * Math.PI) / 360);
+      const wide = (extent.gap + 2.1 * extent.reach) / (view * Math.max(camera.aspect, 0.3));
+      const far = Math.max((1.62 * (extent.top + 0.2)) / view, wide);
+      camera.position.set(extent.view[0], extent.view[1], 0.2).multiplyScalar(far).add(target);
+      controls.target.copy(target);
+    },
+    draw(frame) {
+      const [x, y, z] = frame.target;
+      if (!placed) {
+        target.set(x, y, z);
+        stage.home();
+        placed = true;
+      } else if (frame.follow) {
+        moved.set(x, y, z).sub(target);
+        target.add(moved);
+        camera.position.add(moved);
+        controls.target.add(moved);
+      }
+      controls.update();
+      const [rx, ry] = frame.shift[0];
+      const [sx, sy] = frame.shift[1];
+      pose(reference, frame.reference, rx, ry);
+      pose(simulated, frame.simulated, sx, sy);
+      ghost.visible = true;
+      simulated.mats[0].color.copy(colors.sim);
+      for (const side of [0, 1]) simulated.mats[side + 1].color.copy(frame.lit[side] ? colors.lit : colors.sim);
+      arrow.visible = Boolean(frame.arrow);
+      if (frame.arrow) {
+        along.fromArray(frame.arrow);
+        const length = along.length();
+        arrow.visible = length > 0.004;
+        const head = Math.min(1, length / 0.2);
+        arrow.position.set(frame.simulated.pos[0] + sx, frame.simulated.pos[1] + sy, frame.simulated.pos[2]);
+        arrow.quaternion.setFromUnitVectors(up, along.divideScalar(length || 1));
+        shaft.scale.set(1, Math.max(length - 0.1 * head, 1e-3), 1);
+        tip.position.y = Math.max(length - 0.11 * head, 0);
+        tip.scale.setScalar(head);
+      }
+      sun.target.position.set(controls.target.x, controls.target.y, 0);
+      sun.position.set(controls.target.x + 2.2, controls.target.y - 2.8, 6.5);
+      grid.uniforms.center.value.copy(controls.target);
+      floor.position.x = shade.position.x = controls.target.x;
+      floor.position.y = shade.position.y = controls.target.y;
+      renderer.render(scene, camera);
+    },
+    project(x, y, z) {
+      const p = new T.Vector3(x, y, z).project(camera);
+      return p.z > 1 ? null : [(p.x + 1) / 2, (1 - p.y) / 2];
+    },
+  };
+  stage.theme();
+  return stage;
+};

@@ -1,0 +1,183 @@
+"""The HTML of the report's tiles, plots, notes and facts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from html import escape
+
+import numpy as np
+
+from poise.view.data import Report, body_weight, number
+from poise.view.svg import bar_plot, line_plot
+from poise.view.verdict import grades
+
+_CLOCK = (("hours", 3600.0, 7200.0), ("minutes", 60.0, 300.0), ("seconds", 1.0, -math.inf))
+_SIM, _REF, _HELP, _HELP2 = "var(--sim)", "var(--ref)", "var(--help)", "var(--contact)"
+
+
+def tiles(report: Report) -> str:
+    """The four judged figures, each with its level and the thresholds behind it."""
+    out = []
+    for grade in grades(report.score):
+        detail = f"<small>{escape(grade.detail)}</small>" if grade.detail else ""
+        out.append(
+            f'<div class="tile {grade.level}"><div class="name">{escape(grade.name)}'
+            f'<span class="chip">{grade.level}</span></div>'
+            f'<div class="value">{escape(grade.value)}</div>'
+            f'{detail}<small class="rule">{escape(grade.rule)}</small></div>'
+        )
+    return "\n".join(out)
+
+
+def _figure(
+    title: str,
+    text: str,
+    body: str,
+    legend: tuple[tuple[str, str], ...] = (),
+    unit: str = "",
+    time: bool = False,
+) -> str:
+    keys = "".join(f'<span><i style="background:{c}"></i>{escape(n)}</span>' for n, c in legend)
+    return (
+        f'<figure data-time="{int(time)}" data-unit="{escape(unit, quote=True)}">'
+        f"<figcaption><h2>{escape(title)}</h2><p>{escape(text)}</p></figcaption>"
+        + (f'<div class="legend">{keys}</div>' if keys else "")
+        + f"{body}</figure>"
+    )
+
+
+def _empty(text: str) -> str:
+    return f'<p class="empty">{escape(text)}</p>'
+
+
+def plots(report: Report) -> str:
+    """The four figures: error and help per frame, learning curve, reward terms."""
+    return "\n".join((_error(report), _help(report), _curve(report), _reward(report)))
+
+
+def _error(report: Report) -> str:
+    title = "Error per frame"
+    local = np.asarray(report.error_mm, dtype=np.float64)
+    world = np.asarray(report.error_global_mm, dtype=np.float64)
+    if not (np.isfinite(local).any() or np.isfinite(world).any()):
+        return _figure(title, "", _empty("No error was measured for this clip."))
+    at = np.arange(len(local)) / report.fps
+    names = ("pose, relative to the root", "in the world, drift included")
+    colors = (_SIM, _REF)
+    body = line_plot(
+        [(names[0], at, local), (names[1], at, world)],
+        "Mean joint error per frame",
+        "time (s)",
+        "mean joint error (mm)",
+        zero=True,
+        colors=colors,
+        inline=True,
+    )
+    text = "Mean distance between the joints of simulation and reference."
+    return _figure(title, text, body, tuple(zip(names, colors, strict=True)), "s", True)
+
+
+def _help(report: Report) -> str:
+    title = "Help per frame"
+    if report.force is None and report.torque is None:
+        return _figure(title, "", _empty("No residual force was recorded for this run."))
+    series: list[tuple[str, np.ndarray, np.ndarray]] = []
+    colors: list[str] = []
+    for name, vector, color in (
+        ("force (N)", report.force, _HELP),
+        ("torque (N m)", report.torque, _HELP2),
+    ):
+        if vector is not None:
+            size = np.linalg.norm(np.asarray(vector, dtype=np.float64), axis=1)
+            series.append((name, np.arange(len(size)) / report.fps, size))
+            colors.append(color)
+    weight = body_weight(report)
+    right = ("force (% of body weight)", 100.0 / weight) if weight and report.force is not None else None
+    label = " · ".join(name for name, *_ in series)
+    body = line_plot(
+        series, "Help per frame", "time (s)", label, zero=True, right=right, colors=colors, inline=True
+    )
+    legend = tuple((name, c) for (name, *_), c in zip(series, colors, strict=True))
+    text = "What the residual force and torque on the root add from outside."
+    return _figure(title, text, body, legend, "s", True)
+
+
+def _columns(curve: dict[str, np.ndarray], name: str, count: int | None = None) -> np.ndarray | None:
+    values = curve.get(name)
+    if values is None:
+        return None
+    out = np.asarray(values, dtype=np.float64).reshape(-1)
+    return out if np.isfinite(out).any() and (count is None or len(out) == count) else None
+
+
+def _curve(report: Report) -> str:
+    title = "Learning curve"
+    reward = _columns(report.curve, "reward")
+    if reward is None:
+        return _figure(title, "", _empty("No learning curve: nothing was learned, or it was not kept."))
+    samples, seconds = (_columns(report.curve, k, len(reward)) for k in ("samples", "seconds"))
+    x, label, unit = np.arange(len(reward), dtype=np.float64), "iteration", "iterations"
+    top: tuple[str, Callable[[float], float]] | None = None
+    if samples is not None:
+        x, label, unit = samples, "samples", "samples"
+        if seconds is not None and len(x) > 1:
+            order = np.argsort(samples)
+            known, clock = samples[order], seconds[order]
+            longest = float(np.nanmax(clock))
+            name, size = next(u for u in _CLOCK if longest > u[2])[:2]
+            top = (f"wall clock ({name})", lambda v: float(np.interp(v, known, clock)) / size)
+    elif seconds is not None:
+        x, label, unit = seconds, "wall clock (s)", "s"
+    body = line_plot(
+        [("reward", x, reward)],
+        "Learning curve",
+        label,
+        "mean reward",
+        top=top,
+        colors=(_SIM,),
+        inline=True,
+    )
+    last = reward[np.isfinite(reward)][-1]
+    return _figure(title, f"Mean reward while learning; last value {last:.3g}.", body, (), unit)
+
+
+def _reward(report: Report) -> str:
+    title = "Reward per term"
+    reward = report.score.get("reward")
+    if isinstance(reward, dict):
+        known = ((str(k), number(v)) for k, v in reward.items() if k != "total")
+        items = [(k, math.nan if v is None else v) for k, v in known]
+        if items:
+            finite = [v for _, v in items if math.isfinite(v)]
+            most = 1.0 if finite and max(finite) <= 1.0 and max(finite) > 0.2 else None
+            body = bar_plot(
+                items, "Reward per term", "mean reward per step", most=most, color=_SIM, inline=True
+            )
+            total = number(reward.get("total"))
+            whole = "" if total is None else f" Their total: {total:.3f}."
+            return _figure(title, f"Averages over the evaluated frames.{whole}", body)
+    value = number(reward.get("total") if isinstance(reward, dict) else reward)
+    text = "No reward was recorded." if value is None else f"Only the total was recorded: {value:.3f}."
+    return _figure(title, "", _empty(text))
+
+
+def notes(report: Report, held_reference: int, held_simulated: int) -> str:
+    """What was guessed, repaired or limited, and frames that could not be drawn."""
+    lines = list(report.notes)
+    for track, held in ((report.reference, held_reference), (report.simulated, held_simulated)):
+        if held:
+            lines.append(
+                f"{held} frame{'s' if held > 1 else ''} of '{track.name}' had values that "
+                "are not finite; the replay holds the last good pose there."
+            )
+    if not lines:
+        return "<p>Nothing was guessed or repaired.</p>"
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def facts(report: Report) -> str:
+    """Clip, method, seed and so on, as a list of names and values."""
+    rows = report.facts or {"frames": str(len(report.error_mm)), "fps": f"{report.fps:g}"}
+    cells = (f"<dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd>" for k, v in rows.items())
+    return f"<dl>{''.join(cells)}</dl>"

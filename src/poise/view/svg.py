@@ -1,0 +1,264 @@
+"""Small SVG plots in text, without a plotting library: lines with bands, and bars.
+
+A plot stands alone as an image file (its own style, light and dark), or goes `inline` into a page
+which brings the style, the heading and the legend, and reads the hover values from `data-plot`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+COLORS = ("#e0692e", "#3b7ddd", "#7a5cd6", "#1f9d75", "#c2417c", "#8a8f98")
+"""One colour per series, in order; readable on white and on near-black."""
+
+_W, _H = 560, 300
+_STYLE = """<style>
+.pp{font:13px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",sans-serif;
+--ink:#1d2129;--soft:#667080;--line:#e4e6ea;--card:#fff}
+@media (prefers-color-scheme:dark){.pp{--ink:#eceef2;--soft:#9aa3b0;--line:#2c313a;--card:#171a20}}
+.pp text{fill:var(--soft)}.pp .pp-t{fill:var(--ink);font-size:16px;font-weight:600}
+.pp .pp-k{fill:var(--ink)}.pp .pp-g{stroke:var(--line);stroke-width:1}
+.pp .pp-l{fill:none;stroke-width:2;stroke-linejoin:round;stroke-linecap:round}
+</style>"""
+
+
+def ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """About `count` round numbers (1, 2 or 5 times a power of ten) within `[low, high]`."""
+    if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
+        return [low] if math.isfinite(low) else []
+    raw = (high - low) / max(count, 1)
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= raw * 0.7)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return [round(k * step, 12) for k in range(first, last + 1)]
+
+
+def short(value: float) -> str:
+    """A number in few characters: 1234567 becomes 1.2M, 0.25 stays."""
+    size = abs(value)
+    for limit, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+        if size >= limit:
+            return f"{value / (1e3 if letter == 'k' else limit):.3g}{letter}"
+    return f"{value:.4g}"
+
+
+def _numbers(values: Any) -> np.ndarray:
+    return np.asarray(values, dtype=np.float64).reshape(-1)
+
+
+def _path(x: np.ndarray, y: np.ndarray) -> str:
+    """Path data with a new stroke after every gap (a value that is not finite)."""
+    parts, pen = [], False
+    for a, b in zip(x, y, strict=True):
+        if math.isfinite(a) and math.isfinite(b):
+            parts.append(f"{'L' if pen else 'M'}{a:.1f} {b:.1f}")
+            pen = True
+        else:
+            pen = False
+    return "".join(parts)
+
+
+def _thin(n: int, most: int = 800) -> np.ndarray:
+    return np.arange(n) if n <= most else np.unique(np.linspace(0, n - 1, most).round().astype(int))
+
+
+def _write(text: str, path: Path | str | None) -> str:
+    if path is not None:
+        Path(path).write_text(text, encoding="utf-8")
+    return text
+
+
+_Line = tuple[str, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]
+
+
+def _split(entry: Sequence[Any]) -> _Line:
+    name, x, y = str(entry[0]), _numbers(entry[1]), _numbers(entry[2])
+    band = entry[3:] if len(entry) == 5 else (entry[3] if len(entry) == 4 else None)
+    if band is None:
+        return name, x, y, None, None
+    return name, x, y, _numbers(band[0]), _numbers(band[1])
+
+
+def _range(values: list[np.ndarray], zero: bool) -> tuple[float, float]:
+    flat = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.zeros(0)
+    if flat.size == 0:
+        return 0.0, 1.0
+    low, high = float(flat.min()), float(flat.max())
+    if zero:
+        low, high = min(low, 0.0), max(high, 0.0)
+    if high - low < 1e-12:
+        high = low + max(abs(low), 1.0) * 0.1
+    pad = (high - low) * 0.06
+    return (low if zero and low == 0 else low - pad), high + pad
+
+
+def line_plot(
+    series: Sequence[Sequence[Any]],
+    title: str,
+    xlabel: str,
+    ylabel: str,
+    path: Path | str | None = None,
+    *,
+    zero: bool = False,
+    right: tuple[str, float] | None = None,
+    top: tuple[str, Callable[[float], float]] | None = None,
+    colors: Sequence[str] = COLORS,
+    inline: bool = False,
+) -> str:
+    """Lines over a shared x axis as one SVG text.
+
+    series: `(name, x, y)`, or `(name, x, y, (low, high))` with a shaded band, or the five flat;
+        gaps where NaN.
+    path: where to write the file too. zero: let the y axis include 0.
+    right: label and factor of a second y axis, right value = factor times left value.
+    top: label and function of a second x axis. inline: for a page that brings style and heading.
+    """
+    lines = [_split(entry) for entry in series]
+    xs = [x for _, x, *_ in lines]
+    ys = [v for _, _, *rest in lines for v in rest if v is not None]
+    flat = np.concatenate([v[np.isfinite(v)] for v in xs]) if xs else np.zeros(0)
+    x0, x1 = (float(flat.min()), float(flat.max())) if flat.size else (0.0, 1.0)
+    x1 = x1 if x1 > x0 else x0 + 1.0
+    y0, y1 = _range(ys, zero)
+    left, end = 58.0, _W - (58.0 if right else 16.0)
+    up = (12.0 if inline else 62.0) + (34.0 if top else 0.0)
+    down = _H - 46.0
+
+    def px(v: Any) -> Any:
+        return left + (v - x0) / (x1 - x0) * (end - left)
+
+    def py(v: Any) -> Any:
+        return down - (v - y0) / (y1 - y0) * (down - up)
+
+    out = [_head(title, inline)]
+    for v in ticks(y0, y1):
+        y = py(v)
+        out.append(f'<line class="pp-g" x1="{left:g}" x2="{end:g}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        out.append(f'<text x="{left - 8:g}" y="{y + 4:.1f}" text-anchor="end">{short(v)}</text>')
+    for v in ticks(x0, x1, 6):
+        out.append(f'<text x="{px(v):.1f}" y="{down + 19:g}" text-anchor="middle">{short(v)}</text>')
+        if top:
+            text = short(float(f"{top[1](v):.2g}"))
+            out.append(f'<text x="{px(v):.1f}" y="{up - 8:g}" text-anchor="middle">{text}</text>')
+    if right:
+        for v in ticks(y0 * right[1], y1 * right[1]):
+            y = py(v / right[1]) + 4
+            out.append(f'<text x="{end + 8:g}" y="{y:.1f}">{short(v)}</text>')
+    sides = (right[0] if right else "", top[0] if top else "")
+    out.append(_labels(xlabel, ylabel, *sides, left, end, up, down))
+    plot: dict[str, Any] = {"x": [x0, x1], "px": [left, end], "py": [up, down], "w": _W, "series": []}
+    for k, (name, x, y, low, high) in enumerate(lines):
+        color = colors[k % len(colors)]
+        keep = _thin(len(x))
+        if low is not None and high is not None:
+            ok = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
+            edge = np.concatenate([px(x[ok]), px(x[ok])[::-1]])
+            rim = np.concatenate([py(high[ok]), py(low[ok])[::-1]])
+            if edge.size:
+                out.append(f'<path d="{_path(edge, rim)}Z" fill="{color}" opacity=".16"/>')
+        if np.isfinite(y).sum() == 1:
+            one = int(np.argmax(np.isfinite(y)))
+            out.append(f'<circle cx="{px(x[one]):.1f}" cy="{py(y[one]):.1f}" r="4" fill="{color}"/>')
+        out.append(f'<path class="pp-l" stroke="{color}" d="{_path(px(x[keep]), py(y[keep]))}"/>')
+        if not inline:
+            out.append(_key(k, name, color))
+        plot["series"].append({"name": name, "color": color, "x": _few(x[keep]), "y": _few(y[keep])})
+    data = escape(json.dumps(plot, separators=(",", ":")), quote=True)
+    carried = f' data-plot="{data}"' if inline else ""
+    return _write("".join(out).replace(" data-plot", carried, 1) + "</svg>", path)
+
+
+def bar_plot(
+    items: Sequence[tuple[str, float]],
+    title: str,
+    xlabel: str,
+    path: Path | str | None = None,
+    *,
+    most: float | None = None,
+    color: str = COLORS[0],
+    inline: bool = False,
+) -> str:
+    """Horizontal bars, one per `(name, value)`; `most` fixes the full length of the axis."""
+    up, row = (8.0 if inline else 44.0), 30.0
+    down = up + row * max(len(items), 1)
+    height = down + 46.0
+    left, end = 150.0, _W - 60.0
+    finite = [v for _, v in items if math.isfinite(v)]
+    low, high = min([0.0, *finite]), most if most is not None else max([0.0, *finite])
+    high = max(high, *finite, low + 1e-9) if finite else 1.0
+    out = [_head(title, inline, height)]
+
+    def px(v: float) -> float:
+        return left + (v - low) / (high - low) * (end - left)
+
+    for v in ticks(low, high):
+        out.append(f'<line class="pp-g" x1="{px(v):.1f}" x2="{px(v):.1f}" y1="{up:g}" y2="{down:g}"/>')
+        out.append(f'<text x="{px(v):.1f}" y="{down + 19:g}" text-anchor="middle">{short(v)}</text>')
+    for k, (name, value) in enumerate(items):
+        y = up + row * k
+        shown = name if len(name) <= 20 else name[:19] + "…"
+        out.append(
+            f'<text class="pp-k" x="{left - 10:g}" y="{y + 20:g}" text-anchor="end">{escape(shown)}'
+            f"<title>{escape(name)}</title></text>"
+        )
+        if math.isfinite(value):
+            a, b = sorted((px(0.0), px(value)))
+            out.append(
+                f'<rect x="{a:.1f}" y="{y + 6:g}" width="{b - a:.1f}" height="18" rx="4" fill="{color}">'
+                f"<title>{escape(name)}: {value:.4g}</title></rect>"
+            )
+        text = f"{value:.3g}" if math.isfinite(value) else "no value"
+        x = max(px(value), px(0.0)) if math.isfinite(value) else px(0.0)
+        out.append(f'<text class="pp-k" x="{x + 8:.1f}" y="{y + 20:g}">{text}</text>')
+    out.append(_labels(xlabel, "", "", "", left, end, up, down))
+    return _write("".join(out).replace(" data-plot", "", 1) + "</svg>", path)
+
+
+def _few(values: np.ndarray) -> list[float | None]:
+    return [float(f"{v:.5g}") if math.isfinite(v) else None for v in values]
+
+
+def _head(title: str, inline: bool, height: float = _H) -> str:
+    name = escape(title, quote=True)
+    if inline:
+        return f'<svg class="pp" viewBox="0 0 {_W} {height:g}" role="img" aria-label="{name}" data-plot>'
+    return (
+        f'<svg class="pp" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_W} {height:g}" width="{_W}" '
+        f'height="{height:g}" role="img" aria-label="{name}" data-plot>{_STYLE}'
+        f'<rect width="100%" height="100%" rx="10" style="fill:var(--card)"/>'
+        f'<text class="pp-t" x="16" y="27">{escape(title)}</text>'
+    )
+
+
+def _key(k: int, name: str, color: str) -> str:
+    x, y = 18 + (k % 3) * 182, 47 + (k // 3) * 16
+    return (
+        f'<rect x="{x}" y="{y - 6}" width="14" height="4" rx="2" fill="{color}"/>'
+        f'<text class="pp-k" x="{x + 20}" y="{y}">{escape(name[:26])}</text>'
+    )
+
+
+def _labels(
+    x: str, y: str, right: str, top: str, left: float, end: float, up: float, down: float
+) -> str:
+    mid, centre = (left + end) / 2, (up + down) / 2
+    out = [f'<text x="{mid:g}" y="{down + 38:g}" text-anchor="middle">{escape(x)}</text>']
+    if y:
+        turn = f"translate(15 {centre:g}) rotate(-90)"
+        out.append(f'<text transform="{turn}" text-anchor="middle">{escape(y)}</text>')
+    if right:
+        out.append(
+            f'<text transform="translate({end + 50:g} {centre:g}) rotate(90)" text-anchor="middle">'
+            f"{escape(right)}</text>"
+        )
+    if top:
+        out.append(f'<text x="{mid:g}" y="{up - 24:g}" text-anchor="middle">{escape(top)}</text>')
+    return "".join(out)

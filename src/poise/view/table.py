@@ -1,0 +1,98 @@
+"""The score table: every figure of score.json with its unit, beside the clip's own where known."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+from poise.view.data import number
+from poise.view.verdict import percent
+
+_ROWS: tuple[tuple[str, str, str, str], ...] = (
+    ("mpjpe_mm", "Joint error", "mm", "mean joint distance after the roots are laid together"),
+    ("mpjpe_global_mm", "Joint error in the world", "mm", "the same in place: drift counts"),
+    ("vel_mm_per_frame", "Velocity error", "mm/frame", "how far the joints' velocities are apart"),
+    ("acc_mm_per_frame2", "Acceleration error", "mm/frame²", "the same of accelerations; shaking shows"),
+    ("foot_slide_mm_per_s", "Foot slide", "mm/s", "speed of the feet over the ground while they bear"),
+    ("penetration_mm", "Penetration", "mm", "how deep the body sinks into the ground"),
+    ("float_mm", "Floating", "mm", "how far the body hovers where it should touch"),
+    ("jerk", "Jerk", "m/s³", "change of acceleration; smoother motion has less"),
+)
+_HELP: tuple[tuple[str, str, str, str], ...] = (
+    ("limit_n", "Force limit", "N", "the most the residual force may give"),
+    ("limit_nm", "Torque limit", "N m", "the most the residual torque may give"),
+    ("force_mean_n", "Force, mean", "N", "what it did give"),
+    ("force_p95_n", "Force, 95th percentile", "N", "what it gave in its busiest twentieth"),
+    ("torque_mean_nm", "Torque, mean", "N m", ""),
+    ("torque_p95_nm", "Torque, 95th percentile", "N m", ""),
+    ("work_j_per_s", "Work", "J/s", "power that came from outside"),
+    ("share_of_body_weight", "Share of body weight", "%", "mean force over the character's weight"),
+)
+_RUN: tuple[tuple[str, str, str, str], ...] = (
+    ("seconds", "Learning time", "s", "wall clock"),
+    ("samples", "Samples", "", "steps of simulated experience"),
+    ("seed", "Seed", "", "the run repeats with it"),
+)
+NONE = "\u2013"
+"""Stands where nothing was measured."""
+
+_SPECIAL = {"succ", "succ_rule", "reward", "help", "reference"}
+
+
+def amount(value: Any, unit: str = "") -> str:
+    """A figure with its unit, or a dash where there is none."""
+    size = number(value)
+    if size is None:
+        return escape(value) if isinstance(value, str) else NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if unit == "%":
+        return percent(size)
+    if abs(size) >= 1000 or float(size).is_integer():
+        text = f"{size:,.0f}".replace(",", "\u202f")
+    else:
+        text = f"{size:.1f}" if abs(size) >= 10 else f"{size:.3g}"
+    return f"{text} {unit}".rstrip()
+
+
+def _row(name: str, value: str, before: str, meaning: str, mark: str = "") -> str:
+    return (
+        f'<tr><th scope="row">{escape(name)}</th><td class="n {mark}">{value}</td>'
+        f'<td class="n">{before}</td><td class="m">{escape(meaning)}</td></tr>'
+    )
+
+
+def _mark(after: float | None, before: float | None) -> str:
+    """Better or worse than the clip itself, with a tenth of tolerance; less is always better."""
+    if after is None or before is None or abs(after - before) <= 0.1 * abs(before):
+        return ""
+    return "better" if after < before else "worse"
+
+
+def score_table(score: dict[str, Any]) -> str:
+    """The whole score as an HTML table; keys that are not known are listed last as they are."""
+    raw = score.get("reference")
+    before: dict[str, Any] = raw if isinstance(raw, dict) else {}
+    share = number(score.get("succ"))
+    rule = str(score.get("succ_rule") or "share of starts that reach the end")
+    rows = [_row("Whole clip tracked", NONE if share is None else percent(share), "", rule)]
+    for key, name, unit, meaning in _ROWS:
+        mark = _mark(number(score.get(key)), number(before.get(key)))
+        beside = amount(before[key], unit) if key in before else ""
+        rows.append(_row(name, amount(score.get(key), unit), beside, meaning, mark))
+    reward = score.get("reward")
+    total = reward.get("total") if isinstance(reward, dict) else reward
+    if number(total) is not None:
+        rows.append(_row("Reward", amount(total), "", "mean per step"))
+    table = score.get("help")
+    if isinstance(table, dict):
+        known = {key for key, *_ in _HELP}
+        for key, name, unit, text in _HELP:
+            rows.append(_row(f"Help: {name.lower()}", amount(table.get(key), unit), "", text))
+        rows += [_row(f"Help: {key}", amount(v), "", "") for key, v in table.items() if key not in known]
+    rows += [_row(name, amount(score.get(key), unit), "", text) for key, name, unit, text in _RUN]
+    listed = _SPECIAL | {key for key, *_ in _ROWS + _RUN}
+    rest = {k: v for k, v in score.items() if k not in listed and not isinstance(v, dict | list)}
+    rows += [_row(str(k), amount(v), "", "") for k, v in rest.items()]
+    head = '<tr><th>Measure</th><th>Simulation</th><th>Clip itself</th><th class="m">Meaning</th></tr>'
+    return f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"

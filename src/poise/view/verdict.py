@@ -1,0 +1,142 @@
+"""The verdict in words: grades of a score, with the thresholds that decide them stated beside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from poise.view.data import number
+
+LEVELS = ("good", "fair", "poor")
+
+
+@dataclass(frozen=True)
+class Grade:
+    """One judged figure.
+
+    level: "good", "fair", "poor" or "unknown". value: the figure in words with its unit.
+    rule: the thresholds in words. counts: whether it decides the overall verdict.
+    """
+
+    name: str
+    value: str
+    level: str
+    rule: str
+    detail: str = ""
+    counts: bool = True
+
+
+def _level(value: float | None, key: str, larger: bool = False) -> str:
+    if value is None:
+        return "unknown"
+    good, fair = THRESHOLDS[key]
+    if larger:
+        return "good" if value >= good else "fair" if value >= fair else "poor"
+    return "good" if value <= good else "fair" if value <= fair else "poor"
+
+
+def _rule(key: str, unit: str, times: float = 1.0, word: str = "to") -> str:
+    good, fair = (f"{bound * times:g}" for bound in THRESHOLDS[key])
+    return f"good {word} {good}, fair {word} {fair} {unit}"
+
+
+def percent(share: float) -> str:
+    """A share as whole per cent, never rounded up to 100 nor down to 0."""
+    value = share * 100
+    if 99.5 <= value < 99.95:
+        return "99 %"
+    if 0 < value < 1:
+        return f"{value:.1f} %" if value >= 0.1 else "below 0.1 %"
+    return f"{value:.0f} %"
+
+
+def _part(score: dict[str, Any], name: str) -> dict[str, Any]:
+    part = score.get(name)
+    return part if isinstance(part, dict) else {}
+
+
+THRESHOLDS: dict[str, tuple[float, float]] = {
+    "succ": (0.95, 0.80),
+    "mpjpe_mm": (40.0, 80.0),
+    "foot_slide_mm_per_s": (50.0, 150.0),
+    "share_of_body_weight": (0.02, 0.10),
+    "torque_mean_nm": (5.0, 25.0),
+}
+"""(good, fair) bounds; the score card's own (`eval.verdicts`) are the same, and a test says so."""
+
+
+def tracking(score: dict[str, Any]) -> Grade:
+    """How often the whole clip is tracked to its end."""
+    succ = number(score.get("succ"))
+    rule = _rule("succ", "%", 100, "from")
+    if succ is None:
+        return Grade("Tracks the whole clip", "not measured", "unknown", rule)
+    word = "yes" if succ >= 0.9995 else "almost" if succ >= 0.95 else "no"
+    detail = str(score.get("succ_rule") or "")
+    return Grade(
+        "Tracks the whole clip", f"{word} ({percent(succ)})", _level(succ, "succ", True), rule, detail
+    )
+
+
+def joint_error(score: dict[str, Any]) -> Grade:
+    """The mean joint error, root-relative."""
+    error = number(score.get("mpjpe_mm"))
+    rule = _rule("mpjpe_mm", "mm")
+    text = "not measured" if error is None else f"{error:.0f} mm"
+    return Grade("Joint error", text, _level(error, "mpjpe_mm"), rule, "mean distance, root-relative")
+
+
+def help_given(score: dict[str, Any]) -> Grade:
+    """The mean residual force as a share of body weight."""
+    table = _part(score, "help")
+    force, share = number(table.get("force_mean_n")), number(table.get("share_of_body_weight"))
+    rules = (_rule("share_of_body_weight", "% of body weight", 100), _rule("torque_mean_nm", "N\u00a0m"))
+    rule = "; ".join(rules)
+    if force is None and share is None:
+        return Grade("Help", "not measured", "unknown", rule)
+    torque = number(table.get("torque_mean_nm"))
+    if (force or 0.0) == (share or 0.0) == (torque or 0.0) == 0.0:
+        return Grade("Help", "none", "good", rule, "no outside force: only the joints' own torques")
+    parts = []
+    if force is not None:
+        parts.append(f"{force:.0f} N" if force >= 1 or force == 0 else f"{force:.1f} N")
+    if share is not None:
+        parts.append(f"{percent(share)} of body weight")
+    beside = "" if torque is None else f", and {torque:.0f} N\u00a0m"
+    detail = f"mean residual force on the root{beside}"
+    levels = [_level(share, "share_of_body_weight"), _level(torque, "torque_mean_nm")]
+    level = levels[0] if torque is None else max(levels, key=("unknown", *LEVELS).index)
+    if share is None and level != "poor":
+        level = "unknown"
+    return Grade("Help", " = ".join(parts), level, rule, detail)
+
+
+def foot_slide(score: dict[str, Any]) -> Grade:
+    """Foot slide beside that of the clip; told, but it does not decide the verdict."""
+    slide = number(score.get("foot_slide_mm_per_s"))
+    before = number(_part(score, "reference").get("foot_slide_mm_per_s"))
+    text = "not measured" if slide is None else f"{slide:.0f} mm/s"
+    detail = "" if before is None else f"the clip itself: {before:.0f} mm/s"
+    key = "foot_slide_mm_per_s"
+    return Grade("Foot slide", text, _level(slide, key), _rule(key, "mm/s"), detail, False)
+
+
+def grades(score: dict[str, Any]) -> tuple[Grade, ...]:
+    """The four figures at the top of the page."""
+    return tracking(score), joint_error(score), help_given(score), foot_slide(score)
+
+
+def overall(score: dict[str, Any]) -> str:
+    """The worst level among the figures that count; "unknown" when one of them is missing."""
+    levels = [g.level for g in grades(score) if g.counts]
+    if "poor" in levels:
+        return "poor"
+    if "unknown" in levels:
+        return "unknown"
+    return "fair" if "fair" in levels else "good"
+
+
+def sentence(score: dict[str, Any]) -> str:
+    """The verdict line, e.g. "Tracks the whole clip from every start: yes (100 %) · joint error …"."""
+    track, error, aid, _ = grades(score)
+    return f"{track.name} from every start: {track.value} · joint error {error.value} · help {aid.value}"
