@@ -188,7 +188,7 @@ def test_bad_files_are_told(tmp_path):
     with pytest.raises(PoiseError, match=r"score\.json, line 3: is no JSON"):
         read_score(path)
     path.write_text('{"succ": 1}')
-    with pytest.raises(PoiseError, match="lacks the key 'succ_rule'. Score the run again"):
+    with pytest.raises(PoiseError, match=r"lacks the key 'succ_rule'\. Score the run again"):
         read_score(path)
     path.write_text("[]")
     with pytest.raises(PoiseError, match="one JSON object"):
@@ -222,9 +222,9 @@ def test_random_rollouts_equal_a_naive_loop():
     wrench = torch.randn(episodes, frames, 2, 3, generator=g, dtype=torch.float64)
     big = replace(
         r, pos=pos, ref_pos=ref, quat=quat, ref_quat=quat, lengths=lengths,
-        alive=torch.arange(frames) < lengths[:, None], reached_end=torch.ones(episodes, dtype=torch.bool),
+        alive=torch.arange(frames) < lengths[:, None], reached_end=torch.ones(episodes).bool(),
         force=wrench, torque=wrench, point_vel=wrench, ang_vel=wrench, reward={},
-        clip=torch.tensor([0, 0, 1, 1, 1]), start=torch.zeros(episodes, dtype=torch.long), shapes=None,
+        clip=torch.tensor([0, 0, 1, 1, 1]), start=torch.zeros(episodes).long(), shapes=None,
     )  # fmt: skip
     errors, forces, won = [], [], 0
     for e in range(episodes):

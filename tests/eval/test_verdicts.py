@@ -61,3 +61,10 @@ def test_thresholds_are_frozen():
     with pytest.raises(AttributeError):
         THRESHOLDS["succ"].good = 0.1  # type: ignore[misc]
     assert Threshold(1.0, 2.0).verdict(-5.0) == "good"
+
+
+def test_every_key_is_documented():
+    page = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
+    found = card().to_dict()
+    keys = [*found, *(f"help.{k}" for k in found["help"])]
+    assert [k for k in keys if k != "help" and f"`{k}`" not in page] == []

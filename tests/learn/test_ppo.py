@@ -7,8 +7,20 @@ import torch
 from toy_point_env import LIMIT, PointEnv
 
 from poise.errors import PoiseError
-from poise.learn import PPO, PPOConfig, Rollout, Step, Trainer, TrainingError
+from poise.learn import (
+    LAST_GOOD,
+    PPO,
+    PPOConfig,
+    Rollout,
+    Step,
+    Trainer,
+    TrainingError,
+    Until,
+    load_policy,
+    run,
+)
 from poise.learn.ppo import clipped_surrogate
+from poise.learn.rollout import Episodes, collect
 from poise.nets import gaussian_kl
 
 TOY = PPOConfig(
@@ -184,6 +196,39 @@ def test_a_broken_environment_is_named(broken, words):
     with pytest.raises(TrainingError, match=words):
         trainer.iterate()
     assert torch.equal(before, trainer.ppo.actor.policy.mean.last.weight)
+
+
+def test_a_run_that_breaks_keeps_the_last_good_policy(tmp_path):
+    trainer = Trainer(Faulty(16), replace(TOY, norm_warmup=8, horizon=4))
+    with pytest.raises(TrainingError):
+        run(trainer, Until(iterations=9), tmp_path, every=5, tensorboard=False)
+    kept = load_policy(tmp_path / LAST_GOOD)
+    assert kept.meta["metadata"]["iteration"] == 2
+    assert torch.equal(kept.policy.mean.last.weight, trainer.policy().policy.mean.last.weight)
+
+
+def test_a_rollout_records_what_was_seen_done_and_reached():
+    env, ppo = PointEnv(6), PPO(4, 2, TOY, seed=0)
+    rollout = Rollout(LIMIT + 3, 6, 4, 2, env.device)
+    episodes = Episodes(6, env.device)
+    actor = ppo.actor
+    obs = collect(env, actor.policy, actor.norm, rollout, env.reset(), episodes, ppo.noise)
+    # All rows time out together at step LIMIT; the toy's state follows from its action.
+    last = LIMIT - 1
+    assert rollout.truncated.nonzero()[:, 0].tolist() == [last] * 6
+    assert rollout.cut_at.tolist() == [last * 6 + n for n in range(6)]
+    reached = rollout.obs[last, :, :2] + 0.2 * rollout.action[last]
+    torch.testing.assert_close(rollout.cut_obs, torch.cat([reached, rollout.obs[last, :, 2:]], -1))
+    torch.testing.assert_close(rollout.obs[1, :, :2], rollout.obs[0, :, :2] + 0.2 * rollout.action[0])
+    assert torch.equal(rollout.obs[-1], obs)
+    with torch.no_grad():
+        want = actor.policy.log_prob(rollout.obs[:-1], rollout.action)
+    torch.testing.assert_close(rollout.log_prob, want)
+    assert episodes.finished == 6 and episodes.finished_length == 6 * LIMIT and episodes.failures == 0
+    assert episodes.length.tolist() == [3] * 6
+    assert float(actor.norm.count) == 6 * (LIMIT + 3)
+    d = (rollout.cut_obs[:, :2] - rollout.cut_obs[:, 2:]).norm(dim=-1)
+    torch.testing.assert_close(rollout.reward[last], (-(d**2)).exp())
 
 
 def test_ppo_solves_the_toy_task_and_the_seed_decides_the_numbers():

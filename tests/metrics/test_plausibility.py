@@ -53,6 +53,13 @@ def test_planted_high_and_landing_feet():
     assert foot_slide(both, FPS) == pytest.approx(25.0)
 
 
+def test_a_swinging_foot_is_no_slide_but_a_skater_is():
+    planted, swinging = line(9, (0.02, 0.0, 0.0)), line(9, (3.0, 0.0, 0.0), start=(0, 0, 0.015))
+    assert foot_slide(torch.cat((planted, swinging), 1), FPS) == pytest.approx(20.0)
+    # Pulled along at walking speed with both feet on the ground: nothing is planted, all counts.
+    assert foot_slide(torch.cat((swinging, swinging), 1), FPS) == pytest.approx(3000.0)
+
+
 def test_foot_slide_equals_a_naive_loop():
     g = torch.Generator().manual_seed(4)
     points = torch.rand(3, 12, 5, 3, generator=g, dtype=torch.float64) * torch.tensor([0.02, 0.02, 0.03])

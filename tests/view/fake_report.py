@@ -55,7 +55,7 @@ def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def walk(frames: int, fps: float, name: str, shake: float = 0.0, seed: int = 0) -> Track:
     """A walk along x at 1.2 m/s; every joint turns about y only, so world angles add up."""
-    t = np.arange(frames) / fps
+    t = np.arange(frames) / max(fps, 1.0)
     phase = 2 * np.pi * 0.9 * t
     rng = np.random.default_rng(seed)
     noise = np.cumsum(rng.normal(size=(frames, len(BODIES))), axis=0) * 0.1

@@ -188,6 +188,10 @@ class ImitationEnv:
             heading_quat(qpos[:, 3:7]),
         )
 
+    def where(self, env: int) -> str:
+        """Which frame of which clip world `env` is at, for messages."""
+        return f"{self.reference.names[int(self.clip[env])]} frame {int(self.frame[env])}"
+
     def _frame(self, ahead: bool) -> Frame:
         extra = self.action[:, self.hinges :]
         reg = self.task.residual.regularizer(extra) if self.task.residual else torch.ones(self.num_envs)

@@ -38,7 +38,7 @@ THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
         "mpjpe_global_mm": Threshold(60.0, 120.0),
         "vel_mm_per_frame": Threshold(10.0, 20.0),
         "acc_mm_per_frame2": Threshold(7.0, 15.0),
-        "foot_slide_mm_per_s": Threshold(50.0, 150.0),
+        "foot_slide_mm_per_s": Threshold(100.0, 250.0),
         "penetration_mm": Threshold(5.0, 15.0),
         "float_mm": Threshold(10.0, 30.0),
         "jerk_ratio": Threshold(1.5, 3.0),

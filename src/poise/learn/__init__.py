@@ -1,6 +1,6 @@
 """Reinforcement learning on any `VecEnv`; it knows neither the simulator nor the character."""
 
-from poise.learn.checkpoint import BEST, LATEST, check_fits, load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import BEST, LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.config import PPOConfig
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
@@ -14,6 +14,7 @@ from poise.learn.train import IterationStats, Trainer
 
 __all__ = [
     "BEST",
+    "LAST_GOOD",
     "LATEST",
     "PPO",
     "IterationStats",

@@ -26,6 +26,7 @@ from poise.errors import PoiseError
 FORMAT = 1
 LATEST = "checkpoint.safetensors"
 BEST = "best.safetensors"
+LAST_GOOD = "last_good.safetensors"
 _TEMPORARY = ".partial"
 
 

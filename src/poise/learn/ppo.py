@@ -284,11 +284,22 @@ class PPO:
         )
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Restores what `state` returned; other network sizes raise a `PoiseError`."""
+        """Restores what `state` returned; other network sizes raise a `PoiseError`.
+
+        What the config fixes (the learning rates unless they adapt, the deviation unless it is
+        learned) stays as the config has it, so that a resumed run may change it.
+        """
+        fixed_log_std = self.actor.policy.log_std.detach().clone()
         self.actor.load_state(state)
         load_module(self.critic, state, "critic")
         load_module(self.return_norm, state, "return_norm")
         load_optimizer_state(self.optimizer, under("adam", state))
+        policy_group, value_group = self.optimizer.param_groups
+        value_group["lr"] = self.config.value_lr
+        if self.config.kl_target is None:
+            policy_group["lr"] = self.config.policy_lr
+        if not self.config.learn_std:
+            self.actor.policy.log_std.data.copy_(fixed_log_std)
         self.noise.set_state(take(state, "generator/noise").cpu())
         self.shuffle.set_state(take(state, "generator/shuffle").cpu())
 

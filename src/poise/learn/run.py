@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import BEST, LATEST, remove_partial
+from poise.learn.checkpoint import BEST, LAST_GOOD, LATEST, remove_partial
+from poise.learn.guard import TrainingError
 from poise.learn.log import Log
 from poise.learn.train import IterationStats, Trainer
 
@@ -74,7 +75,8 @@ def run(
         resume: whether a checkpoint in `folder` may be continued; if not, finding one is an error.
         tensorboard: whether to write TensorBoard's files beside the CSV.
 
-    Ctrl-C ends the run after the present iteration, with a checkpoint; a second one at once.
+    Ctrl-C ends the run after the present iteration, with a checkpoint; a second one at once. After
+    a `TrainingError` the policy of the last good iteration is in `last_good.safetensors`.
     """
     if every < 1:
         raise PoiseError(f"the interval of checkpoints must be at least 1, got {every}")
@@ -94,6 +96,10 @@ def run(
                     interrupt.set()
             if keeper is not None and keeper.saved != trainer.iteration:
                 keeper.save()
+    except TrainingError:
+        if keeper is not None:
+            keeper.save_policy(LAST_GOOD)
+        raise
     finally:
         if keeper is not None:
             keeper.log.close()
@@ -112,7 +118,9 @@ class _Keeper:
                 raise PoiseError(
                     "the folder already holds a run", folder, "Resume it or choose another folder"
                 )
-            self.best = trainer.load(self.path).get("metadata", {}).get("best_score", self.best)
+            saved = trainer.load(self.path)["metadata"]
+            if "best_score" in saved:
+                self.best = trainer.metadata["best_score"] = saved["best_score"]
         remove_partial(folder)
         self.saved = trainer.iteration if self.path.exists() else -1
         self.log = Log(folder, trainer.iteration, tensorboard)
@@ -125,10 +133,13 @@ class _Keeper:
         if score is not None and (value := score(stats)) > self.best:
             self.best = value
             self.trainer.metadata["best_score"] = value
-            extra = {**self.trainer.metadata, "iteration": stats.iteration}
-            self.trainer.ppo.actor.save(self.folder / BEST, self.trainer.character, extra)
+            self.save_policy(BEST)
         if save:
             self.save()
+
+    def save_policy(self, name: str) -> None:
+        extra = {**self.trainer.metadata, "iteration": self.trainer.iteration}
+        self.trainer.ppo.actor.save(self.folder / name, self.trainer.character, extra)
 
     def save(self) -> None:
         self.log.flush()

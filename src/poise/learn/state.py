@@ -69,8 +69,7 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, T
     for i, p in enumerate(params):
         moments = {k: v.detach().clone() for k, v in under(str(i), state).items()}
         if moments:
-            # Adam keeps its step count on the CPU unless it is fused on a GPU.
-            optimizer.state[p] = {k: v.to(p.device) if v.dim() else v for k, v in moments.items()}
+            optimizer.state[p] = {k: v.to(p.device) for k, v in moments.items()}
 
 
 def make_generator(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:

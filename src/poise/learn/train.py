@@ -42,6 +42,8 @@ class IterationStats:
     """Share of the same episodes that ended by failure."""
     episodes: int
     """Episodes that ended in this iteration."""
+    batch: int
+    """Control steps of this iteration."""
     update: UpdateStats
     terms: Mapping[str, float]
     """Means of the environment's log over this iteration."""
@@ -54,9 +56,6 @@ class IterationStats:
     def samples_per_s(self) -> float:
         """Samples of this iteration over its time, collection and update together."""
         return self.batch / (self.collect_seconds + self.update_seconds)
-
-    batch: int = 0
-    """Control steps of this iteration."""
 
     def row(self) -> dict[str, float]:
         """All numbers under flat names for a log; the times come last, under "time/"."""

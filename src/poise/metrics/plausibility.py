@@ -20,6 +20,8 @@ CONTACT_HEIGHT = 0.02
 """m; a foot point above this is not in contact."""
 CONTACT_RISE = 0.2
 """m/s; a foot point that rises or falls faster is landing or leaving, not in contact."""
+SWING_SPEED = 1.0
+"""m/s; a foot point that is faster while another one is planted belongs to a swinging foot."""
 BALLISTIC_TOLERANCE = 0.4
 """Share of g by which the vertical acceleration may differ from -g in flight."""
 BALLISTIC_WINDOW = 0.1
@@ -44,13 +46,16 @@ def foot_contacts(
     *,
     height: float = CONTACT_HEIGHT,
     rise: float = CONTACT_RISE,
+    swing: float = SWING_SPEED,
     ground: float = 0.0,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Horizontal speed in mm/s and contact of each foot point between frames, both `(..., T - 1, F)`.
 
-    A point `(..., T, F, 3)` is in contact from t to t+1 when it is within `height` of the ground in
-    both frames (deeper counts as in contact) and its vertical speed is at most `rise`.
+    A point `(..., T, F, 3)` is in contact from t to t+1 when it is within `height` m of the ground in
+    both frames (deeper counts as in contact) and its vertical speed is at most `rise` m/s. A point
+    faster than `swing` m/s is left out while another point in contact is slower: it skims the
+    ground in mid-swing. Where all points in contact are fast, the character skates and all count.
     """
     if foot_points.ndim < 3 or foot_points.shape[-1] != 3:
         raise PoiseError(f"foot points must be (..., T, F, 3), got {tuple(foot_points.shape)}")
@@ -59,7 +64,10 @@ def foot_contacts(
     contact = low[..., 1:, :] & low[..., :-1, :] & (step[..., 2].abs() <= rise)
     if mask is not None:
         contact = contact & span_mask(mask, 1).unsqueeze(-1)
-    return step[..., :2].norm(dim=-1) * MM, contact
+    speed = step[..., :2].norm(dim=-1)
+    planted = contact & (speed <= swing)
+    contact = torch.where(planted.any(-1, keepdim=True), planted, contact)
+    return speed * MM, contact
 
 
 def foot_slide(
@@ -68,15 +76,18 @@ def foot_slide(
     *,
     height: float = CONTACT_HEIGHT,
     rise: float = CONTACT_RISE,
+    swing: float = SWING_SPEED,
     ground: float = 0.0,
     mask: Tensor | None = None,
 ) -> Tensor:
     """Poise's foot slide, mm/s: mean horizontal speed of foot points while in contact; `(...)`.
 
     Contact as in `foot_contacts`; the mean runs over all (frame, point) pairs in contact. NaN
-    without any contact. A swinging foot that skims lower than `height` counts, on both sides alike.
+    without any contact. Hand in the points of all feet together.
     """
-    speed, contact = foot_contacts(foot_points, fps, height=height, rise=rise, ground=ground, mask=mask)
+    speed, contact = foot_contacts(
+        foot_points, fps, height=height, rise=rise, swing=swing, ground=ground, mask=mask
+    )
     return masked_mean(speed, contact, (-2, -1))
 
 

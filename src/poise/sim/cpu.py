@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import mujoco
 import numpy as np
 import torch
@@ -41,10 +39,9 @@ class CpuBackend:
                 f"num_envs must be above 0 and threads not below, got {num_envs}, {threads}"
             )
         self._model = _compiled(spec_or_model)
-        threads = min(threads or len(os.sched_getaffinity(0)), num_envs)
-        self._batch: Batch | None = Batch(self._model, num_envs, threads)
+        self._batch: Batch | None = Batch(self._model, num_envs, min(threads, num_envs))
         self._num_envs = num_envs
-        self._rows = torch.from_numpy(self._batch.state)
+        self._rows = torch.from_numpy(self._live.state)
         self._outputs: dict[str, Tensor] = {}
         self._state = SimState(self._views)
         self._drive = Drive(**self._views(["ctrl", "qfrc_applied", "xfrc_applied"]))

@@ -155,7 +155,7 @@ def _reward(report: Report) -> str:
                 items, "Reward per term", "mean reward per step", most=most, color=_SIM, inline=True
             )
             total = number(reward.get("total"))
-            whole = "" if total is None else f" Their total: {total:.3f}."
+            whole = "" if total is None else f" Weighted total: {total:.3f}."
             return _figure(title, f"Averages over the evaluated frames.{whole}", body)
     value = number(reward.get("total") if isinstance(reward, dict) else reward)
     text = "No reward was recorded." if value is None else f"Only the total was recorded: {value:.3f}."

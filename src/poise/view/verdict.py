@@ -41,13 +41,13 @@ def _rule(key: str, unit: str, times: float = 1.0, word: str = "to") -> str:
 
 
 def percent(share: float) -> str:
-    """A share as whole per cent, never rounded up to 100 nor down to 0."""
-    value = share * 100
-    if 99.5 <= value < 99.95:
-        return "99 %"
-    if 0 < value < 1:
-        return f"{value:.1f} %" if value >= 0.1 else "below 0.1 %"
-    return f"{value:.0f} %"
+    """A share in per cent to a tenth, never rounded up to 100 nor down to 0."""
+    text = f"{share * 100:.1f}".removesuffix(".0")
+    if share < 1 and text == "100":
+        text = "99.9"
+    if share > 0 and text == "0":
+        text = "below 0.1"
+    return f"{text} %"
 
 
 def _part(score: dict[str, Any], name: str) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _part(score: dict[str, Any], name: str) -> dict[str, Any]:
 THRESHOLDS: dict[str, tuple[float, float]] = {
     "succ": (0.95, 0.80),
     "mpjpe_mm": (40.0, 80.0),
-    "foot_slide_mm_per_s": (50.0, 150.0),
+    "foot_slide_mm_per_s": (100.0, 250.0),
     "share_of_body_weight": (0.02, 0.10),
     "torque_mean_nm": (5.0, 25.0),
 }
@@ -71,7 +71,7 @@ def tracking(score: dict[str, Any]) -> Grade:
     rule = _rule("succ", "%", 100, "from")
     if succ is None:
         return Grade("Tracks the whole clip", "not measured", "unknown", rule)
-    word = "yes" if succ >= 0.9995 else "almost" if succ >= 0.95 else "no"
+    word = "yes" if succ >= 1 - 1e-9 else "almost" if succ >= 0.95 else "no"
     detail = str(score.get("succ_rule") or "")
     return Grade(
         "Tracks the whole clip", f"{word} ({percent(succ)})", _level(succ, "succ", True), rule, detail
@@ -102,7 +102,7 @@ def help_given(score: dict[str, Any]) -> Grade:
         parts.append(f"{force:.0f} N" if force >= 1 or force == 0 else f"{force:.1f} N")
     if share is not None:
         parts.append(f"{percent(share)} of body weight")
-    beside = "" if torque is None else f", and {torque:.0f} N\u00a0m"
+    beside = "" if torque is None else f", and {torque:.0f}\u00a0N\u00a0m"
     detail = f"mean residual force on the root{beside}"
     levels = [_level(share, "share_of_body_weight"), _level(torque, "torque_mean_nm")]
     level = levels[0] if torque is None else max(levels, key=("unknown", *LEVELS).index)

@@ -12,7 +12,16 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
 from poise.motion.io.asf import ROTATIONS, TRAVEL, AsfFile, fixed_axes_quat, parse_asf
 from poise.motion.io.raw import Options, RawMotion, assemble
-from poise.motion.io.text import append_numbers, at_line, decode, first_bad, listed, read_bytes, shown
+from poise.motion.io.text import (
+    CUT_OFF,
+    append_numbers,
+    at_line,
+    decode,
+    first_bad,
+    listed,
+    read_bytes,
+    shown,
+)
 from poise.motion.skeleton import Channel
 from poise.spatial import quat_conj, quat_mul
 
@@ -180,7 +189,7 @@ def _frames(path: Path, asf: AsfFile, notes: list[str]) -> tuple[dict[str, np.nd
         places[name].append(i)
         seen += 1
     if not numbers:
-        raise PoiseError("the file has no frames", path, "The file seems cut off")
+        raise PoiseError("the file has no frames", path, CUT_OFF)
     _close_frame(path, values, numbers, frame_line, seen, first_set)
     out = {n: np.array(v).reshape(len(numbers), -1) for n, v in values.items()}
     if "root" not in out:
@@ -238,6 +247,6 @@ def _check_values(
     if found:
         frame, line, name, value = min(found)
         raise PoiseError(
-            f"joint '{name}' at frame {numbers[frame]} has the value {value:g}, which is no usable number",
+            f"joint '{name}' at frame {numbers[frame]} has the unusable value {value:g}",
             at_line(path, line),
         )

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.io.text import MAX_JOINTS, at_line, decode, number, read_bytes, shown
+from poise.motion.io.text import CUT_OFF, MAX_JOINTS, at_line, decode, number, read_bytes, shown
 from poise.spatial import euler_to_quat
 
 ROTATIONS = ("rx", "ry", "rz")
@@ -83,7 +83,7 @@ def parse_asf(path: Path) -> AsfFile:
         current.append((line, words))
     for name in ("root", "bonedata", "hierarchy"):
         if not sections.get(name):
-            raise PoiseError(f"the skeleton has no :{name} section", path, "The file seems cut off")
+            raise PoiseError(f"the skeleton has no :{name} section", path, CUT_OFF)
     for line, words in sections.get("units", []):
         _unit(asf, words, at_line(path, line))
     for line, words in sections["root"]:
@@ -160,9 +160,7 @@ def _bonedata(asf: AsfFile, lines: list[_Line]) -> None:
         else:
             _bone_entry(asf, bone, key, words[1:], where)
     if bone is not None:
-        raise PoiseError(
-            f"bone '{bone.name}' has no 'end'", at_line(asf.path, bone.line), "The file seems cut off"
-        )
+        raise PoiseError(f"bone '{bone.name}' has no 'end'", at_line(asf.path, bone.line), CUT_OFF)
 
 
 def _bone_entry(asf: AsfFile, bone: Bone, key: str, values: list[str], where: str) -> None:
@@ -214,7 +212,8 @@ def _close(asf: AsfFile, bone: Bone) -> None:
         raise PoiseError(f"more than {MAX_JOINTS} bones", where)
     if bone.limits and len(bone.limits) != len(bone.dof):
         raise PoiseError(
-            f"bone '{bone.name}' has {len(bone.dof)} degrees of freedom but {len(bone.limits)} limits", where
+            f"bone '{bone.name}' has {len(bone.dof)} degrees of freedom but {len(bone.limits)} limits",
+            where,
         )
     if bone.length < 0:
         raise PoiseError(f"bone '{bone.name}' has the negative length {bone.length:g}", where)

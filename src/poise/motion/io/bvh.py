@@ -10,6 +10,7 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.io.text import (
+    CUT_OFF,
     MAX_HEADER_LINES,
     MAX_JOINTS,
     MAX_VALUE,
@@ -76,7 +77,7 @@ class _Tokens:
     def next(self, wanted: str) -> str:
         if self.done():
             cut = "MOTION starts" if self.motion_line is not None else "the file ends"
-            raise PoiseError(f"{cut} where {wanted} was expected", self.place(), "The file seems cut off")
+            raise PoiseError(f"{cut} where {wanted} was expected", self.place(), CUT_OFF)
         word = self.words[self.at][0]
         self.at += 1
         return word
@@ -113,7 +114,7 @@ def parse_bvh(path: Path) -> BvhFile:
     tokens = _Tokens(lines, path)
     joints = _hierarchy(tokens)
     if tokens.motion_line is None:
-        raise PoiseError("the file ends before MOTION", path, "The file seems cut off")
+        raise PoiseError("the file ends before MOTION", path, CUT_OFF)
     return _motion(lines, tokens.motion_line + 1, joints, path)
 
 
@@ -169,7 +170,9 @@ def _open_joint(
         raise PoiseError(f"joint '{name}' stands outside any other joint", place)
     if name in known:
         raise PoiseError(
-            f"joint name '{name}' appears twice (first in line {known[name]})", place, "Rename one of them"
+            f"joint name '{name}' appears twice (first in line {known[name]})",
+            place,
+            "Rename one of them",
         )
     if len(joints) >= MAX_JOINTS:
         raise PoiseError(f"more than {MAX_JOINTS} joints", place)
@@ -198,9 +201,7 @@ def _set_channels(tokens: _Tokens, joints: list[BvhJoint], stack: list[int], pla
     joint = joints[stack[-1]]
     count = tokens.next("the number of channels")
     if not (count.isdigit() and count.isascii()) or int(count) > 6:
-        raise PoiseError(
-            f"joint '{joint.name}' must have 0 to 6 channels, got {shown(count)}", place
-        )
+        raise PoiseError(f"joint '{joint.name}' must have 0 to 6 channels, got {shown(count)}", place)
     if joint.channels is not None:
         raise PoiseError(f"joint '{joint.name}' has two CHANNELS lines", place)
     channels = []
@@ -220,11 +221,13 @@ def _set_channels(tokens: _Tokens, joints: list[BvhJoint], stack: list[int], pla
 
 def _check_closed(tokens: _Tokens, joints: list[BvhJoint], stack: list[int]) -> None:
     if not joints:
-        raise PoiseError("the hierarchy has no ROOT", tokens.place(), "The file seems cut off")
+        raise PoiseError("the hierarchy has no ROOT", tokens.place(), CUT_OFF)
     if stack:
         open_joint = next(joints[j].name for j in reversed(stack) if j >= 0)
         raise PoiseError(
-            f"the brace of joint '{open_joint}' is never closed", tokens.place(), "The file seems cut off"
+            f"the brace of joint '{open_joint}' is never closed",
+            tokens.place(),
+            CUT_OFF,
         )
     for joint in joints:
         for what, value in (("OFFSET", joint.offset), ("CHANNELS", joint.channels)):
@@ -261,7 +264,7 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) 
             continue
         if len(tokens) != width:
             raise PoiseError(
-                f"the row of frame {len(numbers)} has {len(tokens)} numbers, but the channels need {width}",
+                f"the row of frame {len(numbers)} has {len(tokens)} numbers; the channels need {width}",
                 at_line(path, line),
             )
         append_numbers(values, tokens, at_line(path, line))
@@ -270,7 +273,7 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) 
         raise PoiseError(
             f"{stated} frames are stated, but only {len(numbers)} rows follow",
             at_line(path, count_line),
-            "The file seems cut off",
+            CUT_OFF,
         )
     table = np.array(values).reshape(-1, width)
     _check_values(table, joints, numbers, path)
@@ -283,7 +286,7 @@ def _entry(rows, key: bytes, path: Path, end: int) -> tuple[int, bytes]:  # type
     """The line and value of "Frames: N" or "Frame Time: S"."""
     line, tokens = next(rows, (end, None))
     if tokens is None:
-        raise PoiseError(f"the file ends before '{key.decode()}'", path, "The file seems cut off")
+        raise PoiseError(f"the file ends before '{key.decode()}'", path, CUT_OFF)
     text = b" ".join(tokens)
     if not text.lower().startswith(key.lower()):
         raise PoiseError(f"'{key.decode()}' was expected, got {shown(text)}", at_line(path, line))
@@ -305,5 +308,3 @@ def _check_values(table: np.ndarray, joints: list[BvhJoint], lines: list[int], p
     raise PoiseError(
         f"{channel} of joint '{name}' at frame {frame} is {value:g}, {what}", at_line(path, lines[frame])
     )
-
-

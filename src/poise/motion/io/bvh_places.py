@@ -37,7 +37,7 @@ def resolve_places(file: BvhFile, rot: np.ndarray) -> Places:
     """Turns the position channels of all joints into rigid offsets and one root path.
 
     Position channels replace the OFFSET, the root's too. Three dialects are told apart: channels
-    that stay constant; a root that stands still over a joint that carries the travel; and
+    that stay constant; a joint below the root that carries the travel (the root may stand still); and
     channels that hold world positions, which fit a rigid bone far better read so.
     """
     joints = file.joints
@@ -52,18 +52,20 @@ def resolve_places(file: BvhFile, rot: np.ndarray) -> Places:
     if offsets[0].any() and any(c in POSITIONS for c in joints[0].channels or ()):
         out.notes.append("The root's OFFSET is not added to its position channels")
     offsets[0] = 0.0
-    out.travel = _travel_joint(parents, out.root_pos, moves, tolerance)
+    out.travel = _travel_joint(parents, moves, tolerance)
     path = None if out.travel is None else moves.pop(out.travel)
+    if path is not None:
+        out.notes.append(_travel_note(names, int(out.travel or 0), _still(out.root_pos, tolerance)))
     loose = any(np.abs(m - np.median(m, axis=0)).max() > tolerance for m in moves.values())
     world = _from_world(parents, offsets, out.root_pos, rot, moves, tolerance) if loose else []
     if world:
         out.extra.append(("world_positions", " ".join(map(str, world))))
         listed = ", ".join(f"'{names[j]}'" for j in world)
-        out.notes.append(f"The position channels of {listed} hold places in the world, not in the parent")
+        out.notes.append(f"The position channels of {listed} hold places in the world")
     for j, places in moves.items():
         _keep_rigid(out, j, names[j], places, tolerance)
     if out.travel is not None and path is not None:
-        _lift_travel(out, parents, rot, path, names)
+        _lift_travel(out, parents, rot, path)
     return out
 
 
@@ -91,15 +93,11 @@ def _still(path: np.ndarray, tolerance: float) -> bool:
     return bool(np.abs(path - path[0]).max() <= tolerance)
 
 
-def _travel_joint(
-    parents: Sequence[int], root_pos: np.ndarray, moves: dict[int, np.ndarray], tolerance: float
-) -> int | None:
-    """The joint that carries the travel instead of a root that stands still.
+def _travel_joint(parents: Sequence[int], moves: dict[int, np.ndarray], tolerance: float) -> int | None:
+    """The joint that carries the travel instead of the root, or together with it.
 
     It is sought down from the root as long as each joint is the only child of its parent.
     """
-    if not _still(root_pos, tolerance):
-        return None
     joint = 0
     while True:
         children = [i for i, parent in enumerate(parents) if parent == joint]
@@ -110,9 +108,14 @@ def _travel_joint(
             return joint
 
 
-def _lift_travel(
-    out: Places, parents: Sequence[int], rot: np.ndarray, path: np.ndarray, names: Sequence[str]
-) -> None:
+def _travel_note(names: Sequence[str], travel: int, root_still: bool) -> str:
+    root, hips = names[0], names[travel]
+    if root_still:
+        return f"The root '{root}' stands still: the travel of '{hips}' became the root's path"
+    return f"Both the root '{root}' and '{hips}' travel; the path of both became the root's"
+
+
+def _lift_travel(out: Places, parents: Sequence[int], rot: np.ndarray, path: np.ndarray) -> None:
     """Moves the travel of joint `out.travel` into the root's path; its own offset becomes zero."""
     travel = int(out.travel or 0)
     out.extra += [
@@ -125,10 +128,6 @@ def _lift_travel(
     )
     # p_root' = p_root + R_parent (p_travel(t) - o_travel), with o_travel = 0
     out.root_pos = out.root_pos + quat_rotate(quat[:, parents[travel]], torch.tensor(path)).numpy()
-    out.notes.append(
-        f"The root '{names[0]}' stands still and '{names[travel]}' carries the travel; its path became "
-        "the root's"
-    )
 
 
 def _from_world(

@@ -66,8 +66,9 @@ def _rotations(file: BvhFile) -> np.ndarray:
     groups: dict[str, list[tuple[int, list[int]]]] = {}
     column = 0
     for j, joint in enumerate(file.joints):
-        turns = [(c[0], column + i) for i, c in enumerate(joint.channels or ()) if c.endswith("rotation")]
-        column += len(joint.channels or ())
+        channels = joint.channels or ()
+        turns = [(c[0], column + i) for i, c in enumerate(channels) if c.endswith("rotation")]
+        column += len(channels)
         if turns:
             groups.setdefault("".join(t[0] for t in turns), []).append((j, [t[1] for t in turns]))
     for order, members in groups.items():

@@ -14,8 +14,15 @@ from poise.motion.clip import Clip
 from poise.motion.io.bvh import POSITIONS
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.skeleton import Skeleton
-from poise.spatial import euler_to_quat, forward_kinematics, quat_angle, quat_conj, quat_mul
-from poise.spatial import quat_rotate_inv, quat_to_euler
+from poise.spatial import (
+    euler_to_quat,
+    forward_kinematics,
+    quat_angle,
+    quat_conj,
+    quat_mul,
+    quat_rotate_inv,
+    quat_to_euler,
+)
 
 _LOST_ANGLE = np.radians(0.005)
 
@@ -56,7 +63,7 @@ def write_bvh(
     offsets = vectors_from_z_up(clip.skeleton.offsets, axis) / unit
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
     kept = {k: np.array([float(x) for x in v.split()]) for k, v in source.extra} if own else {}
-    if own and unit != source.unit_m or own and axis != source.up_axis:
+    if own and (unit != source.unit_m or axis != source.up_axis):
         # Remembered file values hold in the file's own unit and axes only.
         kept = {}
     places = _places(clip.skeleton, offsets, root_pos, rot, kept)
@@ -146,7 +153,7 @@ def _hierarchy(
             lines.append(f"{tab}}}")
             continue
         written.append(j)
-        offset = kept.get(f"offset:{j}", offsets[j])
+        offset = kept[f"offset:{j}"] if f"offset:{j}" in kept else offsets[j]
         lines += [f"{tab}{'ROOT' if j == 0 else 'JOINT'} {skeleton.names[j]}", f"{tab}{{"]
         lines.append(f"{tab}\tOFFSET {_numbers(offset)}")
         lines.append(f"{tab}\tCHANNELS {' '.join([str(len(channels[j])), *channels[j]])}")

@@ -12,7 +12,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.raw import Options, RawMotion, assemble
-from poise.motion.io.text import MAX_VALUE, at_line, read_bytes
+from poise.motion.io.text import CUT_OFF, MAX_VALUE, at_line, read_bytes
 from poise.motion.skeleton import Channel
 from poise.spatial import axis_angle_to_quat, slerp
 
@@ -91,7 +91,7 @@ def read_deepmimic(path: Path, options: Options) -> Clip:
             f"Frame durations run from {times.min():.4g} to {times.max():.4g} s; the clip was resampled "
             f"at {1.0 / step:.4g} frames per second"
         )
-        clip = _even(clip, times)
+        clip = _even(clip, times, path)
     source = clip.skeleton.source
     return clip.replaced(skeleton=clip.skeleton.with_source(notes=(*notes, *source.notes)))
 
@@ -103,7 +103,9 @@ def _load(path: Path) -> dict[str, Any]:
         raise PoiseError(f"byte {error.start} is not UTF-8 text", path, "Save it as UTF-8") from None
     except json.JSONDecodeError as error:
         raise PoiseError(
-            f"this is not valid JSON ({error.msg})", at_line(path, error.lineno), "The file seems cut off"
+            f"this is not valid JSON ({error.msg})",
+            at_line(path, error.lineno),
+            CUT_OFF,
         ) from None
     except (RecursionError, ValueError):
         raise PoiseError("this is not valid JSON", path) from None
@@ -117,11 +119,11 @@ def _table(frames: list[Any], path: Path) -> np.ndarray:
     for i, row in enumerate(frames):
         count = len(row) if isinstance(row, list) else 0
         if count != COLUMNS:
-            raise PoiseError(f"it has {count} numbers where {COLUMNS} were expected", f"{path}, frame {i}")
+            raise PoiseError(f"it has {count} numbers, not {COLUMNS}", f"{path}, frame {i}")
         for k, value in enumerate(row):
             if type(value) not in (int, float) or not abs(value) <= MAX_VALUE:
                 raise PoiseError(
-                    f"column {k} holds {str(value)[:30]!r}, which is no usable number", f"{path}, frame {i}"
+                    f"column {k} holds {str(value)[:30]!r}, no usable number", f"{path}, frame {i}"
                 )
     if not frames:
         raise PoiseError("the list 'Frames' is empty", path)
@@ -144,7 +146,7 @@ def _rotations(
             frame = int(np.abs(norm - 1).argmax())
             if abs(norm[frame] - 1) > _NORM_SLACK:
                 raise PoiseError(
-                    f"the quaternion of joint '{name}' has length {norm[frame]:.3g}, which is no rotation",
+                    f"the quaternion of joint '{name}' has length {norm[frame]:.3g}, no rotation",
                     f"{path}, frame {frame}",
                 )
             worst = max(worst, (float(abs(norm[frame] - 1)), name, frame))
@@ -176,12 +178,12 @@ def _times(durations: np.ndarray, path: Path) -> tuple[np.ndarray, bool]:
     return times, bool(np.abs(times / step - 1).max() > _TIME_SLACK)
 
 
-def _even(clip: Clip, times: np.ndarray) -> Clip:
+def _even(clip: Clip, times: np.ndarray, path: Path) -> Clip:
     """The clip, whose frames last `times (T - 1)` s, at even steps of their median."""
     at = np.concatenate(([0.0], np.cumsum(times)))
     count = max(2, int(np.floor(at[-1] * clip.fps + 1e-3)) + 1)
     if count > 100 * clip.frames:
-        raise PoiseError("its frame durations differ too much to be evened out", clip.skeleton.source.path)
+        raise PoiseError("its frame durations differ too much to be evened out", path)
     wanted = np.minimum(np.arange(count) / clip.fps, at[-1])
     low = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, clip.frames - 2)
     t = np.clip((wanted - at[low]) / times[low], 0.0, 1.0)

@@ -45,7 +45,7 @@ def _looks_like_amc(head: bytes) -> bool:
 
 
 def _looks_like_json(head: bytes) -> bool:
-    return head[:1] == b"{" and b'"Frames"' in head or head[:1] == b"{" and b'"Loop"' in head
+    return head[:1] == b"{" and (b'"Frames"' in head or b'"Loop"' in head)
 
 
 def _refuse_asf(path: Path, options: Options) -> Clip:

@@ -91,32 +91,52 @@ def _size(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 0.1 else f"{metres * 1e3:.3g} mm"
 
 
-def guess_up(names: Sequence[str], positions: np.ndarray) -> Guess:
-    """The vertical of a file, "Y" or "Z", from sampled poses `(S, J, 3)` in file axes.
+def guess_up(names: Sequence[str], positions: np.ndarray, rest: np.ndarray) -> Guess:
+    """The vertical of a file, "Y" or "Z", from sampled poses `(S, J, 3)` and the rest pose `(J, 3)`.
 
-    People mostly stand: the mean direction from the ankles to the head, the first frames
-    counted as much as all others, or the longer side of the body where names tell nothing.
+    The body mostly stands along it, in the motion and in the rest pose. Where these two
+    contradict each other (someone lies or crawls), the floor decides: the lowest joint keeps its
+    height better than its place along any other axis.
+    """
+    first = max(1, len(positions) // 10)
+    moving = (_upright(names, positions[:first]) + _upright(names, positions)) / 2
+    resting = _upright(names, rest[None])
+    axes = [_axis(moving, "the body stands along it"), _axis(resting, "the rest pose stands along it")]
+    sure = [a for a in axes if a is not None]
+    if sure and all(a[0] == sure[0][0] for a in sure):
+        axis, why = sure[0]
+        return Guess(axis, f"The file states no vertical: {axis} taken, since {why}")
+    low = positions.min(1)
+    wander = np.percentile(low, 95, axis=0) - np.percentile(low, 5, axis=0)
+    axis = "Y" if wander[1] <= wander[2] else "Z"
+    return Guess(
+        axis,
+        f"The file states no vertical and the body lies along several axes: {axis} taken, since the "
+        "lowest joint keeps its height along it (uncertain; override with --up Y or --up Z)",
+    )
+
+
+def _upright(names: Sequence[str], positions: np.ndarray) -> np.ndarray:
+    """`(3,)` how far the bodies `(S, J, 3)` stand along each axis, 0 to 1.
+
+    The mean direction from ankles to head, or the body's extent where names tell nothing.
     """
     heads, necks, ankles = landmarks(names)
     tops = heads or necks
-    first = max(1, len(positions) // 10)
     if tops and ankles:
-        upright = positions[:, tops[0]] - positions[:, ankles].mean(1)
-        upright = upright / np.maximum(np.linalg.norm(upright, axis=-1, keepdims=True), 1e-12)
-        sides = np.abs(upright[:first].mean(0) + upright.mean(0)) / 2
-        why = "the way from the ankles to the head"
-    else:
-        extent = positions.max(1) - positions.min(1)
-        sides = extent[:first].mean(0) + extent.mean(0)
-        sides = sides / max(float(sides.max()), 1e-12)
-        why = "the body's length"
-    axis = "Y" if sides[1] >= sides[2] else "Z"
-    low, high = sorted((float(sides[1]), float(sides[2])))
-    sure = high > 0 and low < 0.7 * high
-    note = f"The file states no vertical: {axis} taken, since {why} lies along it"
-    if not sure:
-        note += f" (uncertain: Y {sides[1]:.2f}, Z {sides[2]:.2f}; override with --up Y or --up Z)"
-    return Guess(axis, note)
+        way = positions[:, tops[0]] - positions[:, ankles].mean(1)
+        way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
+        return np.abs(way.mean(0))
+    extent = (positions.max(1) - positions.min(1)).mean(0)
+    return extent / max(float(np.linalg.norm(extent)), 1e-12)
+
+
+def _axis(along: np.ndarray, why: str) -> tuple[str, str] | None:
+    """The clearly larger one of Y and Z, None where neither is or where X is larger than both."""
+    y, z = float(along[1]), float(along[2])
+    if min(y, z) > 0.7 * max(y, z) or max(y, z) < 0.5:
+        return None
+    return ("Y" if y > z else "Z"), why
 
 
 def inserted_rest_frame(rot: np.ndarray) -> str | None:
@@ -138,9 +158,11 @@ def inserted_rest_frame(rot: np.ndarray) -> str | None:
     if not (root_jumps or joints_jump):
         return None
     note = "Frame 0 is a rest pose that was put before the motion; it was dropped"
-    easing = int(np.cumprod(joints[1:20] > 3.0 * np.median(joints[20:]) + np.radians(0.2)).sum()) if (
-        len(joints) > 24
-    ) else 0
+    easing = (
+        int(np.cumprod(joints[1:20] > 3.0 * np.median(joints[20:]) + np.radians(0.2)).sum())
+        if (len(joints) > 24)
+        else 0
+    )
     if easing:
         note += f" (the joints still ease out of it in the first {easing} frames that are left)"
     return note

@@ -139,7 +139,7 @@ def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[f
 
 def _check(raw: RawMotion) -> None:
     if len(raw.names) > MAX_JOINTS:
-        raise PoiseError(f"it has {len(raw.names)} joints, more than the limit of {MAX_JOINTS}", raw.path)
+        raise PoiseError(f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed", raw.path)
     if len(raw.root_pos) < 2:
         count = len(raw.root_pos)
         raise PoiseError(
@@ -178,11 +178,19 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: Options) -> tuple[Gue
     elif raw.up_axis is not None:
         up = Guess(raw.up_axis)
     else:
-        up = guess_up(raw.names, pos)
+        up = guess_up(raw.names, pos, _rest(raw))
     return up, unit
+
+
+def _rest(raw: RawMotion) -> np.ndarray:
+    """`(J, 3)` joint places with all rotations at identity, file units."""
+    out = np.zeros_like(raw.offsets)
+    for j, parent in enumerate(raw.parents):
+        if parent >= 0:
+            out[j] = out[parent] + raw.offsets[j]
+    return out
 
 
 def zero_length_note(names: list[str]) -> str:
     """The sentence about joints that lie on their parents."""
-    one = len(names) == 1
-    return f"Joint{'' if one else 's'} {listed(names)} {'has a bone' if one else 'have bones'} of no length"
+    return f"Bones of no length lead to {listed(names)}"

@@ -21,6 +21,8 @@ MAX_JOINTS = 2000
 """Skeletons with more joints are refused."""
 MAX_VALUE = 1e8
 """Numbers larger than this, in any unit, are taken for damage."""
+CUT_OFF = "The file seems cut off"
+"""The hint of errors about files that end too early."""
 
 _CHUNK = 1 << 20
 
@@ -118,7 +120,9 @@ def decode(line: bytes, path: Path, number: int) -> str:
         return line.decode("utf-8")
     except UnicodeDecodeError as error:
         raise PoiseError(
-            f"byte 0x{line[error.start]:02x} is not UTF-8 text", at_line(path, number), "Save it as UTF-8"
+            f"byte 0x{line[error.start]:02x} is not UTF-8 text",
+            at_line(path, number),
+            "Save it as UTF-8",
         ) from None
 
 

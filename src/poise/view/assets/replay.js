@@ -96,6 +96,7 @@ Poise.replay = (data) => {
     if (Math.abs(next - state.at) > 0.7 * data.fps) fresh = true;
     state.at = next;
     if (pause) play(false);
+    readout();
   }
   function play(on) {
     state.playing = on;

@@ -1,0 +1,101 @@
+"""What a user gets: the simulated motion on the skeleton that came in, the score, the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from poise import __version__
+from poise.eval import write_score
+from poise.kin import qpos_to_clip
+from poise.motion import Clip, resample
+from poise.motion.io import write_clip
+from poise.recipes.imitation import Imitation
+from poise.recipes.session import Evaluation
+from poise.view import Report, Shape, Track, write_report
+
+
+def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0) -> Clip:
+    """The simulated motion of clip `index` on its own skeleton, at the clip's own frame rate.
+
+    The simulation runs at the control rate; the clip is resampled to the source's rate so that it
+    drops into the place of the original, at the same height above the floor.
+    """
+    recording = evaluation.recordings[index]
+    source = imitation.library.clips[recording.clip]
+    rate = imitation.reference.rate_hz
+    frames = min(len(recording.qpos), int(imitation.reference.length[recording.clip]))
+    template = resample(source, rate)
+    motion = qpos_to_clip(
+        recording.qpos[:frames],
+        imitation.humanoid.table,
+        source.skeleton,
+        rate,
+        template if template.frames == frames else None,
+        source.name,
+    )
+    return resample(motion, source.fps)
+
+
+def deliver(
+    imitation: Imitation, evaluation: Evaluation, out: Path, curve: dict[str, np.ndarray]
+) -> dict[str, Path]:
+    """Writes `simulated.bvh`, `score.json` and `report.html` into `out`; returns their paths.
+
+    A library gets one BVH per clip, named after it; the report shows the first clip.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths: dict[str, Path] = {}
+    for k, recording in enumerate(evaluation.recordings):
+        name = (
+            "simulated" if len(evaluation.recordings) == 1 else imitation.library.names[recording.clip]
+        )
+        paths[name] = out / f"{name}.bvh"
+        write_clip(simulated_clip(imitation, evaluation, k), paths[name])
+    paths["score"] = write_score(evaluation.card, out / "score.json")
+    paths["report"] = out / "report.html"
+    write_report(make_report(imitation, evaluation, curve), paths["report"])
+    return paths
+
+
+def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, np.ndarray]) -> Report:
+    """The report page of the first clip's episode from its first frame."""
+    recording, r = evaluation.recordings[0], evaluation.rollouts
+    row, frames = recording.row, len(recording.qpos)
+    pos, ref = r.pos[row, :frames].numpy(), r.ref_pos[row, :frames].numpy()
+    table, source = imitation.humanoid.table, imitation.library.clips[recording.clip]
+    card = evaluation.card
+    error = np.linalg.norm((pos - pos[:, :1]) - (ref - ref[:, :1]), axis=-1).mean(-1) * 1000
+    helped = imitation.config.method != "deepmimic"
+    return Report(
+        title=f"{source.name}, simulated",
+        subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and {len(imitation.humanoid.hinges)} "
+        f"hinges, {imitation.humanoid.mass:.0f} kg",
+        shapes=tuple(
+            Shape(i, g.kind, g.size, g.pos, g.quat) for i, b in enumerate(table.rows) for g in b.geoms
+        ),
+        bodies=imitation.humanoid.bodies,
+        reference=Track("reference", ref, r.ref_quat[row, :frames].numpy()),
+        simulated=Track("simulation", pos, r.quat[row, :frames].numpy()),
+        fps=r.fps,
+        force=r.force[row, :frames].sum(1).numpy() if helped else None,
+        torque=r.torque[row, :frames].sum(1).numpy() if helped else None,
+        error_mm=error,
+        error_global_mm=np.linalg.norm(pos - ref, axis=-1).mean(-1) * 1000,
+        contacts=None,
+        score=card.to_dict(),
+        curve=curve,
+        notes=(*source.skeleton.source.notes, *imitation.report.sentences()),
+        facts={
+            "clip": source.name,
+            "format": source.skeleton.source.format,
+            "frames": f"{source.frames} at {source.fps:.5g} fps",
+            "height": f"{table.height_m:.2f} m",
+            "mass": f"{imitation.humanoid.mass:.1f} kg",
+            "method": card.method,
+            "training": f"{card.seconds:.0f} s, {card.samples:,} samples",
+            "seed": str(card.seed),
+            "version": __version__,
+        },
+    )

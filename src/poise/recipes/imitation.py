@@ -1,0 +1,51 @@
+"""What every imitation recipe shares: a built task that can be trained and watched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from poise.body import Humanoid
+from poise.env import ImitationEnv, Reference, TaskConfig
+from poise.kin import FitReport
+from poise.learn import Trainer
+from poise.motion import ClipLibrary
+from poise.sim import CpuBackend, NanGuard
+
+
+@dataclass(frozen=True, eq=False)
+class Imitation:
+    """A library with a body, ready to be learned.
+
+    config: the recipe's settings; it must have `num_envs`, `seed`, `sim` and `ppo`.
+    """
+
+    library: ClipLibrary
+    humanoid: Humanoid
+    reference: Reference
+    report: FitReport
+    config: Any
+    task: TaskConfig
+
+    def env(
+        self,
+        num_envs: int | None = None,
+        seed: int | None = None,
+        auto_reset: bool = True,
+        threads: int = 0,
+        dumps: Path | None = None,
+    ) -> ImitationEnv:
+        """An environment of this task; without `auto_reset` for evaluation from given frames."""
+        backend = CpuBackend(self.humanoid.model, num_envs or self.config.num_envs, threads)
+        seed = self.config.seed if seed is None else seed
+        guard = NanGuard(backend, dumps, seed=seed)
+        task = replace(self.task, auto_reset=auto_reset)
+        env = ImitationEnv(self.reference, backend, task, self.config.sim.substeps, seed, guard=guard)
+        guard.where = env.where
+        return env
+
+    def trainer(self, threads: int = 0, dumps: Path | None = None, **metadata: Any) -> Trainer:
+        """A PPO trainer on a fresh environment."""
+        env = self.env(threads=threads, dumps=dumps)
+        return Trainer(env, self.config.ppo, self.config.seed, self.humanoid.identity, metadata=metadata)

@@ -1,0 +1,148 @@
+"""Residual Force Control for Agile Human Behavior Imitation and Extended Motion Synthesis.
+
+Yuan and Kitani, NeurIPS 2020; the motion imitation half.
+
+| paper                                   | here                                                  |
+|-----------------------------------------|-------------------------------------------------------|
+| Sec. 3 PD targets, Eq. 1                | `control.PDTargets` (absolute), MuJoCo position servos |
+| Sec. 5 additive action u = q^ + du      | `control.PDTargets` (additive), the default            |
+| Sec. 4.1 RFC-Explicit, Eqs. 2, 3        | `control.ExplicitResidual`                             |
+| Sec. 4.2 RFC-Implicit, Eqs. 4, 5        | `control.ImplicitResidual`                             |
+| App. B.1 world reward, Eqs. 7 to 11     | `env.terms.reward`, `world_rewards`                    |
+| App. B.2 local reward, Eqs. 12 to 14    | `env.terms.reward`, `local_rewards`                    |
+| App. C early termination                | `env.terms.done.root_too_low`                          |
+| Table 4 PPO                             | `learn.PPOConfig.paper()`                              |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+
+from poise.body import BodyConfig, Humanoid
+from poise.control import ExplicitResidual, ImplicitResidual, PDTargets, Residual
+from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
+from poise.env.terms import done, obs, reward
+from poise.kin import fit_humanoid
+from poise.learn import PPOConfig
+from poise.motion import Clip, ClipLibrary
+from poise.recipes.imitation import Imitation
+from poise.sim import SimConfig
+
+
+@dataclass(frozen=True)
+class ResidualForce:
+    """Settings of one run.
+
+    method: rfc-implicit, rfc-explicit, or deepmimic (no residual force).
+    help_limit: N, the most residual force; the torque limit is the same number in N m.
+    reward: world (App. B.1) or local (App. B.2). observation: reference (state and next reference
+    frame) or phase (the paper's). action: additive or absolute. faithful: where the paper and its
+    authors' code disagree, whose value holds (rotation angle or half of it; reward weights).
+    done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
+    """
+
+    method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
+    help_limit: float = 100.0
+    reward: Literal["world", "local"] = "world"
+    observation: Literal["reference", "phase"] = "reference"
+    action: Literal["additive", "absolute"] = "additive"
+    faithful: Literal["paper", "code"] = "paper"
+    done: Literal["bodies", "height"] = "bodies"
+    num_envs: int = 512
+    horizon: int = 300
+    seed: int = 0
+    body: BodyConfig = BodyConfig()
+    sim: SimConfig = SimConfig()
+    ppo: PPOConfig = PPOConfig(std=0.055, policy_hidden=(512, 256), value_hidden=(512, 256))
+
+
+def residual(config: ResidualForce, humanoid: Humanoid) -> Residual | None:
+    """The kind of help: none, a root wrench, or wrenches on pelvis, feet and hands."""
+    limits = {"limit_n": config.help_limit, "limit_nm": config.help_limit}
+    if config.method == "rfc-implicit":
+        return ImplicitResidual(**limits)
+    if config.method == "rfc-explicit":
+        return ExplicitResidual(bodies=(0, *humanoid.feet), **limits)
+    return None
+
+
+def world_rewards(humanoid: Humanoid, faithful: str = "paper") -> tuple[RewardTerm, ...]:
+    """Eq. 7 with the paper's weights (0.3, 0.1, 0.5, 0.1) or the code's (0.3, 0.1, 0.45, 0.1)."""
+    code = faithful == "code"
+    bodies = torch.tensor(humanoid.end_effectors)
+    return (
+        RewardTerm("pose", reward.pose, 0.3, {"alpha": 2.0, "half": code}),
+        RewardTerm("velocity", reward.velocity, 0.1, {"alpha": 0.005}),
+        RewardTerm("end_effectors", reward.end_effectors, 0.45 if code else 0.5, {"bodies": bodies}),
+        RewardTerm("centre_of_mass", reward.centre_of_mass, 0.1, {"alpha": 100.0}),
+    )
+
+
+def local_rewards(humanoid: Humanoid, faithful: str = "paper") -> tuple[RewardTerm, ...]:
+    """Eq. 12 with weights (0.5, 0.3, 0.1, 0.1), the code's being (0.5, 0.3, 0.05, 0.1)."""
+    code = faithful == "code"
+    tips = {"bodies": torch.tensor(humanoid.end_effectors), "alpha": 20.0, "local": True}
+    return (
+        RewardTerm("pose", reward.pose, 0.5, {"alpha": 2.0, "half": code}),
+        RewardTerm("end_effectors", reward.end_effectors, 0.3, tips),
+        RewardTerm("root_pose", reward.root_pose, 0.05 if code else 0.1, {"alpha": 300.0, "half": code}),
+        RewardTerm("root_velocity", reward.root_velocity, 0.1, {"alpha": 0.1}),
+    )
+
+
+def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
+    """Imitation as terms."""
+    help_ = residual(config, humanoid)
+    rewards = (world_rewards if config.reward == "world" else local_rewards)(humanoid, config.faithful)
+    if help_ is not None:
+        weight = 0.05 if config.faithful == "code" else 0.1
+        rewards += (RewardTerm("residual", reward.residual, weight, imitation=False),)
+    own = (obs.root_height, obs.root_tilt, obs.root_velocity, obs.joint_angles, obs.joint_velocities)
+    seen = (*own, obs.phase)
+    if config.observation == "reference":
+        targets = (obs.body_positions, obs.target_joints, obs.target_root, obs.target_bodies)
+        seen = (*seen, *targets)
+    fail = (
+        DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5})
+        if config.done == "bodies"
+        else DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1})
+    )
+    return TaskConfig(
+        obs=tuple(ObsTerm(fn.__name__, fn) for fn in seen),
+        rewards=rewards,
+        dones=(fail,),
+        pd=PDTargets(config.action),
+        residual=help_,
+        horizon=config.horizon,
+    )
+
+
+def build(clips: Clip | ClipLibrary, config: ResidualForce | None = None) -> Imitation:
+    """Body, reference and task for a clip or a library; train with `.trainer()`."""
+    config = config or ResidualForce()
+    library = ClipLibrary.of(clips) if isinstance(clips, Clip) else clips
+    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
+    config.sim.apply(humanoid.model)
+    reference = Reference(
+        humanoid, motions, config.sim.control_hz, library.names, [c.cyclic for c in library]
+    )
+    return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
+
+
+def paper(config: ResidualForce) -> ResidualForce:
+    """The paper's own setting: phase observation, absolute action, root height rule, its PPO."""
+    slow = SimConfig(rate_hz=450.0, integrator="implicitfast")
+    faithful = {"observation": "phase", "action": "absolute", "done": "height", "sim": slow}
+    return replace(config, ppo=PPOConfig.paper(), **faithful)
+
+
+#: What to expect of the default settings (see `benchmarks/first_light.json`).
+RECIPE = {
+    "name": "residual-force",
+    "config": ResidualForce,
+    "build": build,
+    "expected": {"cmu 02_01 walk": {"succ": 0.95, "mpjpe_mm": 60.0}, "tolerance": 0.05},
+}

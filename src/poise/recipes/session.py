@@ -1,0 +1,171 @@
+"""From clips to results: a run folder that can be resumed, evaluated, played and delivered.
+
+run/
+    run.safetensors         the clips and the recipe's settings, all a run needs to be rebuilt
+    checkpoint.safetensors  the trainer's whole state (learn.run)
+    progress.csv            the learning curve (learn.run)
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poise.body import BodyConfig
+from poise.errors import PoiseError
+from poise.eval import Recording, RolloutSet, ScoreCard, run_episodes, score_rollouts, start_frames
+from poise.learn import (
+    LATEST,
+    IterationStats,
+    Policy,
+    PPOConfig,
+    RunResult,
+    Until,
+    load_checkpoint,
+    load_policy,
+    run,
+    save_checkpoint,
+)
+from poise.motion import ClipLibrary
+from poise.motion.pack import pack_clips, unpack_clips
+from poise.recipes.imitation import Imitation
+from poise.recipes.residual_force import ResidualForce, build
+from poise.sim import SimConfig
+
+#: The file that says what a run is.
+RUN_FILE = "run.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What a policy did: the score card, the padded rollouts, one whole episode per clip."""
+
+    card: ScoreCard
+    rollouts: RolloutSet
+    recordings: list[Recording]
+
+
+def begin(folder: Path, library: ClipLibrary, config: ResidualForce) -> Imitation:
+    """Builds the task and writes the run file; a folder that holds another run is refused."""
+    imitation = build(library, config)
+    path = folder / RUN_FILE
+    tensors, notes = pack_clips(library.clips)
+    meta = {"kind": "run", "recipe": "residual-force", "config": _as_json(config), "clips": notes}
+    meta["character"] = imitation.humanoid.identity
+    if path.exists():
+        _, found = load_checkpoint(path)
+        if json.dumps(found.get("config")) != json.dumps(meta["config"]):
+            raise PoiseError(
+                "the folder holds a run with other settings",
+                folder,
+                "Resume it as it is or choose another",
+            )
+        if found.get("character") != meta["character"] or found.get("clips") != json.loads(
+            json.dumps(notes)
+        ):
+            raise PoiseError(
+                f"the folder holds a run of other clips ({', '.join(c['name'] for c in found['clips'])})",
+                folder,
+                "Choose another folder",
+            )
+        return imitation
+    folder.mkdir(parents=True, exist_ok=True)
+    save_checkpoint(path, tensors, meta)
+    return imitation
+
+
+def reopen(folder: Path) -> Imitation:
+    """The task of an existing run, rebuilt from its folder alone."""
+    path = folder / RUN_FILE
+    if not path.exists():
+        raise PoiseError(
+            f"is no run folder: there is no {RUN_FILE} in it",
+            folder,
+            "Give the 'run' folder of a result",
+        )
+    tensors, meta = load_checkpoint(path)
+    config = _from_json(meta["config"])
+    return build(ClipLibrary(tuple(unpack_clips(tensors, meta["clips"]))), config)
+
+
+def train(
+    imitation: Imitation,
+    folder: Path,
+    until: Until,
+    on_iteration: Callable[[IterationStats], bool | None] | None = None,
+    threads: int = 0,
+    tensorboard: bool = True,
+) -> RunResult:
+    """Trains, or goes on training, in `folder`; see `poise.learn.run`."""
+    trainer = imitation.trainer(threads=threads, dumps=folder / "dumps")
+    try:
+        return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
+    finally:
+        trainer.env.close()
+
+
+def trained_policy(folder: Path, imitation: Imitation) -> tuple[Policy, dict[str, Any]]:
+    """The run's latest policy and its checkpoint's metadata."""
+    path = folder / LATEST
+    if not path.exists():
+        raise PoiseError("nothing has been trained in it yet", folder, "Train it with --resume first")
+    policy = load_policy(path, character=imitation.humanoid.identity)
+    return policy, policy.meta
+
+
+def evaluate(
+    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], rule: str = "phc"
+) -> Evaluation:
+    """Every start frame simulated to the end with the deterministic policy, and its score card."""
+    config = imitation.config
+    limit = 0.0 if config.method == "deepmimic" else config.help_limit
+    clip, start = start_frames(imitation.reference)
+    rollouts, recordings = run_episodes(
+        lambda n: imitation.env(n, auto_reset=False), policy, clip, start, limit, limit
+    )
+    card = score_rollouts(
+        rollouts,
+        rule=rule,
+        method=config.method,
+        seconds=float(meta.get("seconds", 0.0)),
+        samples=int(meta.get("samples", 0)),
+        seed=config.seed,
+    )
+    return Evaluation(card, rollouts, recordings)
+
+
+def learning_curve(folder: Path) -> dict[str, np.ndarray]:
+    """Columns of the run's CSV by name; empty where nothing was trained."""
+    path = next(iter(sorted(folder.glob("*.csv"))), None)
+    if path is None:
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = rows[0].keys() if rows else ()
+    return {name: np.array([float(r[name] or "nan") for r in rows]) for name in names}
+
+
+def _as_json(config: ResidualForce) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def _from_json(data: Mapping[str, Any]) -> ResidualForce:
+    """Settings from JSON; a key of another version is an error, since its meaning is unknown."""
+    try:
+        values = dict(data)
+        body = dict(values.pop("body"))
+        body["overrides"] = tuple((str(k), float(v)) for k, v in body["overrides"])
+        ppo = {k: tuple(v) if isinstance(v, list) else v for k, v in values.pop("ppo").items()}
+        sim = SimConfig(**values.pop("sim"))
+        return ResidualForce(**values, body=BodyConfig(**body), sim=sim, ppo=PPOConfig(**ppo))
+    except (TypeError, KeyError) as problem:
+        raise PoiseError(
+            f"the run was made by another version of Poise ({problem})", hint="Train it again"
+        ) from None

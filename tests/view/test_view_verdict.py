@@ -1,0 +1,89 @@
+"""The verdict in words, its thresholds, and the score table."""
+
+from __future__ import annotations
+
+import pytest
+from fake_report import score
+
+from poise.view.table import amount, score_table
+from poise.view.verdict import THRESHOLDS, grades, help_given, overall, percent, sentence
+
+
+def test_sentence_of_a_good_run():
+    assert sentence(score()) == (
+        "Tracks the whole clip from every start: yes (100 %) · joint error 32 mm · "
+        "help 11 N = 1.9 % of body weight"
+    )
+    assert overall(score()) == "good"
+
+
+@pytest.mark.parametrize(
+    ("changes", "level"),
+    [
+        ({"succ": 0.96}, "good"),
+        ({"succ": 0.9}, "fair"),
+        ({"succ": 0.5}, "poor"),
+        ({"succ": None}, "unknown"),
+        ({"mpjpe_mm": 70}, "fair"),
+        ({"mpjpe_mm": 120}, "poor"),
+        ({"mpjpe_mm": float("nan")}, "unknown"),
+        ({"mpjpe_mm": float("nan"), "succ": 0.1}, "poor"),
+        ({"foot_slide_mm_per_s": 900}, "good"),
+        ({"help": {"force_mean_n": 60, "share_of_body_weight": 0.09}}, "fair"),
+        ({"help": {"force_mean_n": 300, "share_of_body_weight": 0.4}}, "poor"),
+        ({"help": {"force_mean_n": 5}}, "unknown"),
+        ({"help": {}}, "unknown"),
+        ({"help": {"force_mean_n": 0.0, "share_of_body_weight": 0.0, "torque_mean_nm": 30.0}}, "poor"),
+    ],
+)
+def test_the_worst_figure_decides(changes: dict, level: str):
+    assert overall({**score(), **changes}) == level
+
+
+def test_no_help_is_said_plainly():
+    none = {"help": {"force_mean_n": 0.0, "share_of_body_weight": 0.0, "torque_mean_nm": 0.0}}
+    assert sentence({**score(), **none}).endswith("help none")
+    assert help_given(none).level == "good"
+
+
+def test_thresholds_are_stated_beside_the_figures():
+    assert [g.rule for g in grades(score())][:2] == [
+        "good from 95, fair from 80 %",
+        "good to 40, fair to 80 mm",
+    ]
+
+
+def test_thresholds_are_those_of_the_score_card():
+    verdicts = pytest.importorskip("poise.eval.verdicts")
+    for key, bounds in THRESHOLDS.items():
+        card = verdicts.THRESHOLDS[key]
+        assert (card.good, card.fair) == bounds, key
+
+
+def test_per_cent_never_rounds_to_all_or_nothing():
+    shares = (1.0, 0.9999, 0.96875, 0.5, 0.00001, 0.0)
+    assert [percent(s) for s in shares] == ["100 %", "99.9 %", "96.9 %", "50 %", "below 0.1 %", "0 %"]
+
+
+def test_amounts():
+    assert [
+        amount(1_500_000),
+        amount(3.14159, "mm"),
+        amount(41.26, "N"),
+        amount(None),
+        amount("<b>"),
+    ] == [
+        "1\u202f500\u202f000",
+        "3.14 mm",
+        "41.3 N",
+        "\u2013",
+        "&lt;b&gt;",
+    ]
+
+
+def test_table_shows_the_clip_beside_and_keeps_unknown_keys():
+    table = score_table({**score(), "jerk": 900.0, "new_figure": 7.25})
+    assert 'class="n better">14.2 mm/s</td><td class="n">41 mm/s' in table
+    assert 'class="n worse">900 m/s³' in table
+    assert "new_figure" in table and "7.25" in table
+    assert "Help: force limit" in table and score_table({})
