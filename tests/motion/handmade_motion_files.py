@@ -139,8 +139,8 @@ def deepmimic_row(t: int, duration: float = 0.02) -> list[float]:
     unit = [1.0, 0.0, 0.0, 0.0]
     row = [duration, 0.02 * t, 0.85, 0.0, *unit]
     row += unit + unit
-    row += unit + [-0.5] + unit + unit + [0.0]
-    row += unit + [0.0] + unit + unit + [0.7]
+    row += [*unit, -0.5, *unit, *unit, 0.0]
+    row += [*unit, 0.0, *unit, *unit, 0.7]
     return row
 
 

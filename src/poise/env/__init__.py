@@ -2,11 +2,14 @@
 
 from poise.env.env import ImitationEnv, TaskConfig
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
+from poise.env.gym import GymEnv, GymVectorEnv
 from poise.env.reference import Reference
 
 __all__ = [
     "DoneTerm",
     "Frame",
+    "GymEnv",
+    "GymVectorEnv",
     "ImitationEnv",
     "ObsTerm",
     "Reference",

@@ -16,6 +16,7 @@ from poise.kin.coords import clip_to_qpos
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground
 from poise.motion import Clip, ClipLibrary, resample
+from poise.motion.repair import Spike, remove_spikes, spike_sentence
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 
 #: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
@@ -28,13 +29,15 @@ GIMBAL = 1.2
 class FitReport:
     """What was measured and changed so that one body can do the motion.
 
-    names: the clips. ground: one fit per clip. joint_error_mm: mean distance between the clip's
-    joints and the humanoid's after conversion (turns that a chain cannot make), per clip. widened:
-    hinges whose range had to grow, with the growth in degrees. excluded: body pairs that overlap in
-    the reference. fastest: (hinge, rad/s), the largest joint speed.
+    names: the clips. spikes: impossible turns that were interpolated, per clip. ground: one fit per
+    clip. joint_error_mm: mean distance per clip between its joints and the humanoid's after
+    conversion (turns that a chain cannot make). widened: hinges whose range had to grow, with the
+    growth in degrees. excluded: body pairs that overlap in the reference. fastest: (hinge, rad/s),
+    the largest joint speed.
     """
 
     names: tuple[str, ...]
+    spikes: tuple[tuple[Spike, ...], ...]
     ground: tuple[GroundFit, ...]
     joint_error_mm: tuple[float, ...]
     widened: tuple[tuple[str, float], ...]
@@ -44,7 +47,10 @@ class FitReport:
     def sentences(self) -> list[str]:
         """The report in words, one line each."""
         out = []
-        for name, ground, error in zip(self.names, self.ground, self.joint_error_mm, strict=True):
+        columns = (self.names, self.spikes, self.ground, self.joint_error_mm)
+        for name, spikes, ground, error in zip(*columns, strict=True):
+            if spikes:
+                out.append(f"{name}: {spike_sentence(spikes)}")
             out.append(f"{name}: {ground.sentence()}")
             out.append(f"{name}: the humanoid's joints lie {error:.1f} mm from the clip's on average.")
         if self.widened:
@@ -75,7 +81,8 @@ def fit_humanoid(
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
-    clips = [resample(c, rate_hz) for c in library]
+    repaired = [remove_spikes(c) for c in library]
+    clips = [resample(c, rate_hz) for c, _ in repaired]
     table = generate_table(clips[0].skeleton, config, clips)
     table = _choose_orders(table, clips)
     motions = [clip_to_qpos(c, table) for c in clips]
@@ -93,6 +100,7 @@ def fit_humanoid(
         humanoid = make_humanoid(clips[0].skeleton, table)
     report = FitReport(
         library.names,
+        tuple(spikes for _, spikes in repaired),
         tuple(f for _, f in fits),
         tuple(error),
         widened,

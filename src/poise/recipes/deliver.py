@@ -70,8 +70,8 @@ def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, n
     helped = imitation.config.method != "deepmimic"
     return Report(
         title=f"{source.name}, simulated",
-        subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and {len(imitation.humanoid.hinges)} "
-        f"hinges, {imitation.humanoid.mass:.0f} kg",
+        subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and "
+        f"{len(imitation.humanoid.hinges)} hinges, {imitation.humanoid.mass:.0f} kg",
         shapes=tuple(
             Shape(i, g.kind, g.size, g.pos, g.quat) for i, b in enumerate(table.rows) for g in b.geoms
         ),

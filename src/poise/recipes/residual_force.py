@@ -56,7 +56,7 @@ class ResidualForce:
     seed: int = 0
     body: BodyConfig = BodyConfig()
     sim: SimConfig = SimConfig()
-    ppo: PPOConfig = PPOConfig(std=0.055, policy_hidden=(512, 256), value_hidden=(512, 256))
+    ppo: PPOConfig = PPOConfig(std=0.055)
 
 
 def residual(config: ResidualForce, humanoid: Humanoid) -> Residual | None:

@@ -70,8 +70,9 @@ def begin(folder: Path, library: ClipLibrary, config: ResidualForce) -> Imitatio
         if found.get("character") != meta["character"] or found.get("clips") != json.loads(
             json.dumps(notes)
         ):
+            names = ", ".join(c["name"] for c in found["clips"])
             raise PoiseError(
-                f"the folder holds a run of other clips ({', '.join(c['name'] for c in found['clips'])})",
+                f"the folder holds a run of other clips ({names})",
                 folder,
                 "Choose another folder",
             )

@@ -1,0 +1,67 @@
+# The same few commands everywhere. They need python3 (3.11 or newer) with venv, pip, git and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+CLIP := src/poise/data/walk.bvh
+MINUTES ?= 0.7
+
+.DEFAULT_GOAL := help
+.PHONY: help install dev demo test check format bench docs clean
+
+help:
+	@echo "make demo    install into $(VENV), train on a walk for $(MINUTES) minutes, write demo/"
+	@echo "make test    run the tests"
+	@echo "make check   lint, formatting, types, order of imports"
+	@echo "make format  mend formatting and simple lint"
+	@echo "make bench   measure and rewrite the figures of the README"
+	@echo "make docs    check the links of the documents"
+	@echo "make clean   remove $(VENV), demo/ and caches"
+
+# The stamps make installing idempotent: it happens again only when what is installed changes.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Poise needs Python 3.11 or newer; name one with: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@test -x $(BIN)/python && $(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) || \
+	  { echo "The venv module is missing; on Debian and Ubuntu install python3-venv." >&2; exit 1; }
+	$(PIP) install --quiet -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.installed
+	$(PIP) install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+install: $(VENV)/.installed
+
+dev: $(VENV)/.dev
+
+demo: $(VENV)/.installed
+	@rm -rf demo
+	$(BIN)/poise imitate $(CLIP) -o demo --minutes $(MINUTES)
+	@echo "The report:               demo/report.html (open it in a browser)"
+	@echo "The simulated motion:     demo/simulated.bvh"
+	@echo "The score card:           demo/score.json"
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/first_light.py
+
+docs:
+	$(PYTHON) docs/check_links.py
+
+clean:
+	rm -rf $(VENV) demo build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf src/*.egg-info MUJOCO_LOG.TXT
+	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

@@ -1,0 +1,55 @@
+"""Every real clip of the index reads with the joints, frames and rate that it lists."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from poise.motion import Clip, describe, read_clip
+
+INCH = 0.0254
+ASF_UNIT = 0.0254 / 0.45
+
+
+def expected_unit(path: str) -> float:
+    if path.startswith("deepmimic"):
+        return 1.0
+    if path.startswith("cmu_amc") or "fairmotion" in path or "14_14" in path or "jumping" in path:
+        return ASF_UNIT
+    return INCH if "cmu_bvh/ad/" in path else 0.01
+
+
+def check(clip: Clip, row: dict[str, str]) -> None:
+    path = row["path"]
+    facts = describe(clip)
+    dropped = any(w.startswith("Frame 0 is a rest pose") for w in facts["warnings"])
+    assert facts["joints"] == int(row["joints"]), path
+    assert facts["frames"] == int(row["frames"]) - dropped, path
+    assert abs(facts["fps"] - float(row["fps"])) < 2e-3, path
+    assert dropped == ("acrnn" in path or "fairmotion" in path), path
+    assert np.isclose(facts["unit_m"], expected_unit(path)), path
+    z_up = "cmu_bvh/ad/" in path and "14_14" not in path and "jumping" not in path
+    assert facts["up_axis"] == ("Z" if z_up else "Y"), path
+    assert 1.35 < facts["height_m"] < 1.9, path
+    # Nobody is far below the floor or flies above it.
+    assert -0.35 < clip.positions()[..., 2].min() < 0.35, path
+
+
+def test_all_files_of_the_index(data_dir: Path) -> None:
+    with (data_dir / "INDEX.tsv").open(newline="") as file:
+        rows = [r for r in csv.DictReader(file, delimiter="\t")]
+    wanted = [r for r in rows if r["format"] in ("bvh", "asf/amc", "deepmimic-json")]
+    wanted = [r for r in wanted if "malformed" not in r["path"]]
+    assert len(wanted) > 150
+    for row in wanted:
+        skeleton = data_dir / "cmu_amc/rfc/08.asf" if "/rfc/" in row["path"] else None
+        check(read_clip(data_dir / row["path"], skeleton=skeleton), row)
+
+
+def test_known_teleports(data_dir: Path) -> None:
+    for name, frames in (("04", ("346", "347", "350")), ("10", ("317", "356", "361"))):
+        clip = read_clip(data_dir / f"cmu_bvh/acrnn_salsa/{name}.bvh")
+        note = next(n for n in clip.skeleton.source.notes if n.startswith("The root jumps"))
+        assert all(f in note for f in frames)
