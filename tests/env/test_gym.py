@@ -108,13 +108,15 @@ def test_returned_arrays_are_not_used_again(make_env):
 
 
 def test_gymnasium_vector_wrappers_apply(make_env):
-    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(GymVectorEnv(make_env(2)))
+    inner = GymVectorEnv(make_env(2))
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(inner)
+    env = gymnasium.wrappers.vector.DictInfoToList(env)
     env.reset(seed=0)
     ended = 0
     for _ in range(31):
         _, _, _, _, infos = env.step(np.zeros(env.action_space.shape, np.float32))
-        ended += "episode" in infos
-    assert ended
+        ended += sum("episode" in one and "final_obs" in one for one in infos)
+    assert ended and inner.log["imitation"] > 0.5
     env.close()
 
 

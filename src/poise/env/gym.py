@@ -23,7 +23,7 @@ class GymVectorEnv(VectorEnv):
 
     Observations `(N, O)` and actions `(N, A)` are float32. A world whose episode ends begins the next
     one in the same step: its last observation stands in `infos["final_obs"]`, as Gymnasium's
-    SAME_STEP mode has it, and `infos["log"]` holds the step's means by name.
+    SAME_STEP mode has it. `log` holds the last step's means by name.
 
     Args:
         env: the worlds, with automatic reset.
@@ -40,6 +40,7 @@ class GymVectorEnv(VectorEnv):
                 hint="Make the ImitationEnv with auto_reset=True",
             )
         self.env, self.num_envs = env, env.num_envs
+        self.log: dict[str, float] = {}
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.single_observation_space, self.single_action_space = _spaces(env, limit)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -59,7 +60,7 @@ class GymVectorEnv(VectorEnv):
         """One control step of all worlds: observations, rewards, terminations, truncations, infos."""
         out = self.env.step(_actions(actions))
         terminated, truncated = _ended(out)
-        infos: Info = {"log": dict(out.log)}
+        self.log, infos = dict(out.log), {}
         over = terminated | truncated
         if over.any():
             last = np.full(self.num_envs, None, dtype=object)

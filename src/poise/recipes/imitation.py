@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -48,4 +49,12 @@ class Imitation:
     def trainer(self, threads: int = 0, dumps: Path | None = None, **metadata: Any) -> Trainer:
         """A PPO trainer on a fresh environment."""
         env = self.env(threads=threads, dumps=dumps)
-        return Trainer(env, self.config.ppo, self.config.seed, self.humanoid.identity, metadata=metadata)
+        cores = threads or len(os.sched_getaffinity(0))
+        return Trainer(
+            env,
+            self.config.ppo,
+            self.config.seed,
+            self.humanoid.identity,
+            metadata=metadata,
+            update_threads=min(cores, 4),
+        )
