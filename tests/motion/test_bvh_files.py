@@ -270,3 +270,18 @@ def test_lafan1_reads_in_a_second(data_dir: Path) -> None:
     clip = read_clip(data_dir / "lafan1_bvh/walk4_subject1.bvh")
     assert clip.frames == 4918
     assert time.perf_counter() - start < 3.0  # 0.3 s alone; the machine may be shared.
+
+
+def test_root_without_position_channels(tmp_path: Path) -> None:
+    header = BVH_HEADER.replace("OFFSET 0 0 0", "OFFSET 5 90 7", 1).replace(
+        "CHANNELS 6 Xposition Yposition Zposition", "CHANNELS 3"
+    )
+    rows = [" ".join(r.split()[3:]) for r in bvh_rows()]
+    clip = read_clip(put(tmp_path, "a.bvh", bvh_text(rows, header=header)))
+    np.testing.assert_allclose(clip.root_pos, [[0.05, -0.07, 0.9]] * 8)
+    write_clip(clip, tmp_path / "b.bvh")
+    assert "position" not in (tmp_path / "b.bvh").read_text()
+    assert max(same(clip, read_clip(tmp_path / "b.bvh"))) < 1e-3
+    moved = clip.replaced(root_pos=clip.root_pos + np.arange(8)[:, None] * 0.01)
+    write_clip(moved, tmp_path / "c.bvh")
+    assert max(same(moved, read_clip(tmp_path / "c.bvh"))) < 1e-3

@@ -337,7 +337,7 @@ def test_endless_lines_and_huge_files_are_refused_at_once(tmp_path: Path) -> Non
         file.write(b"HIERARCHY\n")
         file.truncate(2 << 30)  # Sparse: two gigabytes of zeros that take no disk.
     assert refusal(path) == (
-        ": the file has 2.15 GB, more than the limit of 1.07 GB. Cut it into shorter clips"
+        ": the file has 2.15 GB, more than the limit of 0.54 GB. Cut it into shorter clips"
     )
     with path.open("wb") as file:
         file.write(b"HIERARCHY\n")

@@ -147,7 +147,7 @@ def _bonedata(asf: AsfFile, lines: list[_Line]) -> None:
         where, key = at_line(asf.path, line), words[0].lower()
         if key == "begin":
             if bone is not None:
-                raise PoiseError(f"bone '{bone.name}' has no 'end' before the next 'begin'", where)
+                raise PoiseError(f"bone {shown(bone.name)} has no 'end' before the next 'begin'", where)
             bone, limits = Bone("", line), False
         elif bone is None:
             raise PoiseError(f"{shown(words[0])} stands outside any begin and end", where)
@@ -160,7 +160,7 @@ def _bonedata(asf: AsfFile, lines: list[_Line]) -> None:
         else:
             _bone_entry(asf, bone, key, words[1:], where)
     if bone is not None:
-        raise PoiseError(f"bone '{bone.name}' has no 'end'", at_line(asf.path, bone.line), CUT_OFF)
+        raise PoiseError(f"bone {shown(bone.name)} has no 'end'", at_line(asf.path, bone.line), CUT_OFF)
 
 
 def _bone_entry(asf: AsfFile, bone: Bone, key: str, values: list[str], where: str) -> None:
@@ -204,8 +204,9 @@ def _limit(words: list[str], angle: float, where: str) -> tuple[tuple[float, flo
 
 def _close(asf: AsfFile, bone: Bone) -> None:
     where = at_line(asf.path, bone.line)
-    if not bone.name:
-        raise PoiseError("a bone has no name", where)
+    if not bone.name or not bone.name.isprintable():
+        what = f"{shown(bone.name)} is no bone name" if bone.name else "a bone has no name"
+        raise PoiseError(what, where)
     if bone.name in asf.bones:
         raise PoiseError(f"bone name '{bone.name}' appears twice", where)
     if len(asf.bones) >= MAX_JOINTS:

@@ -11,7 +11,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.motion.io.text import (
     CUT_OFF,
-    MAX_HEADER_LINES,
+    MAX_HEADER_WORDS,
     MAX_JOINTS,
     MAX_VALUE,
     append_numbers,
@@ -58,8 +58,8 @@ class _Tokens:
         self.words: list[tuple[str, int]] = []
         self.motion_line: int | None = None
         for i, line in enumerate(lines):
-            if i >= MAX_HEADER_LINES:
-                raise PoiseError(f"no MOTION in the first {MAX_HEADER_LINES} lines", path)
+            if len(self.words) > MAX_HEADER_WORDS:
+                raise PoiseError(f"no MOTION in the first {MAX_HEADER_WORDS} words", path)
             parts = decode(line, path, i + 1).replace("{", " { ").replace("}", " } ").split()
             if parts and parts[0].upper() == "MOTION":
                 self.motion_line = i
@@ -98,14 +98,16 @@ class _Tokens:
         return out[0], out[1], out[2]
 
     def name(self) -> str:
-        """All words up to the brace, so that names may hold blanks."""
-        words = [self.next("a joint name")]
-        if words[0] in "{}":
-            self.at -= 1
-            raise PoiseError("a joint has no name", self.place())
-        while not self.done() and self.words[self.at][0] != "{" and len(words) < 20:
-            words.append(self.next("'{'"))
-        return " ".join(words)
+        """All words of the line up to a brace, so that names may hold blanks."""
+        line = self.words[self.at - 1][1]
+        words: list[str] = []
+        while not self.done() and self.words[self.at][1] == line and self.words[self.at][0] not in "{}":
+            words.append(self.next("a joint name"))
+        name = " ".join(words)
+        if not name or not name.isprintable() or len(name) > 200:
+            what = "a joint has no name" if not name else f"{shown(name)} is no joint name"
+            raise PoiseError(what, at_line(self.path, line))
+        return name
 
 
 def parse_bvh(path: Path) -> BvhFile:
@@ -275,7 +277,7 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) 
             at_line(path, count_line),
             CUT_OFF,
         )
-    table = np.array(values).reshape(-1, width)
+    table = np.frombuffer(values).reshape(-1, width)
     _check_values(table, joints, numbers, path)
     rows_more = f"{extra} row{'s' if extra > 1 else ''}"
     notes = (f"{rows_more} after the stated {stated} frames were left out",) if extra else ()

@@ -12,7 +12,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.raw import Options, RawMotion, assemble
-from poise.motion.io.text import CUT_OFF, MAX_VALUE, at_line, read_bytes
+from poise.motion.io.text import CUT_OFF, MAX_JSON_BYTES, MAX_VALUE, at_line, read_bytes
 from poise.motion.skeleton import Channel
 from poise.spatial import axis_angle_to_quat, slerp
 
@@ -98,9 +98,10 @@ def read_deepmimic(path: Path, options: Options) -> Clip:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(read_bytes(path).decode("utf-8"))
+        data = json.loads(read_bytes(path, MAX_JSON_BYTES).decode("utf-8"))
     except UnicodeDecodeError as error:
-        raise PoiseError(f"byte {error.start} is not UTF-8 text", path, "Save it as UTF-8") from None
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise PoiseError("this is not UTF-8 text", at_line(path, line), "Save it as UTF-8") from None
     except json.JSONDecodeError as error:
         raise PoiseError(
             f"this is not valid JSON ({error.msg})",

@@ -11,12 +11,18 @@ import numpy as np
 
 from poise.errors import PoiseError
 
-MAX_FILE_BYTES = 1 << 30
-"""Larger files are refused before they are read."""
+MAX_FILE_BYTES = 512 << 20
+"""Larger files are refused before they are read (22 joints at 30 Hz: about seven hours)."""
+MAX_JSON_BYTES = 128 << 20
+"""The same for JSON, which needs far more memory than its text."""
+MAX_SKELETON_BYTES = 16 << 20
+"""The same for ASF skeletons, which hold no motion."""
+MAX_LINES = 10_000_000
+"""Files with more lines are refused while they are read."""
 MAX_LINE_BYTES = 4 << 20
 """Longer lines are refused while they are read."""
-MAX_HEADER_LINES = 200_000
-"""More lines than this before the motion starts are refused."""
+MAX_HEADER_WORDS = 1_000_000
+"""More words than this before the motion starts are refused."""
 MAX_JOINTS = 2000
 """Skeletons with more joints are refused."""
 MAX_VALUE = 1e8
@@ -32,7 +38,7 @@ def at_line(path: Path, line: int) -> str:
     return f"{path}, line {line}"
 
 
-def check_file(path: Path) -> int:
+def check_file(path: Path, limit: int = MAX_FILE_BYTES) -> int:
     """The size in bytes of a regular file that is there, not empty and not too large."""
     try:
         info = path.stat()
@@ -47,10 +53,9 @@ def check_file(path: Path) -> int:
         raise PoiseError("this is not a regular file", path)
     if info.st_size == 0:
         raise PoiseError("the file is empty", path)
-    if info.st_size > MAX_FILE_BYTES:
+    if info.st_size > limit:
         raise PoiseError(
-            f"the file has {info.st_size / 1e9:.2f} GB, more than the limit of "
-            f"{MAX_FILE_BYTES / 1e9:.2f} GB",
+            f"the file has {info.st_size / 1e9:.2f} GB, more than the limit of {limit / 1e9:.2f} GB",
             path,
             "Cut it into shorter clips",
         )
@@ -67,12 +72,12 @@ def read_head(path: Path, size: int = 4096) -> bytes:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
 
 
-def read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """All bytes of a text file; binary data, other encodings and endless lines are refused.
 
     The file is scanned in pieces of 1 MiB, so that a bad one is refused early and cheaply.
     """
-    check_file(path)
+    check_file(path, limit)
     chunks: list[bytes] = []
     run, line, total = 0, 1, 0
     try:
@@ -81,7 +86,7 @@ def read_bytes(path: Path) -> bytes:
                 if total == 0:
                     chunk = _without_mark(chunk, path)
                 total += len(chunk)
-                if total > MAX_FILE_BYTES:
+                if total > limit:
                     raise PoiseError("the file grew beyond the limit while it was read", path)
                 nul = chunk.find(b"\0")
                 if nul >= 0:
@@ -94,7 +99,9 @@ def read_bytes(path: Path) -> bytes:
                         at_line(path, line),
                     )
                 run = len(chunk) - last - 1 if last >= 0 else run + len(chunk)
-                line += chunk.count(b"\n")
+                line += chunk.count(b"\n") + chunk.count(b"\r") - chunk.count(b"\r\n")
+                if line > MAX_LINES:
+                    raise PoiseError(f"the file has more than {MAX_LINES} lines", path)
                 chunks.append(chunk)
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
@@ -153,12 +160,15 @@ def append_numbers(values: array[float], tokens: list[bytes], where: str) -> Non
     """
     size = len(values)
     try:
+        # Python reads "1_000" as a number; motion files do not.
+        if b"_" in b"".join(tokens):
+            raise ValueError
         values.extend(map(float, tokens))
     except ValueError:
         del values[size:]
         for token in tokens:
             try:
-                float(token)
+                float(token.replace(b"_", b"x"))
             except ValueError:
                 raise PoiseError(f"{shown(token)} is not a number", where) from None
 

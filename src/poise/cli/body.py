@@ -1,0 +1,56 @@
+"""`poise body`: the physical body that is made for a clip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.console import notes, say_json, table
+from poise.cli.options import Body, Reading
+
+
+@dataclass(frozen=True)
+class Options:
+    """Show the body that is made for a clip: masses, hinges, gains, torque limits."""
+
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
+    """The motion file."""
+    json: bool = False
+    """Print JSON alone."""
+    body: OmitArgPrefixes[Body] = Body()
+    reading: OmitArgPrefixes[Reading] = Reading()
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Fits the body as training would, so that the table is the one that is trained."""
+    config = options.body.config()
+    from poise.kin import fit_humanoid
+
+    humanoid, _, report = fit_humanoid(options.reading.read(options.clip), config)
+    rows = humanoid.table.describe()
+    if options.json:
+        facts = {"height_m": humanoid.table.height_m, "mass_kg": humanoid.mass}
+        say_json({**facts, "hinges": len(humanoid.hinges), "bodies": rows})
+        return 0
+    title = (
+        f"{options.clip.name}: {len(rows)} bodies, {len(humanoid.hinges)} hinges, "
+        f"{humanoid.mass:.1f} kg, {humanoid.table.height_m:.2f} m"
+    )
+    columns = ("body", "part", "parent", "hinges", "shape", "kg", "kp", "kd", "N m", "range, degrees")
+    table(title, columns, [_row(r) for r in rows], left=5)
+    notes(report.sentences())
+    return 0
+
+
+def _row(r: dict[str, Any]) -> list[str]:
+    ranges = " ".join(f"{low}..{high}" for low, high in r["range_deg"])
+    words = [r[k] for k in ("body", "part", "parent", "hinges", "shape")]
+    figures = [f"{r['mass']:.2f}", *(f"{r[k]:g}" if r["hinges"] != "-" else "-" for k in _GAINS)]
+    return [*words, *figures, ranges or "-"]
+
+
+_GAINS = ("kp", "kd", "torque")

@@ -1,0 +1,73 @@
+"""Everything that is printed: results on stdout, errors and progress on stderr."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+#: Columns of a table that goes to a file or a pipe, where no window limits it.
+_PIPE_WIDTH = 120
+
+
+def _console(stream: Any) -> Console:
+    # Made anew for each use, so that a stream that was replaced (by a test, a notebook) is honoured.
+    terminal = hasattr(stream, "isatty") and stream.isatty()
+    return Console(
+        file=stream, highlight=False, markup=False, emoji=False, width=None if terminal else _PIPE_WIDTH
+    )
+
+
+def out() -> Console:
+    """The console of results."""
+    return _console(sys.stdout)
+
+
+def err() -> Console:
+    """The console of errors and progress."""
+    return _console(sys.stderr)
+
+
+def say(text: str, style: str = "") -> None:
+    """One line of result; it is never wrapped, so that paths can be copied."""
+    out().print(Text(text, style=style), soft_wrap=True)
+
+
+def tell(text: str, style: str = "") -> None:
+    """One line beside the results, on stderr."""
+    err().print(Text(text, style=style), soft_wrap=True)
+
+
+def error(sentence: str) -> None:
+    """Exactly one line `error: ...` on stderr, whatever the sentence holds."""
+    line = " ".join(sentence.split())
+    line = "".join(c if c.isprintable() else "?" for c in line)
+    err().print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
+
+
+def say_json(value: Any) -> None:
+    """JSON alone on stdout, to be read by a program."""
+    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def notes(sentences: Sequence[str], limit: int = 12) -> None:
+    """Sentences as a list, the first `limit` of them."""
+    for sentence in sentences[:limit]:
+        say(f"  - {sentence}", "dim")
+    if len(sentences) > limit:
+        say(f"  - and {len(sentences) - limit} more", "dim")
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> None:
+    """A table whose first `left` columns are words and whose others are figures."""
+    grid = Table(title=Text(title) if title else None, title_justify="left", header_style="bold")
+    for k, name in enumerate(columns):
+        grid.add_column(Text(name), justify="left" if k < left else "right", overflow="fold")
+    for row in rows:
+        grid.add_row(*(c if isinstance(c, Text) else Text(str(c)) for c in row))
+    out().print(grid)

@@ -1,0 +1,200 @@
+"""`poise doctor`: what works on this machine, and what to do about the rest."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import Literal
+
+from rich.text import Text
+
+from poise import __version__
+from poise.cli.console import out, say, say_json
+
+State = Literal["ok", "missing", "optional"]
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "firefox")
+_SPEED_ENVS, _SPEED_S = 64, 0.5
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: what was looked for, whether it is there, what was found, what to do if not."""
+
+    name: str
+    state: State
+    found: str
+    todo: str = ""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say what works on this machine, and what to do about the rest."""
+
+    json: bool = False
+    """Print JSON alone."""
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Exit code 0 if everything needed is there, else 1."""
+    checks = [check() for check in CHECKS]
+    ready = all(c.state != "missing" for c in checks)
+    if options.json:
+        say_json({"poise": __version__, "ready": ready, "checks": [asdict(c) for c in checks]})
+        return 0 if ready else 1
+    wide = max(len(c.name) for c in checks)
+    styles = {"ok": "green", "missing": "bold red", "optional": "yellow"}
+    for c in checks:
+        todo = f" ({c.todo})" if c.todo else ""
+        line = Text.assemble((f"{c.state:<9}", styles[c.state]), f"{c.name:<{wide}}  {c.found}{todo}")
+        out().print(line, soft_wrap=True)
+    say("This machine is ready." if ready else "Something needed is missing; see above.")
+    return 0 if ready else 1
+
+
+def python() -> Check:
+    """Python's version."""
+    good = sys.version_info >= (3, 11)
+    found = f"{platform.python_version()} ({platform.python_implementation()})"
+    return Check("python", "ok" if good else "missing", found, "" if good else "install Python 3.11")
+
+
+def machine() -> Check:
+    """The system, the cores this process may use, the memory."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    memory = ""
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        memory = f", {total / 2**30:.1f} GiB of memory"
+    named = f"{platform.system()} {platform.machine()}"
+    return Check("machine", "ok", f"{named}, {cores} core{'' if cores == 1 else 's'}{memory}")
+
+
+def package(module: str, name: str, todo: str, needed: bool = True) -> Callable[[], Check]:
+    """A check that `module` can be imported; `name` is its distribution."""
+
+    def check() -> Check:
+        absent: State = "missing" if needed else "optional"
+        try:
+            import_module(module)
+        except Exception as problem:
+            # A package that is there but broken says so in its own words.
+            there = "not installed" if isinstance(problem, ModuleNotFoundError) else str(problem)
+            return Check(module, absent, " ".join(there.split())[:120], todo)
+        try:
+            return Check(module, "ok", metadata.version(name))
+        except metadata.PackageNotFoundError:
+            return Check(module, "ok", "version unknown")
+
+    return check
+
+
+def cuda() -> Check:
+    """A GPU that torch can use."""
+    try:
+        import torch
+    except ImportError:
+        return Check("cuda", "optional", "torch is missing", "install torch first")
+    if torch.cuda.is_available():
+        return Check("cuda", "ok", torch.cuda.get_device_name(0))
+    return Check("cuda", "optional", "no GPU", "everything runs on the CPU as well")
+
+
+def browser() -> Check:
+    """A browser for the reports."""
+    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    if found:
+        return Check("browser", "ok", found)
+    return Check("browser", "optional", "none found", "open report.html on any other machine")
+
+
+def cache() -> Check:
+    """A folder for what can be made again."""
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "poise"
+    place = folder
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            return Check("cache", "ok", str(folder))
+    except OSError as problem:
+        why = f"{folder} cannot be written ({problem.strerror})"
+        return Check("cache", "optional", why, "set XDG_CACHE_HOME to a folder that can")
+
+
+def speed() -> Check:
+    """Steps per second of the physics, on a body made here."""
+    try:
+        import torch
+
+        from poise.body import generate_table, make_humanoid
+        from poise.sim import CpuBackend, SimConfig
+
+        humanoid = make_humanoid(skeleton := _skeleton(), generate_table(skeleton))
+        SimConfig().apply(humanoid.model)
+        backend = CpuBackend(humanoid.model, _SPEED_ENVS)
+    except Exception as problem:
+        said = f"{type(problem).__name__}: {problem}"
+        return Check("physics", "missing", " ".join(said.split())[:120], "install Poise again")
+    qpos = torch.tensor(humanoid.model.qpos0).repeat(_SPEED_ENVS, 1)
+    qpos[:, 2] = 1.0
+    backend.write(None, qpos, torch.zeros(_SPEED_ENVS, humanoid.model.nv))
+    steps, start = 0, time.perf_counter()
+    while (spent := time.perf_counter() - start) < _SPEED_S:
+        backend.step(SimConfig().substeps)
+        steps += _SPEED_ENVS
+    fine = bool(torch.isfinite(backend.state.qpos).all())
+    backend.close()
+    hinges = len(humanoid.hinges)
+    found = f"{steps / spent:,.0f} control steps/s with {_SPEED_ENVS} bodies of {hinges} hinges"
+    if fine:
+        return Check("physics", "ok", found)
+    return Check("physics", "missing", "the simulation diverged", "install mujoco again")
+
+
+def _skeleton():  # type: ignore[no-untyped-def]
+    """A person in metres, Z up, for the speed check."""
+    import numpy as np
+
+    from poise.motion import Skeleton
+
+    rows = [
+        ("hips", -1, (0, 0, 0)),
+        ("spine", 0, (0, 0, 0.12)),
+        ("neck", 1, (0, 0, 0.40)),
+        ("head", 2, (0, 0, 0.10)),
+    ]
+    for side, y in (("left", 1.0), ("right", -1.0)):
+        first = len(rows)
+        rows += [
+            (f"{side}_upleg", 0, (0, 0.09 * y, 0)),
+            (f"{side}_leg", first, (0, 0, -0.42)),
+            (f"{side}_foot", first + 1, (0, 0, -0.42)),
+            (f"{side}_arm", 1, (0, 0.18 * y, 0.34)),
+            (f"{side}_forearm", first + 3, (0, 0.28 * y, 0)),
+            (f"{side}_hand", first + 4, (0, 0.25 * y, 0)),
+        ]
+    names, parents, offsets = zip(*rows, strict=True)
+    return Skeleton(names, parents, np.array(offsets, dtype=float))
+
+
+CHECKS: tuple[Callable[[], Check], ...] = (
+    python,
+    machine,
+    package("torch", "torch", "pip install torch"),
+    package("mujoco", "mujoco", "pip install 'mujoco>=4.0'"),
+    package("mujoco.batch", "mujoco", "pip install --upgrade 'mujoco>=4.0'"),
+    package("tensorboard", "tensorboard", "pip install tensorboard"),
+    speed,
+    cache,
+    cuda,
+    package("mujoco_warp", "mujoco-warp", "pip install mujoco-warp, for physics on a GPU", needed=False),
+    browser,
+)

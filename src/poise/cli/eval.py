@@ -1,0 +1,44 @@
+"""`poise eval`: the score card of a trained run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from poise.cli.console import say_json
+from poise.cli.options import Rule
+from poise.cli.output import run_folder
+from poise.cli.progress import working
+from poise.cli.results import print_card
+
+
+@dataclass(frozen=True)
+class Options:
+    """Simulate a trained run from every start frame and print its score card."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a result or of a run."""
+    json: bool = False
+    """Print JSON alone: what score.json holds."""
+    rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
+    """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Rebuilds the task from the run folder alone and evaluates the latest policy."""
+    folder = run_folder(options.run)
+    from poise.recipes.session import evaluate, reopen, trained_policy
+
+    with working("simulating every start frame"):
+        imitation = reopen(folder)
+        policy, meta = trained_policy(folder, imitation)
+        card = evaluate(imitation, policy, meta, options.rule).card
+    if options.json:
+        say_json(card.to_dict())
+    else:
+        print_card(card)
+    return 0

@@ -1,0 +1,54 @@
+"""`poise imitate`: a clip in, the same motion physically simulated out, with a score card."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.console import say
+from poise.cli.options import Body, Reading, Training
+from poise.cli.progress import working
+from poise.cli.results import print_card
+from poise.cli.training import Job, command_line
+
+
+@dataclass(frozen=True)
+class Options:
+    """Give one clip a body: train, simulate every start frame, write simulated.bvh, score.json,
+    report.html and the run itself."""
+
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
+    """The motion file."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+    """The folder of the results."""
+    training: OmitArgPrefixes[Training] = Training()
+    body: OmitArgPrefixes[Body] = Body()
+    reading: OmitArgPrefixes[Reading] = Reading()
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Trains, evaluates, delivers; Ctrl-C during training saves and evaluates nothing."""
+    o = options
+    again = command_line("imitate", argv)
+    job = Job((o.clip,), o.out, o.out / "run", o.training, o.body, o.reading, again)
+    imitation = job.start()
+    result = job.train(imitation)
+    if result.interrupted:
+        return job.stopped("Stopped; the training so far is saved.")
+    from poise.recipes.deliver import deliver
+    from poise.recipes.session import evaluate, learning_curve, trained_policy
+
+    try:
+        with working("simulating every start frame"):
+            evaluation = evaluate(imitation, *trained_policy(job.run, imitation))
+            paths = deliver(imitation, evaluation, o.out, learning_curve(job.run))
+    except KeyboardInterrupt:
+        return job.stopped("Stopped in the evaluation; the training is saved.")
+    print_card(evaluation.card)
+    for path in (*paths.values(), job.run):
+        say(str(path))
+    return 0

@@ -1,0 +1,57 @@
+"""`poise info`: what motion files hold, and what had to be guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.console import notes, say, say_json, table
+from poise.cli.options import Reading
+from poise.errors import PoiseError
+
+#: The keys of `--json`, which programs rely on.
+KEYS = ("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "height_m", "warnings")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say what motion files hold: joints, rate, length, unit, height, what was guessed."""
+
+    clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")] = ()
+    """Motion files: BVH, AMC with its ASF, DeepMimic."""
+    json: bool = False
+    """Print JSON alone: one object, or a list of them for several clips."""
+    reading: OmitArgPrefixes[Reading] = Reading()
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Reads every file before the first line is printed."""
+    if not options.clips:
+        raise PoiseError("no clip was given", hint="Write poise info CLIP")
+    from poise.motion.info import describe
+
+    facts = [describe(options.reading.read(path)) for path in options.clips]
+    if options.json:
+        plain = [{key: fact[key] for key in KEYS} for fact in facts]
+        say_json(plain[0] if len(plain) == 1 else plain)
+        return 0
+    for path, fact in zip(options.clips, facts, strict=True):
+        table(str(path), ("", "value"), _rows(fact))
+        if fact["warnings"]:
+            say("Guessed or repaired:")
+            notes(fact["warnings"], 40)
+    return 0
+
+
+def _rows(fact: dict[str, Any]) -> list[tuple[str, str]]:
+    return [
+        ("format", fact["format"]),
+        ("joints", str(fact["joints"])),
+        ("frames", f"{fact['frames']} at {fact['fps']:.5g} fps, {fact['seconds']:.2f} s"),
+        ("unit", f"{fact['unit_m']:.6g} m, {fact['up_axis']} up"),
+        ("height", f"{fact['height_m']:.2f} m, {fact['height_from']}"),
+    ]

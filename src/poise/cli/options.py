@@ -1,0 +1,125 @@
+"""Options that several verbs share, and what they become."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.body import BodyConfig
+    from poise.motion import Clip
+    from poise.recipes import ResidualForce
+
+Method = Literal["rfc-implicit", "rfc-explicit", "deepmimic"]
+Reward = Literal["world", "local"]
+Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a motion file is read; all of it is guessed or read from the file by default."""
+
+    skeleton: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """The ASF skeleton of an AMC motion."""
+    fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
+    """Frames per second."""
+    unit: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """Metres in one unit of the file: 0.01 for centimetres."""
+    up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
+    """The file's vertical."""
+
+    def read(self, path: Path) -> Clip:
+        """The clip in the file `path`."""
+        from poise.motion.io import read_clip
+
+        return read_clip(
+            path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up
+        )
+
+
+@dataclass(frozen=True)
+class Body:
+    """What may be stated about the body that is made."""
+
+    mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
+    """Total mass; by default that of body mass index 22 at the clip's height."""
+    set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")] = ()
+    """One value of the body, such as lfoot.kp=400 or thigh.torque=250."""
+
+    def config(self) -> BodyConfig:
+        """The settings of the body generator."""
+        from poise.body import BodyConfig
+
+        return BodyConfig(mass_kg=self.mass, overrides=tuple(map(override, self.set)))
+
+
+def override(text: str) -> tuple[str, float]:
+    """("lfoot.kp", 400.0) from "lfoot.kp=400"."""
+    name, equals, value = text.partition("=")
+    hint = "Write for example --set lfoot.kp=400"
+    if not equals or not name.strip():
+        raise PoiseError(f"--set needs NAME=VALUE, got '{text}'", hint=hint)
+    try:
+        number = float(value)
+    except ValueError:
+        raise PoiseError(f"--set {name.strip()} needs a number, got '{value}'", hint=hint) from None
+    return name.strip(), number
+
+
+@dataclass(frozen=True)
+class Training:
+    """How long and in which way is trained."""
+
+    minutes: Annotated[float, arg(metavar="M")] = 10.0
+    """Training time in minutes, counted over all resumed runs."""
+    method: Annotated[Method, arg(metavar="NAME")] = "rfc-implicit"
+    """rfc-implicit and rfc-explicit help with a residual force, deepmimic does without."""
+    help_limit: Annotated[float, arg(metavar="NEWTONS")] = 100.0
+    """The most residual force; the same number in N m limits its torque."""
+    reward: Annotated[Reward, arg(metavar="NAME")] = "world"
+    """world asks for the place in the world, local only for the pose and the root's motion."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of everything random."""
+    envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Characters simulated at once; by default the recipe's 512."""
+    threads: Annotated[int, arg(metavar="N")] = 0
+    """Threads of the physics; 0 takes every core."""
+    iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Stop after so many iterations as well; for tests."""
+    resume: bool = False
+    """Go on with the run that is in the folder."""
+
+    def check(self) -> None:
+        """Refuses numbers that make no sense, before anything is read or made."""
+        if not (self.minutes > 0 and math.isfinite(self.minutes)):
+            raise PoiseError(f"--minutes must be above 0, got {self.minutes:g}")
+        if not (self.help_limit >= 0 and math.isfinite(self.help_limit)):
+            raise PoiseError(
+                f"--help-limit must be a number of at least 0 newtons, got {self.help_limit:g}",
+                hint="Use --method deepmimic to train without help" if self.help_limit < 0 else None,
+            )
+        least = {"envs": 1, "threads": 0, "iterations": 1, "seed": 0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value < 2**31:
+                raise PoiseError(f"--{name} must be a whole number of at least {low}, got {value}")
+
+    def config(self, body: Body) -> ResidualForce:
+        """The recipe's settings."""
+        from poise.recipes import ResidualForce
+
+        more = {} if self.envs is None else {"num_envs": self.envs}
+        return ResidualForce(
+            method=self.method,
+            help_limit=self.help_limit,
+            reward=self.reward,
+            seed=self.seed,
+            body=body.config(),
+            **more,
+        )

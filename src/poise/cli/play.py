@@ -1,0 +1,94 @@
+"""`poise play`: one episode of a trained run as a page to watch."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from poise.cli.console import say
+from poise.cli.output import run_folder
+from poise.cli.progress import working
+from poise.errors import PoiseError, did_you_mean
+
+if TYPE_CHECKING:
+    from poise.recipes.imitation import Imitation
+
+
+@dataclass(frozen=True)
+class Options:
+    """Simulate the latest policy of a run from one frame and write a page to watch."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a result or of a run."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
+    """The page to write; by default play.html in the run folder."""
+    start: Annotated[int, arg(metavar="FRAME")] = 0
+    """The frame of the clip to start from."""
+    clip: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """The clip, where the run has several; by default the first one."""
+    open: bool = False
+    """Open the page in the browser."""
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Simulates one episode to its end and writes its report page."""
+    folder = run_folder(options.run)
+    from poise.recipes.deliver import make_report
+    from poise.recipes.session import learning_curve, reopen, trained_policy
+    from poise.view import write_report
+
+    with working("simulating"):
+        imitation = reopen(folder)
+        clip, frame = _place(imitation, options.clip, options.start)
+        policy, meta = trained_policy(folder, imitation)
+        episode = _episode(imitation, policy, meta, clip, frame)
+        page = options.out or folder / "play.html"
+        write_report(make_report(imitation, episode, learning_curve(folder)), page)
+    say(str(page))
+    if options.open and not webbrowser.open(page.absolute().as_uri()):
+        raise PoiseError("no browser could be opened", page, "Open the page by hand")
+    return 0
+
+
+def _place(imitation: Imitation, name: str | None, start: int) -> tuple[int, int]:
+    """Clip index and control frame of frame `start` of the clip called `name`."""
+    names = imitation.library.names
+    if name is not None and name not in names:
+        raise PoiseError(f"the run has no clip '{name}'. {did_you_mean(name, names)}")
+    index = 0 if name is None else names.index(name)
+    clip = imitation.library.clips[index]
+    if not 0 <= start < clip.frames:
+        raise PoiseError(
+            f"--start must be a frame of '{clip.name}', 0 to {clip.frames - 1}, got {start}"
+        )
+    # The clip's frames have the file's rate, the simulation's have the control rate; an episode
+    # needs at least one step.
+    frame = round(start / clip.fps * imitation.reference.rate_hz)
+    return index, min(frame, int(imitation.reference.length[index]) - 2)
+
+
+def _episode(imitation: Imitation, policy, meta, clip: int, frame: int):  # type: ignore[no-untyped-def]
+    """One episode as an evaluation of its own."""
+    import torch
+
+    from poise.eval import run_episodes, score_rollouts
+    from poise.recipes.session import Evaluation
+
+    config = imitation.config
+    limit = 0.0 if config.method == "deepmimic" else config.help_limit
+    rollouts, recordings = run_episodes(
+        lambda n: imitation.env(n, auto_reset=False),
+        policy,
+        torch.tensor([clip]),
+        torch.tensor([frame]),
+        limit,
+        limit,
+    )
+    trained = {"seconds": float(meta.get("seconds", 0.0)), "samples": int(meta.get("samples", 0))}
+    card = score_rollouts(rollouts, method=config.method, seed=config.seed, **trained)
+    return Evaluation(card, rollouts, recordings)

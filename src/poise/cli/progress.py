@@ -1,0 +1,99 @@
+"""The learning curve while it grows: a bar in a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
+
+from poise.cli.console import err, tell
+
+if TYPE_CHECKING:
+    from poise.learn import IterationStats, Until
+
+#: Seconds between two lines where there is no terminal.
+EVERY_S = 30.0
+
+
+def clock(seconds: float) -> str:
+    """Minutes and seconds, with hours where there are any: "4:05"."""
+    whole = max(0, round(seconds))
+    hours, rest = divmod(whole, 3600)
+    return (f"{hours}:{rest // 60:02d}" if hours else f"{rest // 60}") + f":{rest % 60:02d}"
+
+
+def share_done(stats: IterationStats, until: Until) -> float:
+    """How much of the nearest limit is used up, 0 to 1."""
+    parts = [0.0]
+    if until.minutes:
+        parts.append(stats.seconds / (60 * until.minutes))
+    if until.iterations:
+        parts.append(stats.iteration / until.iterations)
+    return min(1.0, max(parts))
+
+
+def figures(stats: IterationStats) -> str:
+    """What one iteration says about the learning."""
+    reward = stats.terms.get("imitation", stats.reward)
+    # Nothing is known about episodes before the first one has ended.
+    ended = "" if math.isnan(stats.episode_length) else (
+        f"  episode {stats.episode_length:.0f} steps  failures {100 * stats.failure_rate:.0f} %"
+    )
+    return f"{stats.samples_per_s:,.0f} samples/s  imitation {reward:.3f}{ended}"
+
+
+def times(stats: IterationStats, until: Until) -> str:
+    """Elapsed, limit and what is left: "1:20 of 10:00, 8:40 left"."""
+    done = share_done(stats, until)
+    left = stats.seconds * (1 - done) / done if done else math.nan
+    if until.iterations and stats.iteration / until.iterations == done:
+        return f"iteration {stats.iteration} of {until.iterations}, {clock(left)} left"
+    limit = f" of {clock(60 * until.minutes)}" if until.minutes else ""
+    return f"{clock(stats.seconds)}{limit}, {clock(left)} left"
+
+
+@contextlib.contextmanager
+def training(until: Until) -> Iterator[Callable[[IterationStats], None]]:
+    """Gives the function that shows one iteration."""
+    console = err()
+    if not console.is_terminal:
+        yield _Lines(until)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("training", total=1.0, what="")
+
+        def show(stats: IterationStats) -> None:
+            what = f"{times(stats, until)}  {figures(stats)}"
+            bar.update(task, completed=share_done(stats, until), what=what)
+
+        yield show
+
+
+class _Lines:
+    """The first iteration, the last one, and one every `EVERY_S` seconds."""
+
+    def __init__(self, until: Until):
+        self.until, self.last = until, -math.inf
+
+    def __call__(self, stats: IterationStats) -> None:
+        now = time.monotonic()
+        if now - self.last >= EVERY_S or share_done(stats, self.until) >= 1.0:
+            self.last = now
+            tell(f"{times(stats, self.until)}  {figures(stats)}")
+
+
+@contextlib.contextmanager
+def working(what: str) -> Iterator[None]:
+    """A spinner in a terminal while something takes seconds."""
+    console = err()
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(Text(what)):
+        yield

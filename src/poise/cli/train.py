@@ -1,0 +1,54 @@
+"""`poise train`: a recipe on one clip or a library, without evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.console import say
+from poise.cli.options import Body, Reading, Training
+from poise.cli.training import Job, command_line
+from poise.errors import PoiseError, did_you_mean
+
+#: Recipes that can be trained.
+RECIPES = ("residual-force",)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train a recipe on one clip or on several clips of one skeleton, and no more."""
+
+    recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
+    """residual-force."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
+    """The run folder, for poise eval and poise play."""
+    clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")] = ()
+    """Motion files."""
+    training: OmitArgPrefixes[Training] = Training()
+    body: OmitArgPrefixes[Body] = Body()
+    reading: OmitArgPrefixes[Reading] = Reading()
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Trains until the limit or Ctrl-C."""
+    o = options
+    if o.recipe not in RECIPES:
+        raise PoiseError(f"there is no recipe '{o.recipe}'. {did_you_mean(o.recipe, RECIPES)}")
+    if not o.clips:
+        raise PoiseError("no clip was given", hint=f"Write poise train {o.recipe} CLIP -o RUNDIR")
+    again = command_line("train", argv)
+    job = Job(o.clips, o.out, o.out, o.training, o.body, o.reading, again)
+    imitation = job.start()
+    result = job.train(imitation)
+    if result.interrupted:
+        return job.stopped("Stopped; the training so far is saved.")
+    if result.last is None:
+        say(f"{o.out} had reached its limit before; nothing was trained.")
+    else:
+        say(f"Trained {result.last.seconds:.0f} s, {result.last.samples:,} samples")
+    say(str(o.out))
+    return 0

@@ -1,0 +1,88 @@
+"""What `imitate` and `train` share: check, read, build, train, and the way to go on."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from poise.cli import progress
+from poise.cli.console import notes, say, tell
+from poise.cli.options import Body, Reading, Training
+from poise.cli.output import claimed
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.learn import RunResult
+    from poise.motion import ClipLibrary
+    from poise.recipes.imitation import Imitation
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training: which clips, into which result folder and run folder, how."""
+
+    clips: tuple[Path, ...]
+    out: Path
+    run: Path
+    training: Training
+    body: Body
+    reading: Reading
+    again: str
+    """The command line that goes on with it."""
+
+    def start(self) -> Imitation:
+        """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""
+        self.training.check()
+        config = self.training.config(self.body)
+        from poise.recipes.session import RUN_FILE, begin
+
+        held = (self.run / RUN_FILE).exists()
+        if held and not self.training.resume:
+            hint = "Go on with --resume, or choose another folder"
+            raise PoiseError("already holds a run", self.out, hint)
+        library = self.read()
+        say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
+        notes([n for clip in library for n in clip.skeleton.source.notes])
+        with claimed(self.out), claimed(self.run), progress.working("making the body"):
+            imitation = begin(self.run, library, config)
+        if self.training.resume and not held:
+            tell(f"There was no run in {self.run}; a new one starts.")
+        notes(imitation.report.sentences())
+        return imitation
+
+    def read(self) -> ClipLibrary:
+        """All clips, each with a name of its own."""
+        from poise.motion import ClipLibrary
+
+        seen: dict[str, int] = {}
+        clips = []
+        for path in self.clips:
+            clip = self.reading.read(path)
+            seen[clip.name] = seen.get(clip.name, 0) + 1
+            count = seen[clip.name]
+            clips.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
+        return ClipLibrary(tuple(clips))
+
+    def train(self, imitation: Imitation) -> RunResult:
+        """Trains until the limit or Ctrl-C; either way everything is saved."""
+        from poise.learn import Until
+        from poise.recipes.session import train
+
+        until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
+        with progress.training(until) as show:
+            return train(imitation, self.run, until, show, self.training.threads)
+
+    def stopped(self, what: str) -> int:
+        """Says how to go on after Ctrl-C, and gives the exit code."""
+        tell(f"{what} Go on with:")
+        tell(f"  {self.again}")
+        return 130
+
+
+def command_line(verb: str, argv: Sequence[str]) -> str:
+    """The command line that resumes `poise VERB ARGV`."""
+    more = () if "--resume" in argv else ("--resume",)
+    return shlex.join(("poise", verb, *argv, *more))
