@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -123,21 +125,15 @@ def explicit(
 
 @pytest.mark.parametrize("damping", [0.02, 0.2])
 def test_coarse_servos_follow_the_papers_450_hz_controller(data_dir, damping):
-    # Half a second of the CMU humanoid in the air, its servos following a walk.
+    # Half a second of the CMU humanoid in the air, its servos following a walk. Measured: mean 0.28
+    # degrees, 95th percentile 1.0, largest 2.6 (kd 0.02 kp); 0.37, 1.5 and 14 with the paper's 0.2 kp.
     clip = trim(read_clip(data_dir / "cmu_amc/02/02_01.amc"), 0, 80)
     humanoid, motions, _ = fit_humanoid(clip, BodyConfig(damping=damping), 30.0)
     start = motions[0][0].copy()
     start[2] += 2.0
     targets = motions[0][1:16, 7:]
-    fine = explicit(make_copy(humanoid.model), start, targets, SimConfig(450.0, integrator="euler"))
-    coarse = servo(make_copy(humanoid.model), start, targets, SimConfig(60.0))
+    fine = explicit(copy.deepcopy(humanoid.model), start, targets, SimConfig(450.0, integrator="euler"))
+    coarse = servo(copy.deepcopy(humanoid.model), start, targets, SimConfig(60.0))
     error = np.degrees(np.abs(fine - coarse))
-    print(f"kd {damping} kp: mean {error.mean():.2f}, 95% {np.quantile(error, 0.95):.2f}, max {error.max():.2f}")
     assert np.isfinite(error).all()
     assert error.mean() < 1.5 and np.quantile(error, 0.95) < 5.0
-
-
-def make_copy(model: mujoco.MjModel) -> mujoco.MjModel:
-    import copy
-
-    return copy.deepcopy(model)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from poise.body.table import BodyTable
+from poise.errors import PoiseError
 from poise.motion import Skeleton
 
 _GEOMS = {
@@ -127,5 +128,17 @@ def make_spec(table: BodyTable) -> mujoco.MjSpec:
 
 
 def make_humanoid(skeleton: Skeleton, table: BodyTable) -> Humanoid:
-    """Compiles a table into a model."""
-    return Humanoid(skeleton, table, make_spec(table).compile())
+    """Compiles a table into a model.
+
+    Raises:
+        PoiseError: rows that are not depth first, since MuJoCo would number the bodies otherwise.
+    """
+    model = make_spec(table).compile()
+    for i, row in enumerate(table.rows):
+        if model.body(i + 1).name != row.name:
+            raise PoiseError(
+                f"row {i} of the body table is '{row.name}', but MuJoCo's body {i + 1} is "
+                f"'{model.body(i + 1).name}'",
+                hint="Order the rows depth first",
+            )
+    return Humanoid(skeleton, table, model)

@@ -38,8 +38,8 @@ class Part:
 class Anatomy:
     """The parts found in a skeleton; joints that are no part ride rigidly on their nearest ancestor.
 
-    parts: in the skeleton's order; the first is the pelvis. toes: first joint below each foot, by
-    side, where there is one.
+    parts: depth first, as MuJoCo numbers bodies; the first is the pelvis. toes: first joint below each
+    foot, by side, where there is one.
     """
 
     parts: tuple[Part, ...]
@@ -78,6 +78,15 @@ def _path(skeleton: Skeleton, top: int, bottom: int) -> list[int]:
         out.append(j)
         j = skeleton.parents[j]
     return out[::-1]
+
+
+def _depth_first(skeleton: Skeleton) -> list[int]:
+    """All joints, each one's whole subtree before its next sibling."""
+    out, stack = [], [0]
+    while stack:
+        out.append(stack.pop())
+        stack += reversed(skeleton.children(out[-1]))
+    return out
 
 
 def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
@@ -150,5 +159,5 @@ def find_anatomy(skeleton: Skeleton) -> Anatomy:
             kinds[j] = ("neck", "")
         elif core in _HEAD:
             kinds[j] = ("head", "")
-    parts = tuple(Part(j, *kinds[j]) for j in sorted(kinds))
+    parts = tuple(Part(j, *kinds[j]) for j in _depth_first(skeleton) if j in kinds)
     return Anatomy(parts, tuple(toes))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,8 +21,8 @@ class Options:
     """The motion file."""
     json: bool = False
     """Print JSON alone."""
-    body: OmitArgPrefixes[Body] = Body()
-    reading: OmitArgPrefixes[Reading] = Reading()
+    body: OmitArgPrefixes[Body] = field(default_factory=Body)
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options, argv: Sequence[str]) -> int:

@@ -65,7 +65,10 @@ def notes(sentences: Sequence[str], limit: int = 12) -> None:
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> None:
     """A table whose first `left` columns are words and whose others are figures."""
-    grid = Table(title=Text(title) if title else None, title_justify="left", header_style="bold")
+    if title:
+        # As a line of its own, since rich would fold a title to the width of its table.
+        say(title, "bold")
+    grid = Table(header_style="bold", show_header=any(columns))
     for k, name in enumerate(columns):
         grid.add_column(Text(name), justify="left" if k < left else "right", overflow="fold")
     for row in rows:

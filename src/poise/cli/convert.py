@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +24,7 @@ class Options:
     """The motion file to write; its suffix names the format (.bvh)."""
     resample: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None
     """Frames per second of the result."""
-    reading: OmitArgPrefixes[Reading] = Reading()
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options, argv: Sequence[str]) -> int:

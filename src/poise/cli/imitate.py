@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -25,9 +25,9 @@ class Options:
     """The motion file."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
     """The folder of the results."""
-    training: OmitArgPrefixes[Training] = Training()
-    body: OmitArgPrefixes[Body] = Body()
-    reading: OmitArgPrefixes[Reading] = Reading()
+    training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    body: OmitArgPrefixes[Body] = field(default_factory=Body)
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options, argv: Sequence[str]) -> int:

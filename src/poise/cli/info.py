@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,11 +21,13 @@ KEYS = ("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "he
 class Options:
     """Say what motion files hold: joints, rate, length, unit, height, what was guessed."""
 
-    clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")] = ()
+    clips: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
+    ] = ()
     """Motion files: BVH, AMC with its ASF, DeepMimic."""
     json: bool = False
     """Print JSON alone: one object, or a list of them for several clips."""
-    reading: OmitArgPrefixes[Reading] = Reading()
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options, argv: Sequence[str]) -> int:
@@ -40,7 +42,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
         say_json(plain[0] if len(plain) == 1 else plain)
         return 0
     for path, fact in zip(options.clips, facts, strict=True):
-        table(str(path), ("", "value"), _rows(fact))
+        table(str(path), ("", ""), _rows(fact), left=2)
         if fact["warnings"]:
             say("Guessed or repaired:")
             notes(fact["warnings"], 40)

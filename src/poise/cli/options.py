@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -38,9 +38,7 @@ class Reading:
         """The clip in the file `path`."""
         from poise.motion.io import read_clip
 
-        return read_clip(
-            path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up
-        )
+        return read_clip(path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up)
 
 
 @dataclass(frozen=True)
@@ -114,12 +112,11 @@ class Training:
         """The recipe's settings."""
         from poise.recipes import ResidualForce
 
-        more = {} if self.envs is None else {"num_envs": self.envs}
-        return ResidualForce(
+        config = ResidualForce(
             method=self.method,
             help_limit=self.help_limit,
             reward=self.reward,
             seed=self.seed,
             body=body.config(),
-            **more,
         )
+        return config if self.envs is None else replace(config, num_envs=self.envs)

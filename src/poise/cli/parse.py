@@ -14,7 +14,6 @@ from poise.errors import PoiseError
 
 T = TypeVar("T")
 _CONFIG = (tyro.conf.FlagCreatePairsOff,)
-_FRAME = "│╭╮╰╯"
 
 
 def parse(options: type[T], argv: Sequence[str], prog: str) -> T:
@@ -31,25 +30,37 @@ def parse(options: type[T], argv: Sequence[str], prog: str) -> T:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        raise PoiseError(sentence(refused.getvalue(), prog), hint=f"See {prog} --help") from None
+        what, near = sentence(refused.getvalue(), prog)
+        hint = f"Did you mean {near}? " if near else ""
+        raise PoiseError(what, hint=f"{hint}See {prog} --help") from None
 
 
-def sentence(boxed: str, prog: str) -> str:
-    """What tyro's frame says, in one line: the message and, if there is one, the nearest option."""
+def sentence(boxed: str, prog: str) -> tuple[str, str]:
+    """What tyro's frame says, in one line, and the nearest option if it names one."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", boxed)
-    lines = [line.strip(_FRAME + " ") for line in plain.splitlines()]
-    # The first line of the frame holds its title, rules of dashes part its sections.
+    # The frame is drawn with lines, or in ASCII where the terminal's encoding is not UTF-8.
     sections: list[list[str]] = [[]]
-    for line in lines:
-        if line.startswith("─"):
+    for row in plain.splitlines():
+        line = row.strip().strip("│|").rstrip()
+        if line.startswith(("╭", "╰", "+")) or not line.strip("─- "):
             sections.append([])
-        elif line:
+        else:
             sections[-1].append(line)
     parts = [s for s in sections if s]
     if not parts:
-        return "the command line was not understood"
-    text = " ".join(parts[0]).rstrip(".")
-    text = text.replace(f"Missing from {prog}:", "required, but missing:").replace(" (required)", "")
-    near = next((s[1].split()[0] for s in parts[1:] if s[0].startswith("Perhaps") and len(s) > 1), None)
-    text = text[:1].lower() + text[1:]
-    return text if near is None else f"{text}. Did you mean {near.rstrip(',')}?"
+        return "the command line was not understood", ""
+    text = " ".join(line.strip() for line in parts[0]).rstrip(".")
+    if text.startswith("Missing from"):
+        # Names stand at one depth, their descriptions deeper.
+        depths = [len(line) - len(line.lstrip()) for line in parts[0][1:]]
+        named = [x.strip() for x, d in zip(parts[0][1:], depths, strict=True) if d == min(depths)]
+        text = f"{prog} needs {' and '.join(named)}"
+    text = re.sub(r"Expected one of \((.*)\)", _choices, text)
+    near = next((s[1].split()[0] for s in parts[1:] if "Perhaps" in s[0] and len(s) > 1), "")
+    return text[:1].lower() + text[1:], near.rstrip(",")
+
+
+def _choices(found: re.Match[str]) -> str:
+    """The choices in a fixed order, without the None that only Python knows."""
+    names = sorted({x.strip(" '") for x in found[1].split(",")} - {"None", ""})
+    return f"Known: {', '.join(names)}"

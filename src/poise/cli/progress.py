@@ -41,8 +41,10 @@ def figures(stats: IterationStats) -> str:
     """What one iteration says about the learning."""
     reward = stats.terms.get("imitation", stats.reward)
     # Nothing is known about episodes before the first one has ended.
-    ended = "" if math.isnan(stats.episode_length) else (
-        f"  episode {stats.episode_length:.0f} steps  failures {100 * stats.failure_rate:.0f} %"
+    ended = (
+        ""
+        if math.isnan(stats.episode_length)
+        else (f"  episode {stats.episode_length:.0f} steps  failures {100 * stats.failure_rate:.0f} %")
     )
     return f"{stats.samples_per_s:,.0f} samples/s  imitation {reward:.3f}{ended}"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -26,11 +26,13 @@ class Options:
     """residual-force."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
-    clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")] = ()
+    clips: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
+    ] = ()
     """Motion files."""
-    training: OmitArgPrefixes[Training] = Training()
-    body: OmitArgPrefixes[Body] = Body()
-    reading: OmitArgPrefixes[Reading] = Reading()
+    training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    body: OmitArgPrefixes[Body] = field(default_factory=Body)
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options, argv: Sequence[str]) -> int:

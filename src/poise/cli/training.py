@@ -68,12 +68,16 @@ class Job:
 
     def train(self, imitation: Imitation) -> RunResult:
         """Trains until the limit or Ctrl-C; either way everything is saved."""
-        from poise.learn import Until
+        from poise.learn import RunResult, Until
         from poise.recipes.session import train
 
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
-        with progress.training(until) as show:
-            return train(imitation, self.run, until, show, self.training.threads)
+        try:
+            with progress.training(until) as show:
+                return train(imitation, self.run, until, show, self.training.threads)
+        except KeyboardInterrupt:
+            # A second Ctrl-C ends the present iteration too; all before it are saved.
+            return RunResult(None, True, None)
 
     def stopped(self, what: str) -> int:
         """Says how to go on after Ctrl-C, and gives the exit code."""

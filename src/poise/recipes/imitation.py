@@ -10,7 +10,7 @@ from typing import Any
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.kin import FitReport
-from poise.learn import Trainer
+from poise.learn import PPOConfig, Trainer
 from poise.motion import ClipLibrary
 from poise.sim import CpuBackend, NanGuard
 
@@ -19,7 +19,7 @@ from poise.sim import CpuBackend, NanGuard
 class Imitation:
     """A library with a body, ready to be learned.
 
-    config: the recipe's settings; it must have `num_envs`, `seed`, `sim` and `ppo`.
+    config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
     """
 
     library: ClipLibrary
@@ -46,13 +46,21 @@ class Imitation:
         guard.where = env.where
         return env
 
+    def ppo(self) -> PPOConfig:
+        """The learner's settings, with one deviation of the action noise per action."""
+        ppo, extra = self.config.ppo, self.task.residual.dims if self.task.residual else 0
+        if not isinstance(ppo.std, float | int):
+            return ppo
+        joints = (float(ppo.std),) * len(self.humanoid.hinges)
+        return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
+
     def trainer(self, threads: int = 0, dumps: Path | None = None, **metadata: Any) -> Trainer:
         """A PPO trainer on a fresh environment."""
         env = self.env(threads=threads, dumps=dumps)
         cores = threads or len(os.sched_getaffinity(0))
         return Trainer(
             env,
-            self.config.ppo,
+            self.ppo(),
             self.config.seed,
             self.humanoid.identity,
             metadata=metadata,

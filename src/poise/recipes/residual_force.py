@@ -42,6 +42,8 @@ class ResidualForce:
     frame) or phase (the paper's). action: additive or absolute. faithful: where the paper and its
     authors' code disagree, whose value holds (rotation angle or half of it; reward weights).
     done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
+    residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
+    that of the joints. With the joints' small noise the policy would hardly try the help.
     """
 
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
@@ -51,6 +53,7 @@ class ResidualForce:
     action: Literal["additive", "absolute"] = "additive"
     faithful: Literal["paper", "code"] = "paper"
     done: Literal["bodies", "height"] = "bodies"
+    residual_std: float = 0.15
     num_envs: int = 512
     horizon: int = 300
     seed: int = 0

@@ -10,7 +10,16 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.io.text import CUT_OFF, MAX_JOINTS, at_line, decode, number, read_bytes, shown
+from poise.motion.io.text import (
+    CUT_OFF,
+    MAX_JOINTS,
+    MAX_SKELETON_BYTES,
+    at_line,
+    decode,
+    number,
+    read_bytes,
+    shown,
+)
 from poise.spatial import euler_to_quat
 
 ROTATIONS = ("rx", "ry", "rz")
@@ -61,7 +70,7 @@ _Line = tuple[int, list[str]]
 
 
 def _lines(path: Path) -> Iterator[_Line]:
-    for i, raw in enumerate(read_bytes(path).splitlines(), 1):
+    for i, raw in enumerate(read_bytes(path, MAX_SKELETON_BYTES).splitlines(), 1):
         words = decode(raw, path, i).split("#", 1)[0].split()
         if words:
             yield i, words

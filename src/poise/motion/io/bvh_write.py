@@ -59,13 +59,17 @@ def write_bvh(
     if axis not in ("Y", "Z"):
         raise PoiseError(f"the up axis must be Y or Z, got '{axis}'")
     rot = quats_from_z_up(clip.rot, axis)
-    channels = _channels(clip.skeleton, rot, own, order)
+    moving = bool(np.ptp(clip.root_pos, axis=0).max() > 0)
+    channels = _channels(clip.skeleton, rot, moving, own, order)
     offsets = vectors_from_z_up(clip.skeleton.offsets, axis) / unit
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
     kept = {k: np.array([float(x) for x in v.split()]) for k, v in source.extra} if own else {}
     if own and (unit != source.unit_m or axis != source.up_axis):
         # Remembered file values hold in the file's own unit and axes only.
         kept = {}
+    if not any(c in POSITIONS for c in channels[0]):
+        # Without position channels the root stands at its OFFSET.
+        kept["offset:0"] = root_pos[0]
     places = _places(clip.skeleton, offsets, root_pos, rot, kept)
     lines, written = _hierarchy(clip.skeleton, offsets, channels, kept, axis, unit, own)
     step = 1.0 / clip.fps
@@ -76,8 +80,11 @@ def write_bvh(
     write_whole(path, "\n".join(lines) + "\n")
 
 
-def _channels(skeleton: Skeleton, rot: np.ndarray, own: bool, order: str) -> list[tuple[str, ...]]:
-    """Channel names per joint; a joint that turns beyond its source's channels gets all three."""
+def _channels(
+    skeleton: Skeleton, rot: np.ndarray, moving: bool, own: bool, order: str
+) -> list[tuple[str, ...]]:
+    """Channel names per joint; a joint that turns beyond its source's channels gets all three,
+    and a root that moves gets position channels."""
     full = tuple(f"{c}rotation" for c in order)
     if not own:
         return [POSITIONS + full] + [full] * (len(skeleton) - 1)
@@ -90,7 +97,7 @@ def _channels(skeleton: Skeleton, rot: np.ndarray, own: bool, order: str) -> lis
             lost = quat_angle(quat_mul(quat_conj(made), torch.tensor(rot[:, j]))).max()
             if lost > _LOST_ANGLE:
                 names = tuple(c for c in names if c in POSITIONS) + full
-        if j == 0 and not any(c in POSITIONS for c in names):
+        if j == 0 and moving and not any(c in POSITIONS for c in names):
             names = POSITIONS + names
         out.append(names)
     return out

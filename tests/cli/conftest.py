@@ -1,0 +1,51 @@
+"""One tiny training that all tests of the command line share, and the check of a refusal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tiny_clips import deepmimic, put
+
+from poise.cli.main import main
+
+MINIATURE = ["--iterations", "2", "--envs", "16", "--threads", "1"]
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return put(tmp_path_factory.mktemp("clip"), "stand.txt", deepmimic())
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory, clip: Path) -> Path:
+    """The result folder of a miniature training; tests that change it take a copy."""
+    out = tmp_path_factory.mktemp("results") / "stand"
+    assert main(["imitate", str(clip), "-o", str(out), *MINIATURE]) == 0
+    return out
+
+
+def listing(folder: Path) -> list[str]:
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Runs a command line that must fail: exit code 2, one line, nothing written in `tmp_path`."""
+
+    def check(*argv: object, words: tuple[str, ...] = ()) -> str:
+        before = listing(tmp_path)
+        capsys.readouterr()
+        code = main([str(a) for a in argv])
+        said, complained = capsys.readouterr()
+        assert code == 2, complained
+        lines = complained.splitlines()
+        assert len(lines) == 1 and lines[0].startswith("error: "), complained
+        assert "Traceback" not in complained + said
+        for word in words:
+            assert word in complained
+        assert listing(tmp_path) == before
+        return complained
+
+    return check

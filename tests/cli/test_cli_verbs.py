@@ -1,0 +1,246 @@
+"""info, convert, body, eval, play, doctor and the frame around them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from tiny_clips import ASF, amc, bvh, put
+
+import poise
+from poise.cli import options
+from poise.cli.info import KEYS
+from poise.cli.main import VERBS, main
+from poise.cli.options import override
+from poise.errors import PoiseError
+
+SNAPSHOTS = Path(__file__).parent / "snapshots"
+#: Set to write the help texts anew.
+UPDATE = "POISE_UPDATE_SNAPSHOTS"
+
+
+def call(*argv: object, **env: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "poise", *map(str, argv)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **env},
+        check=False,
+        timeout=120,
+    )
+
+
+@pytest.mark.parametrize("verb", ["", *VERBS])
+def test_help_texts_are_as_they_were(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("NO_COLOR", "1")
+    # The frames are drawn with lines only where stdout says that it takes UTF-8.
+    page = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    monkeypatch.setattr("sys.stdout", page)
+    assert main([verb, "--help"] if verb else []) == 0
+    page.flush()
+    shown = page.buffer.getvalue().decode("utf-8")  # type: ignore[attr-defined]
+    text = "\n".join(x.rstrip() for x in shown.splitlines()) + "\n"
+    path = SNAPSHOTS / f"{verb or 'poise'}.txt"
+    if os.environ.get(UPDATE):
+        path.write_text(text, encoding="utf-8")
+    assert text == path.read_text(encoding="utf-8"), f"set {UPDATE}=1 to accept the new text"
+
+
+def test_version_and_help_come_quickly_and_without_torch() -> None:
+    start = time.perf_counter()
+    done = call("--version")
+    assert done.stdout == f"poise {poise.__version__}\n" and done.returncode == 0
+    # A loaded machine gets some slack; the command itself takes 0.1 s.
+    assert time.perf_counter() - start < 2.0
+    code = (
+        "import sys, poise.cli.main as m; code = m.main(['imitate', '--help']); "
+        "sys.exit(code or 3 * any(x in sys.modules for x in ('torch', 'mujoco', 'numpy')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_an_unknown_verb_is_answered_with_the_nearest(refused) -> None:
+    refused("imitat", words=("'imitat'", "Did you mean 'imitate'?"))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_tyros_frames_become_one_sentence(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    from poise.cli.imitate import Options
+    from poise.cli.parse import parse
+
+    def said(*argv: str) -> str:
+        with pytest.raises(PoiseError) as problem:
+            parse(Options, argv, "poise imitate")
+        return str(problem.value)
+
+    see = ". See poise imitate --help"
+    assert said("a.bvh") == "poise imitate needs -o DIR, --out DIR" + see
+    assert said() == "poise imitate needs CLIP and -o DIR, --out DIR" + see
+    near = "unrecognized options: --minuts, 3. Did you mean --minutes? See poise imitate --help"
+    assert said("a.bvh", "-o", "out", "--minuts", "3") == near
+    known = "invalid choice 'Q' for argument '--up'. Known: Y, Z"
+    assert said("a.bvh", "-o", "out", "--up", "Q") == known + see
+
+
+def test_choices_are_those_of_the_parts_behind_them() -> None:
+    from typing import get_type_hints
+
+    from poise.cli.train import RECIPES
+    from poise.metrics.tracking import RULES
+    from poise.recipes import RECIPE, ResidualForce
+
+    hints = get_type_hints(ResidualForce)
+    assert hints["method"] == options.Method and hints["reward"] == options.Reward
+    assert get_args(options.Rule) == tuple(RULES)
+    assert RECIPES == (RECIPE["name"],)
+    plain = ResidualForce()
+    mine = options.Training()
+    assert (plain.method, plain.help_limit, plain.reward, plain.seed, plain.num_envs) == (
+        mine.method,
+        mine.help_limit,
+        mine.reward,
+        mine.seed,
+        512,
+    )
+
+
+def test_info_json_holds_exactly_the_keys(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(clip), "--json"]) == 0
+    said, complained = capsys.readouterr()
+    facts = json.loads(said)
+    assert tuple(facts) == KEYS and complained == ""
+    assert facts["frames"] == 16 and facts["format"] == "deepmimic" and facts["unit_m"] == 1.0
+
+
+def test_info_of_several_clips(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    walk = put(tmp_path, "walk [bold].bvh", bvh())
+    assert main(["info", str(clip), str(walk)]) == 0
+    said = capsys.readouterr().out
+    assert "walk [bold].bvh" in said and "The file states no unit" in said and "15" in said
+    assert main(["info", "--json", str(clip), str(walk)]) == 0
+    assert [f["format"] for f in json.loads(capsys.readouterr().out)] == ["deepmimic", "bvh"]
+
+
+def test_info_takes_the_reading_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    walk = put(tmp_path, "walk.bvh", bvh())
+    assert main(["info", "--json", str(walk), "--fps", "25", "--unit", "0.012", "--up", "Z"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["fps"], facts["unit_m"], facts["up_axis"]) == (25.0, 0.012, "Z")
+    motion = put(tmp_path, "02_01.amc", amc())
+    skeleton = put(tmp_path, "other.asf", ASF)
+    assert main(["info", "--json", str(motion), "--skeleton", str(skeleton)]) == 0
+    assert json.loads(capsys.readouterr().out)["joints"] == 5
+
+
+def test_convert_and_resample(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "half.bvh"
+    assert main(["convert", str(clip), str(target), "--resample", "15"]) == 0
+    assert str(target) in capsys.readouterr().out
+    assert main(["info", "--json", str(target)]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["frames"] == 8 and facts["fps"] == pytest.approx(15.0)
+
+
+def test_convert_refuses_unknown_suffixes_and_itself(clip: Path, tmp_path: Path, refused) -> None:
+    refused("convert", clip, tmp_path / "x.fbx", words=("fbx", ".bvh"))
+    refused("convert", clip, clip, words=("over itself",))
+    refused("convert", clip, tmp_path / "x.bvh", "--resample", "0", words=("frame rate",))
+
+
+def test_body_lists_what_is_trained(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["body", str(clip), "--mass", "50", "--set", "right_ankle.kp=123"]
+    assert main([*command, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    rows = {row["body"]: row for row in facts["bodies"]}
+    assert facts["mass_kg"] == pytest.approx(50.0) and rows["right_ankle"]["kp"] == 123.0
+    assert main(command) == 0
+    assert "right_ankle" in capsys.readouterr().out
+
+
+def test_overrides_are_name_and_number() -> None:
+    assert override("lfoot.kp=4e2") == ("lfoot.kp", 400.0)
+    for text in ("lfoot.kp", "=3", "lfoot.kp=much"):
+        with pytest.raises(PoiseError, match="--set"):
+            override(text)
+
+
+def test_doctor(capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["doctor", "--json"])
+    facts = json.loads(capsys.readouterr().out)
+    states = {c["name"]: c["state"] for c in facts["checks"]}
+    assert code == 0 and facts["ready"]
+    assert {states[n] for n in ("python", "torch", "mujoco", "mujoco.batch", "physics")} == {"ok"}
+    assert all(c["todo"] for c in facts["checks"] if c["state"] != "ok")
+
+
+def test_doctor_says_what_is_missing(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from poise.cli import doctor
+
+    absent = doctor.package("no_such_package_at_all", "none", "pip install it")
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.python, absent))
+    assert main(["doctor"]) == 1
+    said = capsys.readouterr().out
+    assert "missing" in said and "pip install it" in said
+
+
+def test_an_unexpected_fault_is_one_sentence(
+    clip: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("[red]half\nway[/red]")
+
+    monkeypatch.setattr("poise.motion.io.read_clip", broken)
+    assert main(["info", str(clip)]) == 1
+    complained = capsys.readouterr().err
+    assert complained.count("\n") == 1 and "[red]half way[/red]" in complained
+    assert "ZeroDivisionError" in complained and "POISE_DEBUG=1" in complained
+    monkeypatch.setenv("POISE_DEBUG", "1")
+    assert main(["info", str(clip)]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_full_disk_and_a_lack_of_memory(
+    clip: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for problem, code in ((OSError(28, "No space left on device"), 2), (MemoryError(), 1)):
+
+        def broken(*_: object, problem: BaseException = problem, **__: object) -> None:
+            raise problem
+
+        monkeypatch.setattr("poise.motion.io.read_clip", broken)
+        assert main(["info", str(clip)]) == code
+        complained = capsys.readouterr().err
+        assert complained.startswith("error: ") and complained.count("\n") == 1
+
+
+def test_ctrl_c_anywhere(
+    clip: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("poise.motion.io.read_clip", stopped)
+    assert main(["info", str(clip)]) == 130
+    assert capsys.readouterr().err == "error: interrupted\n"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes of a shell")
+def test_a_closed_pipe_is_quiet() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-m", "poise", "imitate", "--help"], stdout=write, stderr=subprocess.PIPE
+    )
+    os.close(write)
+    assert done.stderr == b"" and done.returncode in (0, 141)

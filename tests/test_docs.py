@@ -1,0 +1,119 @@
+"""The documents: snippets run, commands exist, links lead somewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import re
+import shlex
+import shutil
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from poise.errors import PoiseError
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+WALK = ROOT / "src" / "poise" / "data" / "walk.bvh"
+
+# Shortens what a snippet does without changing which functions it calls.
+_SHORTER = (("minutes=3", "iterations=1"), ("help_limit=50.0", "help_limit=50.0, num_envs=16"))
+
+
+def _blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def _commands() -> list[tuple[str, str]]:
+    """(page, command line) of every `poise ...` line in a shell block or on a line of its own."""
+    found = []
+    for page in PAGES:
+        shell = "\n".join(_blocks(page, "sh")).splitlines()
+        shell += re.findall(r"^    (poise .*)$", page.read_text("utf-8"), re.MULTILINE)
+        found += [(page.name, line) for line in shell if line.startswith("poise ")]
+    return found
+
+
+SNIPPETS = [(page, i) for page in PAGES for i in range(len(_blocks(page, "python")))]
+
+
+def _example_clip(request: pytest.FixtureRequest) -> Path:
+    """The embedded walk, else a clip that lies beside the checkout."""
+    if WALK.exists():
+        return WALK
+    return request.getfixturevalue("data_dir") / "cmu_bvh" / "fairmotion" / "01_01.bvh"
+
+
+@pytest.mark.parametrize(("page", "index"), SNIPPETS, ids=lambda x: getattr(x, "name", str(x)))
+def test_python_snippets_run(
+    page: Path,
+    index: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+) -> None:
+    code = _blocks(page, "python")[index]
+    for long, short in _SHORTER:
+        code = code.replace(long, short)
+    for name in re.findall(r"read_clip\(\"([\w.]+)\"\)", code):
+        shutil.copy(_example_clip(request), tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
+    if "deliver(" in code:
+        assert {"simulated.bvh", "score.json", "report.html", "run"} <= {
+            p.name for p in (tmp_path / "out").iterdir()
+        }
+
+
+def test_commands_are_shown() -> None:
+    verbs = {line.split()[1] for page, line in _commands() if page == "README.md"}
+    assert {"info", "imitate", "play"} <= verbs
+
+
+@pytest.mark.parametrize(("page", "line"), _commands())
+def test_commands_parse(page: str, line: str) -> None:
+    from poise.cli.main import VERBS
+    from poise.cli.parse import parse
+
+    verb, *rest = shlex.split(line, comments=True)[1:]
+    assert verb in VERBS
+    try:
+        parse(import_module(f"poise.cli.{verb}").Options, rest, f"poise {verb}")
+    except PoiseError as problem:
+        pytest.fail(f"{page}: {line}: {problem}")
+
+
+def test_named_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    """Options in running text belong to some verb."""
+    from poise.cli.main import VERBS
+    from poise.cli.parse import parse
+
+    known = {"--help", "--version"}
+    for verb in VERBS:
+        with contextlib.suppress(SystemExit):
+            parse(import_module(f"poise.cli.{verb}").Options, ["--help"], f"poise {verb}")
+        known |= set(re.findall(r"--[a-z][\w-]*", capsys.readouterr().out))
+    for page in PAGES:
+        named = set(re.findall(r"`[^`\n]*?(--[a-z][\w-]*)", page.read_text("utf-8")))
+        assert named <= known, page.name
+
+
+def test_named_files_and_keys_exist() -> None:
+    readme = (ROOT / "README.md").read_text("utf-8")
+    metrics = (ROOT / "docs" / "metrics.md").read_text("utf-8")
+    for key in re.findall(r"^\| `([a-z_.0-9`, ]+)` \| [^|]*(?:mm|share|0 to 1)", readme, re.MULTILINE):
+        for name in key.replace("`", "").split(", "):
+            assert name in metrics, name
+    targets = set(re.findall(r"`make (\w+)`", readme + (ROOT / "CONTRIBUTING.md").read_text("utf-8")))
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    assert targets and all(re.search(rf"^{t}:", makefile, re.MULTILINE) for t in targets)
+
+
+def test_links_lead_somewhere() -> None:
+    spec = importlib.util.spec_from_file_location("check_links", ROOT / "docs" / "check_links.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert [sentence for page in module.pages() for sentence in module.broken(page)] == []
