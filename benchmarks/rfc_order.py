@@ -31,9 +31,10 @@ SEEDS = (0, 1)
 
 def settings(name: str, method: str, seed: int) -> ResidualForce:
     """The compared setting: "poise" is the default recipe, "paper" its observation and action."""
-    ppo = PPOConfig(std=0.055) if name == "poise" else PPOConfig(std=0.1)
-    more = {} if name == "poise" else {"observation": "phase", "action": "absolute", "done": "height"}
-    return ResidualForce(method=method, seed=seed, ppo=ppo, **more)
+    if name == "poise":
+        return ResidualForce(method=method, seed=seed)
+    more = {"observation": "phase", "action": "absolute", "done": "height"}
+    return ResidualForce(method=method, seed=seed, ppo=PPOConfig(std=0.1, policy_lr=3e-4), **more)
 
 
 def one(data: Path, name: str, clip_name: str, method: str, seed: int, samples: int) -> dict:

@@ -6,12 +6,12 @@ import re
 
 import numpy as np
 import pytest
-from toy_human import human
 
 from poise.body import find_anatomy, generate_table, make_humanoid
 from poise.body.parts import plain_name
 from poise.errors import PoiseError
 from poise.motion import Skeleton
+from toy_human import human
 
 #: Hierarchies as their files have them, and how many spine, neck, head and clavicle parts they hold.
 DIALECTS = {
@@ -24,8 +24,8 @@ DIALECTS = {
     ),
     "cmu bvh": (
         "Hips(LHipJoint(LeftUpLeg(LeftLeg(LeftFoot(LeftToeBase))))"
-        " RHipJoint(RightUpLeg(RightLeg(RightFoot(RightToeBase)))) LowerBack(Spine(Spine1(Neck(Neck1(Head))"
-        " LeftShoulder(LeftArm(LeftForeArm(LeftHand(LeftFingerBase(LFingers) LThumb))))"
+        " RHipJoint(RightUpLeg(RightLeg(RightFoot(RightToeBase)))) LowerBack(Spine(Spine1(Neck("
+        "Neck1(Head)) LeftShoulder(LeftArm(LeftForeArm(LeftHand(LeftFingerBase(LFingers) LThumb))))"
         " RightShoulder(RightArm(RightForeArm(RightHand(RightFingerBase(RFingers) RThumb))))))))",
         (3, 2, 1, 2),
     ),
@@ -43,8 +43,8 @@ DIALECTS = {
         (2, 1, 1, 2),
     ),
     "karate": (
-        "pelvis(lfemur(ltibia(lfoot(ltoes))) rfemur(rtibia(rfoot(rtoes))) thorax(head lclavicle(lhumerus("
-        "lradius(lhand))) rclavicle(rhumerus(rradius(rhand)))))",
+        "pelvis(lfemur(ltibia(lfoot(ltoes))) rfemur(rtibia(rfoot(rtoes))) thorax(head lclavicle("
+        "lhumerus(lradius(lhand))) rclavicle(rhumerus(rradius(rhand)))))",
         (1, 0, 1, 2),
     ),
     "handspring": (
@@ -53,8 +53,8 @@ DIALECTS = {
         (2, 2, 0, 2),
     ),
     "lafan": (
-        "Hips(LeftUpLeg(LeftLeg(LeftFoot(LeftToe))) RightUpLeg(RightLeg(RightFoot(RightToe))) Spine(Spine1("
-        "Spine2(Neck(Head) LeftShoulder(LeftArm(LeftForeArm(LeftHand))) RightShoulder(RightArm("
+        "Hips(LeftUpLeg(LeftLeg(LeftFoot(LeftToe))) RightUpLeg(RightLeg(RightFoot(RightToe))) Spine("
+        "Spine1(Spine2(Neck(Head) LeftShoulder(LeftArm(LeftForeArm(LeftHand))) RightShoulder(RightArm("
         "RightForeArm(RightHand)))))))",
         (3, 1, 1, 2),
     ),
@@ -85,8 +85,8 @@ DIALECTS = {
         "Hips(Spine(Spine1(Spine2(LeftShoulder(LeftArm(LeftForeArm(LeftHand(LeftInHandIndex(LeftHandIndex1("
         "LeftHandIndex2)) LeftHandThumb1(LeftHandThumb2))))) Neck(Head) RightShoulder(RightArm("
         "RightForeArm(RightHand(RightInHandIndex(RightHandIndex1(RightHandIndex2)) RightHandThumb1("
-        "RightHandThumb2)))))))) LeftUpLeg(LeftLeg(LeftFoot(LeftToeBase))) RightUpLeg(RightLeg(RightFoot("
-        "RightToeBase))))",
+        "RightHandThumb2)))))))) LeftUpLeg(LeftLeg(LeftFoot(LeftToeBase))) RightUpLeg(RightLeg("
+        "RightFoot(RightToeBase))))",
         (3, 1, 1, 2),
     ),
     "deepmimic": (

@@ -116,7 +116,7 @@ OPTIONS = (
 )
 
 
-@pytest.mark.parametrize(("argv", "word"), OPTIONS, ids=lambda x: "=".join(x) if x[0][0] == "-" else "")
+@pytest.mark.parametrize(("argv", "word"), OPTIONS, ids=["=".join(argv) for argv, _ in OPTIONS])
 def test_bad_options(argv: tuple[str, ...], word: str, clip: Path, tmp_path: Path, refused) -> None:
     refused("imitate", clip, "-o", tmp_path / "a" / "out", *argv, words=(word,))
 

@@ -101,7 +101,7 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     hints = get_type_hints(ResidualForce)
     assert hints["method"] == options.Method and hints["reward"] == options.Reward
     assert get_args(options.Rule) == tuple(RULES)
-    assert RECIPES == (RECIPE["name"],)
+    assert (RECIPE["name"],) == RECIPES
     plain = ResidualForce()
     mine = options.Training()
     assert (plain.method, plain.help_limit, plain.reward, plain.seed, plain.num_envs) == (

@@ -81,7 +81,9 @@ def test_stable_pd_clips_at_the_limit():
     torch.testing.assert_close(clipped, torch.maximum(torch.minimum(free, p["limit"]), -p["limit"]))
 
 
-def servo(model: mujoco.MjModel, start: np.ndarray, targets: np.ndarray, config: SimConfig) -> np.ndarray:
+def servo(
+    model: mujoco.MjModel, start: np.ndarray, targets: np.ndarray, config: SimConfig
+) -> np.ndarray:
     """Hinge angles `(T, n)` after each control step of MuJoCo's position servos."""
     config.apply(model)
     data = mujoco.MjData(model)

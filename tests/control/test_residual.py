@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from toy_human import human
 
 from poise.body import generate_table, make_humanoid
 from poise.control import Drive, ExplicitResidual, ImplicitResidual
 from poise.errors import PoiseError
 from poise.sim import CpuBackend
 from poise.spatial import heading_quat, quat_rotate
+from toy_human import human
 
 N = 3
 

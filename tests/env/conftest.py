@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from toy_human import swing
 
 from poise.env import ImitationEnv
 from poise.motion import Clip
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
+from toy_human import swing
 
 
 @pytest.fixture(scope="session")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from toy_human import swing
 
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
 from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
+from toy_human import swing
 
 
 def actions(env: ImitationEnv, size: float = 0.1, seed: int = 0) -> torch.Tensor:

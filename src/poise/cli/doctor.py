@@ -12,12 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module, metadata
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.text import Text
 
 from poise import __version__
 from poise.cli.console import out, say, say_json
+
+if TYPE_CHECKING:
+    from poise.motion import Skeleton
 
 State = Literal["ok", "missing", "optional"]
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "firefox")
@@ -159,7 +162,7 @@ def speed() -> Check:
     return Check("physics", "missing", "the simulation diverged", "install mujoco again")
 
 
-def _skeleton():  # type: ignore[no-untyped-def]
+def _skeleton() -> Skeleton:
     """A person in metres, Z up, for the speed check."""
     import numpy as np
 

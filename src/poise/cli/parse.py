@@ -38,15 +38,18 @@ def parse(options: type[T], argv: Sequence[str], prog: str) -> T:
 def sentence(boxed: str, prog: str) -> tuple[str, str]:
     """What tyro's frame says, in one line, and the nearest option if it names one."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", boxed)
-    # The frame is drawn with lines, or in ASCII where the terminal's encoding is not UTF-8.
+    # The frame is drawn with lines, and its title stands in them; where the terminal's encoding is
+    # not UTF-8 there are only rules, and the title is a section of its own.
     sections: list[list[str]] = [[]]
     for row in plain.splitlines():
-        line = row.strip().strip("│|").rstrip()
-        if line.startswith(("╭", "╰", "+")) or not line.strip("─- "):
+        line = row.rstrip().strip("│").rstrip()
+        if line.startswith(("╭", "╰")) or not line.strip("─- "):
             sections.append([])
         else:
             sections[-1].append(line)
     parts = [s for s in sections if s]
+    if "╭" not in plain:
+        parts = parts[1:]
     if not parts:
         return "the command line was not understood", ""
     text = " ".join(line.strip() for line in parts[0]).rstrip(".")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -16,7 +16,9 @@ from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
 
 if TYPE_CHECKING:
+    from poise.learn import Policy
     from poise.recipes.imitation import Imitation
+    from poise.recipes.session import Evaluation
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,9 @@ def _place(imitation: Imitation, name: str | None, start: int) -> tuple[int, int
     return index, min(frame, int(imitation.reference.length[index]) - 2)
 
 
-def _episode(imitation: Imitation, policy, meta, clip: int, frame: int):  # type: ignore[no-untyped-def]
+def _episode(
+    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], clip: int, frame: int
+) -> Evaluation:
     """One episode as an evaluation of its own."""
     import torch
 

@@ -46,17 +46,13 @@ class GymVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-    def reset(
-        self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[np.ndarray, Info]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """New episodes everywhere; `seed` makes all that follows repeatable."""
         super().reset(seed=seed)
         _reseed(self.env, seed)
         return _array(self.env.reset()), {}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One control step of all worlds: observations, rewards, terminations, truncations, infos."""
         out = self.env.step(_actions(actions))
         terminated, truncated = _ended(out)
@@ -96,9 +92,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.env = env
         self.observation_space, self.action_space = _spaces(env, limit)
 
-    def reset(
-        self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[np.ndarray, Info]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """A new episode at a random frame; `seed` makes all that follows repeatable."""
         super().reset(seed=seed)
         _reseed(self.env, seed)
@@ -122,7 +116,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def _spaces(env: ImitationEnv, limit: float) -> tuple[Box, Box]:
-    if not 0 < limit:
+    if not limit > 0:
         raise PoiseError(f"the action limit must be above 0, got {limit}")
     obs = Box(-np.inf, np.inf, (env.num_obs,), np.float32)
     return obs, Box(-limit, limit, (env.num_actions,), np.float32)

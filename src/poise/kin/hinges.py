@@ -39,11 +39,32 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
         missing = next(c for c in "XYZ" if c not in order)
         path = quat_to_euler(local, order[0] + missing + order[1])[:, [0, 2]]
     else:
-        path = _best_branch(quat_to_euler(local, order), prefer)
+        path = _best_branch(_through_lock(quat_to_euler(local, order), order), prefer)
     path = torch.tensor(np.unwrap(path.numpy(), axis=0))
     centre = torch.zeros(len(order), dtype=path.dtype) if prefer is None else prefer
     turns = torch.round((path.median(0).values - centre) / (2 * math.pi))
     return path - turns * 2 * math.pi
+
+
+def _through_lock(angles: Tensor, order: str) -> Tensor:
+    """Euler angles `(T, 3)` whose third angle is held through frames exactly at gimbal lock.
+
+    There only the sum a +- c is known and `quat_to_euler` sets c to zero, which would be a jump.
+    """
+    # At b = +-90 degrees R_i(a) R_j(b) R_k(c) = R_i(a +- s c) R_j(b), s the parity of the order.
+    locked = (angles[:, 2] == 0.0) & (angles[:, 1].abs() > math.pi / 2 - 1e-6)
+    if not bool(locked.any()) or bool(locked.all()):
+        return angles
+    free = (~locked).nonzero().squeeze(-1)
+    at = torch.arange(len(angles))
+    # The nearest free frame before, or the first one.
+    held = angles[free[(torch.searchsorted(free, at, right=True) - 1).clamp_min(0)], 2]
+    parity = 1.0 if order in ("XYZ", "YZX", "ZXY") else -1.0
+    first = angles[:, 0] - parity * angles[:, 1].sign() * held
+    out = angles.clone()
+    out[:, 0] = torch.where(locked, first, angles[:, 0])
+    out[:, 2] = torch.where(locked, held, angles[:, 2])
+    return out
 
 
 def _best_branch(first: Tensor, prefer: Tensor | None) -> Tensor:
