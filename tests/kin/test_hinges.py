@@ -52,13 +52,11 @@ def test_smooth_angles_come_back(order):
     torch.testing.assert_close(back, angles, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("order", ["Y", "ZY", "YZ", "ZYX", "YXZ"])
+@pytest.mark.parametrize("order", ["Y", "ZY", "YZ", "YXZ", "ZXY"])
 def test_a_pirouette_of_five_turns_counts_up(order):
     count = 5 * 2 * math.pi
     angles = smooth(300, len(order), 5, 0.3)
     angles[:, order.index("Y")] = torch.linspace(0, count, 300, dtype=torch.float64)
-    if len(order) == 3 and order[1] == "Y":
-        pytest.skip("a middle hinge cannot turn round without a branch flip of the others")
     rot = chain_quat(angles, order, ONE.expand(300, 4))
     back = chain_angles(rot, order, ONE)
     # Only the start may differ by whole turns: the middle of the spin lies nearest zero.

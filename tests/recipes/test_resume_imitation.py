@@ -25,7 +25,8 @@ from poise.motion import ClipLibrary
 from poise.recipes.residual_force import ResidualForce
 from poise.recipes.session import begin, train
 folder = Path(sys.argv[1])
-ppo = PPOConfig(horizon=4, minibatch=32, epochs=2, norm_warmup=2, policy_hidden=(16,), value_hidden=(16,))
+small = {{"policy_hidden": (16,), "value_hidden": (16,)}}
+ppo = PPOConfig(horizon=4, minibatch=32, epochs=2, norm_warmup=2, **small)
 imitation = begin(folder, ClipLibrary.of(swing(2.0)), ResidualForce(num_envs=16, ppo=ppo, seed=3))
 train(imitation, folder, Until(iterations={iterations}), threads=1, tensorboard=False)
 print("finished", flush=True)

@@ -32,7 +32,7 @@ def make_spec() -> Callable[..., mujoco.MjSpec]:
         gravity: bool = True,
         floor: bool = True,
         sensors: bool = False,
-        config: SimConfig = SimConfig(),  # noqa: B008 - frozen
+        config: SimConfig = SimConfig(),
     ) -> mujoco.MjSpec:
         spec = mujoco.MjSpec()
         if floor:

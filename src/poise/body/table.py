@@ -83,7 +83,7 @@ class BodyTable:
         return names.index(name)
 
     def overridden(self, changes: Mapping[str, float]) -> BodyTable:
-        """The table with values replaced by name: `{"lfoot.kp": 400, "mass": 70}`.
+        """The table with values replaced by name: `{"lfoot.kp": 400, "thigh.torque": 250}`.
 
         Keys are `<body>.<field>` with field one of mass, kp, kd, torque, armature, or `<part>.<field>`
         for all bodies of a part ("thigh.torque"), or "friction".

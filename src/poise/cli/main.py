@@ -99,11 +99,14 @@ def _share_cores() -> None:
     if "OMP_NUM_THREADS" in os.environ:
         return
     try:
+        import mujoco
         import torch
     except ImportError:
-        # Only `doctor` runs without torch, and it says what to do.
+        # Only `doctor` runs without them, and it says what to do.
         return
     torch.set_num_threads(1)
+    # The guard reports instabilities; MuJoCo's own log would litter the user's folder.
+    mujoco.set_mju_user_warning(lambda _: None)
 
 
 def welcome() -> None:

@@ -34,8 +34,15 @@ class Wrench(NamedTuple):
 class Residual(Protocol):
     """A kind of residual force."""
 
-    limit_n: float
-    limit_nm: float
+    @property
+    def limit_n(self) -> float:
+        """The most force in N, summed over bodies."""
+        ...
+
+    @property
+    def limit_nm(self) -> float:
+        """The most torque in N m, summed over bodies."""
+        ...
 
     @property
     def dims(self) -> int:

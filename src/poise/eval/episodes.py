@@ -99,7 +99,14 @@ def run_episodes(
     alive = torch.arange(total) < lengths[:, None]
     humanoid = ref.humanoid
     rollouts = RolloutSet(
-        **store.tensors,
+        pos=store.tensors["pos"],
+        quat=store.tensors["quat"],
+        ref_pos=store.tensors["ref_pos"],
+        ref_quat=store.tensors["ref_quat"],
+        force=store.tensors["force"],
+        torque=store.tensors["torque"],
+        point_vel=store.tensors["point_vel"],
+        ang_vel=store.tensors["ang_vel"],
         alive=alive,
         lengths=lengths,
         reached_end=torch.ones(len(clip), dtype=torch.bool),

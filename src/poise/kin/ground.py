@@ -32,7 +32,7 @@ class GroundFit:
         return (
             f"Lifted by {self.lift_m * 1000:+.0f} mm to stand on the floor, and by up to "
             f"{self.clear_m.max() * 1000:.0f} mm more where a part sank in "
-            f"(deepest point {-self.before_m * 1000:.0f} mm, now {-self.after_m * 1000:.1f} mm)."
+            f"(deepest point {-self.before_m * 1000:.0f} mm, now {abs(self.after_m) * 1000:.1f} mm)."
         )
 
 

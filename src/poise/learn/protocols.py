@@ -68,10 +68,15 @@ class VecEnv(Protocol):
 class Policy(Protocol):
     """What acts: evaluation, viewers and live loops ask for no more than this."""
 
-    num_obs: int
-    """O, the width of an observation."""
-    num_actions: int
-    """A, the width of an action."""
+    @property
+    def num_obs(self) -> int:
+        """O, the width of an observation."""
+        ...
+
+    @property
+    def num_actions(self) -> int:
+        """A, the width of an action."""
+        ...
 
     def act(self, obs: Tensor) -> Tensor:
         """The deterministic action `(N, A)` for raw, not normalised, observations `(N, O)`."""

@@ -43,14 +43,13 @@ def deliver(
 ) -> dict[str, Path]:
     """Writes `simulated.bvh`, `score.json` and `report.html` into `out`; returns their paths.
 
-    A library gets one BVH per clip, named after it; the report shows the first clip.
+    A library gets one `simulated_<clip>.bvh` per clip; the report shows the first clip.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
     for k, recording in enumerate(evaluation.recordings):
-        name = (
-            "simulated" if len(evaluation.recordings) == 1 else imitation.library.names[recording.clip]
-        )
+        single = len(evaluation.recordings) == 1
+        name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
         paths[name] = out / f"{name}.bvh"
         write_clip(simulated_clip(imitation, evaluation, k), paths[name])
     paths["score"] = write_score(evaluation.card, out / "score.json")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.kin import FitReport
-from poise.learn import PPOConfig, Trainer
+from poise.learn import PPOConfig, Trainer, VecEnv
 from poise.motion import ClipLibrary
 from poise.sim import CpuBackend, NanGuard
 
@@ -39,7 +39,7 @@ class Imitation:
     ) -> ImitationEnv:
         """An environment of this task; without `auto_reset` for evaluation from given frames."""
         backend = CpuBackend(self.humanoid.model, num_envs or self.config.num_envs, threads)
-        seed = self.config.seed if seed is None else seed
+        seed = int(self.config.seed if seed is None else seed)
         guard = NanGuard(backend, dumps, seed=seed)
         task = replace(self.task, auto_reset=auto_reset)
         env = ImitationEnv(self.reference, backend, task, self.config.sim.substeps, seed, guard=guard)
@@ -59,7 +59,8 @@ class Imitation:
         env = self.env(threads=threads, dumps=dumps)
         cores = threads or len(os.sched_getaffinity(0))
         return Trainer(
-            env,
+            # An EnvStep has the fields of the learner's Step; neither room knows the other.
+            cast(VecEnv, env),
             self.ppo(),
             self.config.seed,
             self.humanoid.identity,

@@ -25,6 +25,7 @@ from poise.learn import (
     LATEST,
     IterationStats,
     Policy,
+    PolicyBundle,
     PPOConfig,
     RunResult,
     Until,
@@ -112,7 +113,7 @@ def train(
         trainer.env.close()
 
 
-def trained_policy(folder: Path, imitation: Imitation) -> tuple[Policy, dict[str, Any]]:
+def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, dict[str, Any]]:
     """The run's latest policy and its checkpoint's metadata."""
     path = folder / LATEST
     if not path.exists():
@@ -163,7 +164,8 @@ def _from_json(data: Mapping[str, Any]) -> ResidualForce:
         values = dict(data)
         body = dict(values.pop("body"))
         body["overrides"] = tuple((str(k), float(v)) for k, v in body["overrides"])
-        ppo = {k: tuple(v) if isinstance(v, list) else v for k, v in values.pop("ppo").items()}
+        learner: dict[str, Any] = values.pop("ppo")
+        ppo: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in learner.items()}
         sim = SimConfig(**values.pop("sim"))
         return ResidualForce(**values, body=BodyConfig(**body), sim=sim, ppo=PPOConfig(**ppo))
     except (TypeError, KeyError) as problem:

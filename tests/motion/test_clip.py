@@ -1,0 +1,118 @@
+"""Clips and skeletons: frozen, checked when made, and their world positions by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+import torch
+
+from poise.errors import PoiseError
+from poise.motion import Clip, Skeleton
+from poise.spatial import euler_to_quat
+
+
+def arm() -> Skeleton:
+    return Skeleton(("root", "upper", "lower"), (-1, 0, 1), np.array([[0, 0, 0], [0, 0, 1], [2, 0, 0]]))
+
+
+def still(frames: int = 3) -> Clip:
+    rot = np.zeros((frames, 3, 4))
+    rot[..., 0] = 1.0
+    return Clip(arm(), np.zeros((frames, 3)), rot, 30.0, "still")
+
+
+def test_world_positions_by_hand():
+    clip = still()
+    rot = clip.rot.copy()
+    rot[1, 1] = euler_to_quat(torch.tensor([math.pi / 2], dtype=torch.float64), "Z").numpy()
+    moved = clip.replaced(rot=rot, root_pos=clip.root_pos + np.array([0, 0, 0.5]))
+    pos, quat = moved.world()
+    np.testing.assert_allclose(pos[0], [[0, 0, 0.5], [0, 0, 1.5], [2, 0, 1.5]], atol=1e-12)
+    np.testing.assert_allclose(pos[1], [[0, 0, 0.5], [0, 0, 1.5], [0, 2, 1.5]], atol=1e-12)
+    np.testing.assert_allclose(quat[1, 2], rot[1, 1], atol=1e-12)
+    np.testing.assert_array_equal(moved.positions(), pos)
+    assert moved.frames == 3 and moved.seconds == pytest.approx(2 / 30)
+
+
+def test_a_clip_cannot_be_changed():
+    source = np.zeros((3, 3))
+    clip = still().replaced(root_pos=source)
+    source[0] = 9.0
+    assert not clip.root_pos.any(), "The clip keeps a copy."
+    for array in (clip.root_pos, clip.rot, clip.skeleton.offsets):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    with pytest.raises(FrozenInstanceError):
+        clip.fps = 60.0  # type: ignore[misc]
+    pos, rot = clip.tensors()
+    pos += 1
+    rot += 1
+    assert not clip.root_pos.any() and clip.rot[0, 0].tolist() == [1, 0, 0, 0]
+    assert clip.tensors(torch.float32)[0].dtype == torch.float32
+
+
+def broken(**changes: object) -> str:
+    with pytest.raises(PoiseError) as error:
+        still().replaced(**changes)
+    return str(error.value)
+
+
+def test_faults_are_told_with_joint_and_frame():
+    rot, pos = still().rot.copy(), still().root_pos.copy()
+    rot[2, 1] = [2.0, 0, 0, 0]
+    assert "still: the rotation of joint 'upper' at frame 2 is not a unit quaternion (norm 2)" in broken(
+        rot=rot
+    )
+    rot[2, 1] = np.nan
+    assert "joint 'upper' at frame 2" in broken(rot=rot)
+    pos[1, 2] = np.inf
+    assert broken(root_pos=pos) == "still: the root position is not finite at frame 1"
+    assert "got (3, 2) and (3, 3, 4)" in broken(root_pos=np.zeros((3, 2)))
+    assert "got (4, 3) and (3, 3, 4)" in broken(root_pos=np.zeros((4, 3)))
+    for fps in (0.0, -30.0, math.nan, math.inf):
+        assert "frame rate must be above 0" in broken(fps=fps)
+    with pytest.raises(PoiseError, match="the clip has 1 frame; motion needs at least 2"):
+        still(1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"names": ("a", "b", "a")}, "joint name 'a' appears twice"),
+        ({"parents": (-1, 0)}, "got 3 names, 2 parents"),
+        ({"parents": (0, 0, 1)}, "joint 'root' has parent index 0"),
+        ({"parents": (-1, 2, 0)}, "joint 'upper' has parent index 2"),
+        ({"parents": (-1, -1, 0)}, "joint 'upper' has parent index -1"),
+        ({"offsets": np.full((3, 3), np.nan)}, "joint 'root' has an offset that is not finite"),
+        ({"offsets": np.zeros((3, 2))}, "offsets of shape (3, 2)"),
+    ],
+)
+def test_skeletons_are_checked(changes, message):
+    with pytest.raises(PoiseError) as error:
+        replace(arm(), **changes)
+    assert message in str(error.value)
+
+
+def test_an_empty_skeleton_is_refused():
+    with pytest.raises(PoiseError, match="at least one joint"):
+        Skeleton((), (), np.zeros((0, 3)))
+
+
+def test_skeletons_answer():
+    skeleton = replace(arm(), ends=((2, (0.0, 0.0, 0.5)),))
+    assert skeleton.index("lower") == 2 and skeleton.children(0) == (1,) and len(skeleton) == 3
+    np.testing.assert_array_equal(skeleton.rest_positions(), [[0, 0, 0], [0, 0, 1], [2, 0, 1]])
+    np.testing.assert_array_equal(skeleton.end_positions(), [[2, 0, 1.5]])
+    assert arm().end_positions().shape == (0, 3)
+    with pytest.raises(PoiseError, match=r"no joint 'lowr'. Did you mean 'lower'\?"):
+        skeleton.index("lowr")
+
+
+def test_skeletons_are_equal_by_content():
+    assert arm() == arm() and hash(arm()) == hash(arm())
+    longer = replace(arm(), offsets=arm().offsets * 2)
+    assert longer != arm() and arm().with_source(format="bvh") != arm()
+    assert arm().with_source(format="bvh").source.format == "bvh" and arm() != "arm"

@@ -1,0 +1,124 @@
+"""The residual force recipe: what each setting switches, and runs that can be reopened."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from poise.body import BodyConfig
+from poise.control import ExplicitResidual, ImplicitResidual
+from poise.env.terms import reward
+from poise.errors import PoiseError
+from poise.eval import run_episodes, start_frames
+from poise.motion import ClipLibrary, read_clip
+from poise.recipes import RECIPE, ResidualForce, build
+from poise.recipes.residual_force import paper
+from poise.recipes.session import begin, reopen
+from toy_human import swing
+
+
+def names(terms) -> list[str]:
+    return [t.name for t in terms]
+
+
+@pytest.fixture(scope="module")
+def built():
+    return build(swing(), ResidualForce(num_envs=2))
+
+
+def test_the_default_is_the_papers_reward_with_implicit_help(built):
+    task = built.task
+    assert isinstance(task.residual, ImplicitResidual) and task.residual.limit_n == 100.0
+    weights = {t.name: t.weight for t in task.rewards}
+    assert weights == {
+        "pose": 0.3, "velocity": 0.1, "end_effectors": 0.5, "centre_of_mass": 0.1, "residual": 0.1,
+    }  # fmt: skip
+    # The imitation reward that is reported sums to one at the reference and leaves the help out.
+    assert sum(t.weight for t in task.rewards if t.imitation) == pytest.approx(1.0)
+    assert names(task.dones) == ["bodies_too_far"] and task.pd.mode == "additive"
+    assert RECIPE["config"] is ResidualForce and RECIPE["build"] is build
+
+
+def test_where_paper_and_code_differ():
+    code = build(swing(), ResidualForce(faithful="code")).task
+    weights = {t.name: t.weight for t in code.rewards}
+    assert weights["end_effectors"] == 0.45 and weights["residual"] == 0.05
+    assert next(t for t in code.rewards if t.fn is reward.pose).params["half"] is True
+    local = build(swing(), ResidualForce(reward="local")).task
+    weights = {t.name: t.weight for t in local.rewards if t.imitation}
+    assert weights == {"pose": 0.5, "end_effectors": 0.3, "root_pose": 0.1, "root_velocity": 0.1}
+
+
+def test_methods_and_the_papers_own_setting():
+    explicit = build(swing(), ResidualForce(method="rfc-explicit", help_limit=40.0))
+    assert isinstance(explicit.task.residual, ExplicitResidual)
+    assert explicit.task.residual.limit_nm == 40.0 and explicit.task.residual.bodies[0] == 0
+    plain = build(swing(), ResidualForce(method="deepmimic"))
+    assert plain.task.residual is None and "residual" not in names(plain.task.rewards)
+    config = paper(ResidualForce())
+    assert (config.observation, config.action, config.done) == ("phase", "absolute", "height")
+    faithful = build(swing(), config)
+    assert names(faithful.task.dones) == ["root_too_low"] and faithful.task.pd.mode == "absolute"
+    assert "target_bodies" not in names(faithful.task.obs)
+    assert faithful.humanoid.model.opt.timestep == pytest.approx(1 / 450)
+    env = faithful.env(2)
+    assert torch.isfinite(env.step(torch.zeros(2, env.num_actions)).obs).all()
+    env.close()
+
+
+def test_a_run_folder_rebuilds_the_task(tmp_path):
+    config = ResidualForce(num_envs=2, seed=5, body=BodyConfig(overrides=(("thigh.torque", 150.0),)))
+    library = ClipLibrary((swing(speed=1.0, cyclic=True, name="walk"), swing(0.5, name="short")))
+    first = begin(tmp_path, library, config)
+    again = reopen(tmp_path)
+    assert again.config == config and again.library.names == ("walk", "short")
+    assert again.humanoid.identity == first.humanoid.identity
+    assert torch.equal(again.reference.qpos, first.reference.qpos)
+    assert again.reference.cyclic.tolist() == [True, False]
+    begin(tmp_path, library, config)  # The same again is no conflict.
+    with pytest.raises(PoiseError, match="holds a run with other settings"):
+        begin(tmp_path, library, replace(config, seed=6))
+    with pytest.raises(PoiseError, match=r"holds a run of other clips \(walk, short\)"):
+        begin(tmp_path, ClipLibrary((swing(),)), config)
+    with pytest.raises(PoiseError, match="is no run folder"):
+        reopen(tmp_path / "nowhere")
+
+
+class Nothing:
+    """A policy that asks for nothing."""
+
+    def __init__(self, width: int):
+        self.width = width
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(obs), self.width)
+
+
+def test_evaluation_starts_on_the_reference_and_counts_no_help(built):
+    clip, start = start_frames(built.reference)
+    assert start.tolist() == list(range(30)) and not clip.any()
+    env = built.env(1)
+    width = env.num_actions
+    env.close()
+    rollouts, recordings = run_episodes(
+        lambda n: built.env(n, auto_reset=False), Nothing(width), clip[:3], start[:3], 100.0, 100.0
+    )
+    assert rollouts.lengths.tolist() == [31, 30, 29]
+    assert rollouts.alive.sum(1).tolist() == [31, 30, 29]
+    torch.testing.assert_close(rollouts.pos[:, 0], rollouts.ref_pos[:, 0], atol=1e-5, rtol=0)
+    assert not rollouts.force.any() and not rollouts.torque.any()
+    (kept,) = recordings
+    assert (kept.clip, kept.start, kept.qpos.shape) == (0, 0, (31, built.reference.qpos.shape[1]))
+
+
+def test_the_world_is_built_on_the_reference_for_a_real_deepmimic_clip(data_dir):
+    # Its joints are not listed depth first: bodies must still be the reference's, row for row.
+    task = build(read_clip(data_dir / "deepmimic_txt/humanoid3d_walk.txt"), ResidualForce(num_envs=4))
+    env = task.env()
+    env.reset()
+    sim, ref = env.pose(), env.reference.gather(env.clip, env.frame)
+    torch.testing.assert_close(sim.pos, ref.pos, atol=1e-4, rtol=0)
+    torch.testing.assert_close(sim.com, ref.com, atol=1e-4, rtol=0)
+    env.close()
