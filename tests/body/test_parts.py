@@ -89,6 +89,36 @@ DIALECTS = {
         "RightFoot(RightToeBase))))",
         (3, 1, 1, 2),
     ),
+    "smpl": (
+        "Pelvis(L_Hip(L_Knee(L_Ankle(L_Toe))) R_Hip(R_Knee(R_Ankle(R_Toe))) Torso(Spine(Chest(Neck(Head)"
+        " L_Thorax(L_Shoulder(L_Elbow(L_Wrist(L_Hand))))"
+        " R_Thorax(R_Shoulder(R_Elbow(R_Wrist(R_Hand))))))))",
+        (3, 1, 1, 2),
+    ),
+    "mixamo": (
+        "mixamorig:Hips(mixamorig:Spine(mixamorig:Neck(mixamorig:Head) mixamorig:LeftArm("
+        "mixamorig:LeftForeArm(mixamorig:LeftHand)) mixamorig:RightArm(mixamorig:RightForeArm("
+        "mixamorig:RightHand))) mixamorig:LeftUpLeg(mixamorig:LeftLeg(mixamorig:LeftFoot("
+        "mixamorig:LeftToeBase))) mixamorig:RightUpLeg(mixamorig:RightLeg(mixamorig:RightFoot)))",
+        (1, 1, 1, 0),
+    ),
+    "unreal": (
+        "root(pelvis(spine_01(spine_02(neck_01(head) clavicle_l(upperarm_l(lowerarm_l(hand_l)))"
+        " clavicle_r(upperarm_r(lowerarm_r(hand_r)))))"
+        " thigh_l(calf_l(foot_l)) thigh_r(calf_r(foot_r))))",
+        (2, 1, 1, 2),
+    ),
+    "biped": (
+        "Bip01(Bip01_Pelvis(Bip01_L_Thigh(Bip01_L_Calf(Bip01_L_Foot)) Bip01_R_Thigh(Bip01_R_Calf("
+        "Bip01_R_Foot)) Bip01_Spine(Bip01_L_Clavicle(Bip01_L_UpperArm(Bip01_L_Forearm(Bip01_L_Hand)))"
+        " Bip01_R_Clavicle(Bip01_R_UpperArm(Bip01_R_Forearm(Bip01_R_Hand))))))",
+        (1, 0, 0, 2),
+    ),
+    "hips beside spine": (
+        "Hips(LowerBody(LeftUpLeg(LeftLeg(LeftFoot)) RightUpLeg(RightLeg(RightFoot))) Spine(Head"
+        " LeftArm(LeftForeArm(LeftHand)) RightArm(RightForeArm(RightHand))))",
+        (1, 0, 1, 0),
+    ),
     "deepmimic": (
         "root(chest(neck right_shoulder(right_elbow(right_wrist)) left_shoulder(left_elbow(left_wrist)))"
         " right_hip(right_knee(right_ankle)) left_hip(left_knee(left_ankle)))",
@@ -124,13 +154,16 @@ def test_every_dialect_has_all_parts(dialect):
         for side in ("left", "right"):
             (joint,) = anatomy.of(kind, side)
             mark = skeleton.names[joint].lower()
-            assert ("right" in mark or mark[0] == "r" or mark.endswith("_r")) == (side == "right")
+            right = "right" in mark or mark[0] == "r" or mark.endswith("_r") or "_r_" in mark
+            assert right == (side == "right")
     counts = tuple(len(anatomy.of(k)) for k in ("spine", "neck", "head", "clavicle"))
     assert counts == (spine, neck, head, clavicle)
     assert anatomy.parts[0].kind == "pelvis" and len(anatomy.of("pelvis")) == 1
     for side in ("left", "right"):
         (thigh,), (shin,), (foot,) = (anatomy.of(k, side) for k in ("thigh", "shin", "foot"))
         assert skeleton.parents[foot] == shin and skeleton.parents[shin] == thigh
+    table = generate_table(skeleton)
+    assert [r.parent for r in table.rows].count(-1) == 1 and table.rows[0].parent == -1
     for side, toe in anatomy.toes:
         assert skeleton.parents[toe] == anatomy.of("foot", side)[0]
         assert "toe" in skeleton.names[toe].lower()
@@ -146,6 +179,7 @@ def test_every_dialect_has_all_parts(dialect):
         ("Hand_L", ("left", "hand")),
         ("mixamorig:RightFoot", ("right", "foot")),
         ("Character1_LeftHand", ("left", "hand")),
+        ("Bip01_L_Foot", ("left", "foot")),
         ("lowerback", ("", "lowerback")),
         ("root", ("", "root")),
         ("LowerNeck", ("", "lowerneck")),

@@ -64,6 +64,9 @@ def plain_name(name: str) -> tuple[str, str]:
     match = re.match(r"^(.*)[_.]([lr])$", text) or None
     if match:
         return {"l": "left", "r": "right"}[match.group(2)], match.group(1)
+    match = re.match(r"^.+[_. ]([lr])[_. ](.+)$", text)
+    if match:
+        return {"l": "left", "r": "right"}[match.group(1)], match.group(2)
     match = re.match(r"^([lr])[_.]?(.+)$", text)
     if match and any(match.group(2).rstrip("0123456789") == core for core in _CORES):
         return {"l": "left", "r": "right"}[match.group(1)], match.group(2)
@@ -126,6 +129,8 @@ def find_anatomy(skeleton: Skeleton) -> Anatomy:
             ends[f"{side} {label}"] = joint
     pelvis = _common(skeleton, ends["left foot"], ends["right foot"])
     chest = _common(skeleton, ends["left hand"], ends["right hand"])
+    # Where the hips and the spine hang side by side, the joint that carries both is the pelvis.
+    pelvis = _common(skeleton, pelvis, chest)
     kinds: dict[int, tuple[str, str]] = {pelvis: ("pelvis", "")}
     for j in _path(skeleton, pelvis, chest):
         kinds[j] = ("spine", "")

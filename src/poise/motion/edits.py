@@ -13,11 +13,12 @@ from poise.spatial import slerp
 def resample(clip: Clip, fps: float) -> Clip:
     """The clip at another frame rate: positions linear, rotations by slerp, the duration kept.
 
-    The last sample falls on or before the clip's last frame (within a thousandth of a frame).
+    The last sample falls on or before the clip's last frame (within a hundredth of a frame, since
+    files round their frame times).
     """
     if not (np.isfinite(fps) and fps > 0):
         raise PoiseError(f"the frame rate must be above 0, got {fps}", clip.name)
-    count = int(np.floor(clip.seconds * fps + 1e-3)) + 1
+    count = int(np.floor(clip.seconds * fps + 1e-2)) + 1
     if count < 2:
         raise PoiseError(
             f"the clip lasts {clip.seconds:.3f} s, less than one frame at {fps:g} fps", clip.name

@@ -8,7 +8,7 @@ import numpy as np
 
 from poise import __version__
 from poise.eval import write_score
-from poise.kin import qpos_to_clip
+from poise.kin import lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
 from poise.motion.io import write_clip
 from poise.recipes.imitation import Imitation
@@ -66,6 +66,7 @@ def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, n
     table, source = imitation.humanoid.table, imitation.library.clips[recording.clip]
     card = evaluation.card
     error = np.linalg.norm((pos - pos[:, :1]) - (ref - ref[:, :1]), axis=-1).mean(-1) * 1000
+    low = lowest_height(table, r.pos[row, :frames], r.quat[row, :frames]).numpy()
     helped = imitation.config.method != "deepmimic"
     return Report(
         title=f"{source.name}, simulated",
@@ -82,7 +83,7 @@ def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, n
         torque=r.torque[row, :frames].sum(1).numpy() if helped else None,
         error_mm=error,
         error_global_mm=np.linalg.norm(pos - ref, axis=-1).mean(-1) * 1000,
-        contacts=None,
+        contacts=low[:, list(imitation.humanoid.feet)] < 0.015,
         score=card.to_dict(),
         curve=curve,
         notes=(*source.skeleton.source.notes, *imitation.report.sentences()),
