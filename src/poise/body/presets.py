@@ -55,3 +55,5 @@ CMU_MERGED = ("upperneck",)
 
 #: Ankle above the sole, foot length, heel behind the ankle, foot width: fractions of the height.
 ANKLE_HEIGHT, FOOT_LENGTH, HEEL_LENGTH, FOOT_WIDTH = 0.039, 0.152, 0.040, 0.055
+#: How far the rigid sole reaches beyond the toe joint, a fraction of the height.
+BEYOND_BALL = 0.02

@@ -169,12 +169,11 @@ def _sole(
     reach, drop, ahead = presets.FOOT_LENGTH * height - presets.HEEL_LENGTH * height, 0.0, None
     if toe is not None and np.linalg.norm(skeleton.offsets[toe]) > 1e-3:
         at = skeleton.offsets[toe]
-        tips = [at + skeleton.offsets[c] for c in skeleton.children(toe)]
-        tips += [at + np.array(v) for j, v in skeleton.ends if j == toe]
-        far = max([at, *tips], key=lambda v: float(np.linalg.norm(v)))
         ahead = at - (at @ down) * down
         drop = float(at @ down)
-        reach = max(reach, float(_unit(ahead) @ far)) if np.linalg.norm(ahead) > 1e-3 else reach
+        # A rigid sole ends a little beyond the ball: the toes of a real foot bend at push-off, and
+        # a longer box would poke through the floor there.
+        reach = float(np.linalg.norm(ahead)) + presets.BEYOND_BALL * height
     if ahead is None or np.linalg.norm(ahead) < 1e-3:
         ahead = np.cross(lateral, -down)
         ahead = ahead - (ahead @ down) * down

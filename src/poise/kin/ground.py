@@ -12,14 +12,17 @@ from poise.body import BodyTable
 from poise.kin.fk import Kinematics
 from poise.spatial import quat_rotate
 
+#: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
+SINK_M = 0.02
+
 
 @dataclass(frozen=True)
 class GroundFit:
     """How a motion was set on the floor.
 
     lift_m: constant lift of the whole clip. clear_m: `(T,)` further lift per frame that keeps every
-    shape above the floor (smooth; zero where nothing sank in). before_m, after_m: deepest point under
-    the floor, before and after.
+    shape within `SINK_M` of the floor (smooth; zero where nothing sank deeper). before_m, after_m:
+    deepest point under the floor, before and after.
     """
 
     lift_m: float
@@ -66,14 +69,20 @@ def fit_ground(
 ) -> tuple[np.ndarray, GroundFit]:
     """The motion set on the floor z = 0, and by how much it was moved.
 
-    The constant lift puts the tenth percentile of the lowest point per frame on the floor: it is
-    robust to a few bad frames and right for walks and flights alike. What still sinks in is lifted
-    frame by frame, by the running maximum of the depth over 0.1 s smoothed over 0.2 s.
+    The constant lift sets the soles of standing feet (flat and slow, see `stance_heights`) on the
+    floor, but never so low that the tenth percentile of the lowest points sinks by twice `SINK_M`; a
+    clip in which no foot stands has that percentile set on the floor.
+    Parts that still sink in by more than `SINK_M`, such as the toes of a rigid foot at push-off, are
+    lifted out frame by frame, by the running maximum of the excess over 0.1 s smoothed over 0.2 s.
     """
     state = Kinematics(table)(torch.tensor(qpos))
     low = lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
+    stance = stance_heights(table, state.pos, state.quat, fps)
     lift = -float(np.quantile(low, 0.1))
-    depth = np.maximum(-(low + lift), 0.0)
+    if len(stance) >= 3:
+        # Badly solved feet point their toes down while they stand; they may not drag the rest along.
+        lift = max(-float(np.median(stance)), lift - 2 * SINK_M)
+    depth = np.maximum(-(low + lift) - SINK_M, 0.0)
     reach = max(1, round(0.1 * fps))
     padded = np.pad(depth, reach, mode="wrap" if cyclic else "edge")
     hull = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(-1)
@@ -86,3 +95,27 @@ def fit_ground(
     out[:, 2] += lift + clear
     after = low + lift + clear
     return out, GroundFit(lift, clear, float(low.min()), float(min(after.min(), 0.0)))
+
+
+def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> np.ndarray:
+    """Heights (m) of the middle of the soles in all frames in which a foot stands.
+
+    A foot stands when its sole is within 20 degrees of level, moves slower than 0.4 m/s, and is
+    among the lower half of such moments (a foot may also rest level in the air).
+    """
+    found: list[Tensor] = []
+    for i, row in enumerate(table.rows):
+        box = next((g for g in row.geoms if g.kind == "box"), None)
+        if row.kind != "foot" or box is None:
+            continue
+        turn = torch.tensor(box.quat, dtype=pos.dtype)
+        up = quat_rotate(turn, torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype))
+        sole = torch.tensor(box.pos, dtype=pos.dtype) - up * box.size[2]
+        point = pos[:, i] + quat_rotate(quat[:, i], sole.expand_as(pos[:, i]))
+        ahead = torch.arange(len(point)).add(1).clamp(max=len(point) - 1)
+        behind = torch.arange(len(point)).sub(1).clamp(min=0)
+        speed = (point[ahead] - point[behind]).norm(dim=-1) * fps / (ahead - behind)
+        level = quat_rotate(quat[:, i], up.expand_as(pos[:, i]))[:, 2] > 0.94
+        found.append(point[level & (speed < 0.4), 2])
+    heights = torch.cat(found).numpy() if found else np.zeros(0)
+    return heights[heights <= np.median(heights) + 0.02] if len(heights) else heights

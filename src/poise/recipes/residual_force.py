@@ -63,7 +63,7 @@ class ResidualForce:
 
 
 def residual(config: ResidualForce, humanoid: Humanoid) -> Residual | None:
-    """The kind of help: none, a root wrench, or wrenches on pelvis, feet and hands."""
+    """The kind of help: none, a root wrench, or wrenches on pelvis and feet."""
     limits = {"limit_n": config.help_limit, "limit_nm": config.help_limit}
     if config.method == "rfc-implicit":
         return ImplicitResidual(**limits)
