@@ -4,7 +4,7 @@
 
 Everything but the residual force is the same for the three methods: body, terms, PPO, seeds. The
 imitation reward leaves out the regularizer (paper Sec. 6.1). Results of finished runs are kept in
-the JSON, so that the command goes on where it was stopped; `--plot` draws the curves.
+`--work`, so that the command goes on where it was stopped; `--collect` only gathers them.
 """
 
 from __future__ import annotations

@@ -271,8 +271,8 @@ def soles(humanoid: Humanoid, qpos: np.ndarray, foot: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", ["cmu_amc/02/02_01.amc", "deepmimic_txt/humanoid3d_walk.txt"])
 def test_standing_feet_are_level_and_near_the_floor(fitted, name):
-    # A rigid sole tips over its toes at push-off, which keeps the flat foot a little above the floor:
-    # 3 cm in the CMU walk, 1 cm in DeepMimic's.
+    # The lift follows the standing soles; the two feet of a clip may still stand a little apart in
+    # height, and the smooth lift of toes that sink at push-off reaches into the stance.
     humanoid, qpos, _ = fitted(name)
     for foot in humanoid.feet:
         corners = soles(humanoid, qpos, foot)
@@ -280,7 +280,7 @@ def test_standing_feet_are_level_and_near_the_floor(fitted, name):
         heights = corners[stands][..., 2]
         assert int(stands.sum()) >= 5
         assert float((heights.amax(1) - heights.amin(1)).median()) < 0.025
-        assert 0.0 <= float(heights.mean(1).median()) < 0.05
+        assert abs(float(heights.mean(1).median())) < 0.015
 
 
 def test_the_toys_soles_are_flat_on_the_floor():

@@ -45,6 +45,44 @@ def test_a_start_lies_exactly_on_the_reference(make_env):
     env.close()
 
 
+def test_a_start_in_a_later_cycle_is_carried_on(make_env):
+    env = make_env(6, clips=(swing(1.0, speed=1.2, bend=0.7, cyclic=True, name="bend"),))
+    clip, frame = torch.zeros(6, dtype=torch.long), torch.tensor([7, 37, 67, 30, 60, 0])
+    env.reset_to(clip, frame)
+    sim, ref, state = env.pose(), env.reference.gather(clip, frame), env.backend.state
+    for name in ("pos", "linvel", "angvel", "com"):
+        torch.testing.assert_close(getattr(sim, name), getattr(ref, name), atol=3e-5, rtol=1e-4)
+    # Positions and velocities are those of frame 7, turned and moved by the cycle's step, in float64.
+    turn, travel = env.reference.cycle_turn[0], env.reference.cycle_travel[0]
+    assert state.qpos.dtype == torch.float64
+    for k in (1, 2):
+        pos = quat_rotate(turn, state.qpos[k - 1, :3]) + travel
+        torch.testing.assert_close(state.qpos[k, :3], pos, atol=1e-12, rtol=0)
+        lin = quat_rotate(turn, state.qvel[k - 1, :3])
+        torch.testing.assert_close(state.qvel[k, :3], lin, atol=1e-12, rtol=0)
+        torch.testing.assert_close(state.qvel[k, 3:], state.qvel[0, 3:], atol=1e-12, rtol=0)
+    assert float((state.qpos[2, :2] - state.qpos[0, :2]).norm()) > 1.5
+    # What the character sees and earns there is what it does in the first cycle.
+    step = env.step(torch.zeros(6, env.num_actions))
+    for a, b in ((0, 1), (0, 2), (5, 3), (5, 4)):
+        torch.testing.assert_close(step.reward[a], step.reward[b], atol=1e-3, rtol=0)
+        torch.testing.assert_close(step.final_obs[a], step.final_obs[b], atol=2e-2, rtol=0)
+    env.close()
+
+
+def test_reseeding_repeats_the_starts(make_env):
+    env = make_env(16, seed=1)
+    starts = []
+    for seed in (5, 6, 5):
+        before = env.frame.clone()
+        env.reseed(seed)
+        assert torch.equal(env.frame, before)
+        env.reset()
+        starts.append(env.frame.clone())
+    assert torch.equal(starts[0], starts[2]) and not torch.equal(starts[0], starts[1])
+    env.close()
+
+
 def test_same_seed_same_numbers_at_any_thread_count(make_env):
     runs = []
     for seed, threads in ((3, 1), (3, 1), (3, 2), (4, 1)):

@@ -8,6 +8,8 @@ import torch
 
 from poise.body import generate_table
 from poise.kin import Kinematics, clip_to_qpos, contact_labels, fit_ground, fit_humanoid, lowest_height
+from poise.kin.ground import SINK_M, stance_heights
+from poise.motion import read_clip, resample
 from toy_human import human, swing
 
 
@@ -18,11 +20,17 @@ def lowest(qpos: np.ndarray, table) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def still():
-    """A still stance whose lowest point is at z = 0 exactly, and its table."""
+    """A still stance whose level soles are at z = 0 exactly, and its table."""
     table = generate_table(human())
     qpos = np.repeat(clip_to_qpos(swing(), table)[:1], 60, 0)
+    qpos[:, 7:] = 0.0
     qpos[:, 2] -= lowest(qpos, table)[0]
     return qpos, table
+
+
+def stances(qpos: np.ndarray, table, fps: float = 30.0) -> np.ndarray:
+    state = Kinematics(table)(torch.tensor(qpos))
+    return stance_heights(table, state.pos, state.quat, fps)
 
 
 @pytest.mark.parametrize("offset", [-0.31, -0.02, 0.0, 0.004, 0.25])
@@ -35,7 +43,7 @@ def test_sunken_and_floating_clips_are_set_down(still, offset):
     assert fit.lift_m == pytest.approx(-offset, abs=1e-9)
     assert fit.before_m == pytest.approx(offset, abs=1e-9) and fit.after_m == pytest.approx(0, abs=1e-9)
     assert fit.clear_m.max() == 0.0
-    assert f"Lifted by {-offset * 1000 + 1e-9:+.0f} mm" in fit.sentence()
+    assert f"Lifted by {round(-offset * 1000):+d} mm to stand" in fit.sentence()
 
 
 def test_a_flight_stays_a_flight(still):
@@ -47,26 +55,100 @@ def test_a_flight_stays_a_flight(still):
     assert fit.clear_m.max() == 0.0
 
 
+@pytest.mark.parametrize("offset", [-3.0, -0.07, 0.015, 0.5])
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_the_height_that_a_clip_came_at_does_not_matter(offset, cyclic):
+    table = generate_table(human())
+    qpos = clip_to_qpos(swing(speed=1.0), table)
+    qpos[10:13, 2] -= 0.07
+    out, fit = fit_ground(qpos, table, 30.0, cyclic)
+    moved = qpos.copy()
+    moved[:, 2] += offset
+    again, other = fit_ground(moved, table, 30.0, cyclic)
+    np.testing.assert_allclose(again, out, atol=1e-9)
+    np.testing.assert_allclose(other.clear_m, fit.clear_m, atol=1e-9)
+    assert other.lift_m == pytest.approx(fit.lift_m - offset, abs=1e-9)
+    assert other.after_m == pytest.approx(fit.after_m, abs=1e-9)
+
+
+def test_what_sinks_by_less_than_the_limit_stays(still):
+    qpos, table = still
+    dip = qpos.copy()
+    dip[30, 2] -= 0.019
+    out, fit = fit_ground(dip, table, 30.0)
+    np.testing.assert_allclose(out, dip, atol=1e-9)
+    assert fit.clear_m.max() == 0.0 and fit.after_m == pytest.approx(-0.019)
+
+
 def test_a_frame_that_sinks_is_lifted_smoothly(still):
     qpos, table = still
     dip = qpos.copy()
-    dip[30, 2] -= 0.04
+    dip[30, 2] -= SINK_M + 0.04
     before = dip.copy()
     out, fit = fit_ground(dip, table, 30.0)
     assert np.array_equal(dip, before), "The argument must not change."
-    assert lowest(out, table).min() > -1e-9 and fit.before_m == pytest.approx(-0.04)
+    assert lowest(out, table).min() == pytest.approx(-SINK_M) and fit.after_m == pytest.approx(-SINK_M)
+    assert fit.before_m == pytest.approx(-SINK_M - 0.04)
     assert abs(fit.lift_m) < 1e-9 and 0.039 < fit.clear_m.max() <= 0.0401
     # It rises and falls over several frames, and is gone half a second away.
     assert np.abs(np.diff(fit.clear_m)).max() < 0.02
     assert fit.clear_m[:15].max() == 0.0 and fit.clear_m[45:].max() == 0.0
 
 
-def test_a_cyclic_clip_is_cleared_across_its_seam(still):
+@pytest.mark.parametrize("frame", [0, 59])
+def test_a_cyclic_clip_is_cleared_across_its_seam(still, frame):
     qpos, table = still
     dip = qpos.copy()
-    dip[0, 2] -= 0.04
+    dip[frame, 2] -= SINK_M + 0.04
     _, fit = fit_ground(dip, table, 30.0, cyclic=True)
-    assert fit.clear_m[-1] > 0.02 and fit.clear_m[30] == 0.0
+    # Both ends are one moment: the lift is the same there and falls alike to both sides.
+    assert fit.clear_m[-1] == fit.clear_m[0] > 0.039 and fit.clear_m[30] == 0.0
+    np.testing.assert_allclose(fit.clear_m, fit.clear_m[::-1], atol=1e-12)
+
+
+def test_only_flat_and_slow_feet_stand(still):
+    qpos, table = still
+    np.testing.assert_allclose(stances(qpos, table), np.zeros(120), atol=1e-9)
+    slide, tilt, air = qpos.copy(), qpos.copy(), qpos.copy()
+    slide[:, 0] = np.arange(60) / 30.0 * 0.5
+    assert not len(stances(slide, table))
+    tilt[:, 3:7] = [np.cos(0.2), 0.0, np.sin(0.2), 0.0]
+    assert not len(stances(tilt, table))
+    # A level rest in the air is told by its height.
+    air[40:, 2] += 0.3
+    assert np.abs(stances(air, table)).max() < 1e-9 and len(stances(air, table)) >= 78
+
+
+def test_where_no_foot_stands_the_lowest_points_are_set_down(still):
+    qpos, table = still
+    slide = qpos.copy()
+    slide[:, 0] = np.arange(60) / 30.0 * 2.0
+    slide[:, 2] += 0.2
+    slide[:6, 2] += 0.1
+    _, fit = fit_ground(slide, table, 30.0)
+    assert fit.lift_m == pytest.approx(-0.2, abs=1e-9) and fit.clear_m.max() == 0.0
+
+
+def test_badly_solved_feet_do_not_drag_the_clip_down():
+    # A tall toy on tiptoe: its soles are within 20 degrees of level and over 4 cm up in the middle.
+    table = generate_table(human(1.2))
+    tiptoe = np.repeat(clip_to_qpos(swing(scale=1.2), table)[:1], 60, 0)
+    tiptoe[:, 7:] = 0.0
+    tiptoe[:, 3:7] = [np.cos(0.165), 0.0, np.sin(0.165), 0.0]
+    low = lowest(tiptoe, table)
+    middle = np.median(stances(tiptoe, table)) - low[0]
+    assert middle > 2 * SINK_M
+    _, fit = fit_ground(tiptoe, table, 30.0)
+    assert fit.lift_m == pytest.approx(-low[0] - 2 * SINK_M) and fit.after_m == pytest.approx(-SINK_M)
+
+
+@pytest.mark.parametrize("name", ["cmu_amc/02/02_01.amc", "deepmimic_txt/humanoid3d_walk.txt"])
+def test_real_walks_stand_on_the_floor(data_dir, name):
+    clip = resample(read_clip(data_dir / name), 30.0)
+    table = generate_table(clip.skeleton, None, [clip])
+    out, fit = fit_ground(clip_to_qpos(clip, table), table, 30.0)
+    assert abs(float(np.median(stances(out, table)))) < 0.015
+    assert lowest(out, table).min() > -SINK_M - 1e-4 and fit.after_m < 0.0
 
 
 def test_a_few_bad_frames_do_not_lift_the_clip(still):
@@ -77,11 +159,11 @@ def test_a_few_bad_frames_do_not_lift_the_clip(still):
     assert abs(fit.lift_m) < 1e-9
 
 
-def test_fitted_motions_never_sink():
+def test_fitted_motions_sink_no_deeper_than_the_limit():
     humanoid, motions, report = fit_humanoid(swing(speed=1.0))
-    # What sinks in by less than a tenth of a millimetre stays.
-    assert lowest(motions[0], humanoid.table).min() > -1e-4
-    assert report.ground[0].after_m > -1e-4
+    # An excess of less than a tenth of a millimetre stays.
+    assert lowest(motions[0], humanoid.table).min() > -SINK_M - 1e-4
+    assert report.ground[0].after_m > -SINK_M - 1e-4
     sentences = report.sentences()
     assert any("mm to stand on the floor" in s for s in sentences)
     assert any("0.0 mm from the clip's" in s for s in sentences)

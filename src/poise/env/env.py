@@ -96,14 +96,20 @@ class ImitationEnv:
         self._restart(torch.arange(self.num_envs))
         return self._observe()
 
+    def reseed(self, seed: int) -> None:
+        """Makes the draws of all later starts repeatable; worlds stay where they are."""
+        self._rng.manual_seed(seed)
+
     def reset_to(self, clip: Tensor, frame: Tensor) -> Tensor:
-        """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations."""
+        """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
+
+        Frames past the end of a cyclic clip are where its later cycles are.
+        """
         self.clip.copy_(clip)
         self.frame.copy_(frame)
         self.age.zero_()
         self.action.zero_()
-        rows = self.reference.rows(self.clip, self.frame)
-        self.backend.write(None, self.reference.qpos[rows], self.reference.qvel[rows])
+        self.backend.write(None, *self.reference.coordinates(self.clip, self.frame))
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
     def _restart(self, ids: Tensor) -> None:
@@ -115,8 +121,7 @@ class ImitationEnv:
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
-        rows = self.reference.rows(pick, frame)
-        self.backend.write(ids, self.reference.qpos[rows], self.reference.qvel[rows])
+        self.backend.write(ids, *self.reference.coordinates(pick, frame))
 
     # --- stepping -----------------------------------------------------------------------------
 

@@ -124,7 +124,7 @@ def _spaces(env: ImitationEnv, limit: float) -> tuple[Box, Box]:
 
 def _reseed(env: ImitationEnv, seed: int | None) -> None:
     if seed is not None:
-        env._rng.manual_seed(seed)
+        env.reseed(seed)
 
 
 def _actions(actions: np.ndarray) -> Tensor:

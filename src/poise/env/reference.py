@@ -11,15 +11,16 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env.frame import Pose
 from poise.errors import PoiseError
-from poise.kin import Kinematics, qpos_velocity
-from poise.spatial import heading_quat, quat_conj, quat_mul, quat_rotate
+from poise.kin import Kinematics, cycle_step, cycle_velocity, qpos_velocity
+from poise.spatial import heading_quat, quat_mul, quat_rotate
 
 
 class Reference:
     """Reference motion at the control rate, all clips end to end.
 
-    Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. A cyclic clip goes on after its
-    last frame with its first, moved and turned to where the last frame stands.
+    Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. A cyclic clip, whose last frame is
+    its first one cycle later (`poise.kin.close_cycle`), goes on with its first frames, moved and turned
+    to where the last frame stands.
     """
 
     def __init__(
@@ -44,7 +45,10 @@ class Reference:
         self.kinematics = Kinematics(humanoid.table)
         self._fast = Kinematics(humanoid.table, torch.float32)
         qpos = torch.tensor(np.concatenate(motions), dtype=torch.float64)
-        qvel = torch.tensor(np.concatenate([qpos_velocity(q, rate_hz) for q in motions]))
+        speed = [cycle_velocity if c else qpos_velocity for c in cyclic]
+        qvel = torch.tensor(
+            np.concatenate([of(q, rate_hz) for of, q in zip(speed, motions, strict=True)])
+        )
         self.qpos, self.qvel = qpos, qvel
         self.pose = self._pose(qpos, qvel)
         self.length = torch.tensor([len(q) for q in motions])
@@ -55,11 +59,9 @@ class Reference:
         )
         self.any_cyclic = bool(self.cyclic.any())
         # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
-        first, last = qpos[self.start], qpos[self.start + self.length - 1]
-        self.cycle_turn = quat_mul(heading_quat(last[:, 3:7]), quat_conj(heading_quat(first[:, 3:7])))
-        travel = last[:, :3] - quat_rotate(self.cycle_turn, first[:, :3])
-        travel[:, 2] = 0.0
-        self.cycle_travel = travel
+        steps = [cycle_step(q) for q in motions]
+        self.cycle_turn = torch.stack([turn for turn, _ in steps])
+        self.cycle_travel = torch.stack([travel for _, travel in steps])
 
     def _pose(self, qpos: Tensor, qvel: Tensor) -> Pose:
         body = self.kinematics(qpos, qvel)
@@ -116,15 +118,30 @@ class Reference:
         rows = self.rows(clip, frame)
         p = self.pose
         out = Pose(*(getattr(p, name)[rows] for name in p.__dataclass_fields__))
+        carry = self._carry(clip, frame)
+        return out if carry is None else _carried(out, carry[0].float(), carry[1].float())
+
+    def coordinates(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """`qpos (N, 7 + n)` and `qvel (N, 6 + n)`, float64, of the poses that `gather` gives."""
+        rows = self.rows(clip, frame)
+        qpos, qvel, carry = self.qpos[rows], self.qvel[rows], self._carry(clip, frame)
+        if carry is None:
+            return qpos, qvel
+        turn, move = carry
+        pos, quat = quat_rotate(turn, qpos[:, :3]) + move, quat_mul(turn, qpos[:, 3:7])
+        # The root's angular velocity is in its own frame, so it turns along by itself.
+        linear = quat_rotate(turn, qvel[:, :3])
+        return torch.cat((pos, quat, qpos[:, 7:]), -1), torch.cat((linear, qvel[:, 3:]), -1)
+
+    def _carry(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The turn `(N, 4)` and then the move `(N, 3)` m of the cycles before `frame`; None if none."""
         if not self.any_cyclic:
-            return out
+            return None
         cycles = torch.where(
             self.cyclic[clip], frame // (self.length[clip] - 1), torch.zeros_like(frame)
         )
-        return self._carried(out, clip, cycles) if bool((cycles > 0).any()) else out
-
-    def _carried(self, pose: Pose, clip: Tensor, cycles: Tensor) -> Pose:
-        """Poses moved on by whole cycles: turned and shifted by the clip's own travel, repeatedly."""
+        if not bool((cycles > 0).any()):
+            return None
         turn = torch.zeros(len(clip), 4, dtype=torch.float64)
         turn[:, 0] = 1.0
         move = torch.zeros(len(clip), 3, dtype=torch.float64)
@@ -135,20 +152,22 @@ class Reference:
                 more, quat_rotate(self.cycle_turn[clip], move) + self.cycle_travel[clip], move
             )
             turn = torch.where(more, quat_mul(self.cycle_turn[clip], turn), turn)
-        t, m = turn.float(), move.float()
-        tb = t[:, None].expand(*pose.pos.shape[:-1], 4)
-        pos = quat_rotate(tb, pose.pos) + m[:, None]
-        quat = quat_mul(tb, pose.quat)
-        qpos = torch.cat((pos[:, 0], quat[:, 0], pose.qpos[:, 7:]), -1)
-        qvel = torch.cat((quat_rotate(t, pose.qvel[:, :3]), pose.qvel[:, 3:]), -1)
-        return Pose(
-            qpos,
-            qvel,
-            pos,
-            quat,
-            quat_rotate(tb, pose.linvel),
-            quat_rotate(tb, pose.angvel),
-            quat_rotate(t, pose.com) + m,
-            pose.local,
-            quat_mul(t, pose.heading),
-        )
+        return turn, move
+
+
+def _carried(pose: Pose, turn: Tensor, move: Tensor) -> Pose:
+    """Poses turned by `turn (N, 4)` and then moved by `move (N, 3)` m."""
+    turns = turn[:, None].expand(*pose.pos.shape[:-1], 4)
+    pos = quat_rotate(turns, pose.pos) + move[:, None]
+    quat = quat_mul(turns, pose.quat)
+    return Pose(
+        torch.cat((pos[:, 0], quat[:, 0], pose.qpos[:, 7:]), -1),
+        torch.cat((quat_rotate(turn, pose.qvel[:, :3]), pose.qvel[:, 3:]), -1),
+        pos,
+        quat,
+        quat_rotate(turns, pose.linvel),
+        quat_rotate(turns, pose.angvel),
+        quat_rotate(turn, pose.com) + move,
+        pose.local,
+        quat_mul(turn, pose.heading),
+    )

@@ -171,8 +171,8 @@ class _Store:
         if wrench is not None:
             bodies = list(wrench.body)
             out["force"][:, t], out["torque"][:, t] = wrench.force, wrench.torque
+            # The wrench was applied at the poses before this step: its arm is zero for a root wrench.
+            arm = wrench.point - out["pos"][:, t - 1, bodies]
             ang = sim.angvel[:, bodies]
-            arm = wrench.point - sim.pos[:, bodies] if env.task.residual and len(bodies) > 1 else None
-            vel = sim.linvel[:, bodies]
-            out["point_vel"][:, t] = vel if arm is None else vel + torch.linalg.cross(ang, arm)
+            out["point_vel"][:, t] = sim.linvel[:, bodies] + torch.linalg.cross(ang, arm)
             out["ang_vel"][:, t] = ang

@@ -1,7 +1,8 @@
-"""Kinematics of a humanoid: clips to generalized coordinates and back, forward kinematics, ground."""
+"""Kinematics of a humanoid: clips to generalized coordinates and back, cycles, ground."""
 
 from poise.kin.contacts import contact_labels
 from poise.kin.coords import clip_to_qpos, qpos_to_clip
+from poise.kin.cycle import Cycle, close_cycle, cycle_step, cycle_velocity
 from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
@@ -9,13 +10,17 @@ from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
+    "Cycle",
     "FitReport",
     "GroundFit",
     "Kinematics",
     "chain_angles",
     "chain_quat",
     "clip_to_qpos",
+    "close_cycle",
     "contact_labels",
+    "cycle_step",
+    "cycle_velocity",
     "fit_ground",
     "fit_humanoid",
     "lowest_height",

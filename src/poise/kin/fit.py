@@ -13,6 +13,7 @@ import torch
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
 from poise.kin.coords import clip_to_qpos
+from poise.kin.cycle import Cycle, join_cycle
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground
 from poise.motion import Clip, ClipLibrary, resample
@@ -29,28 +30,36 @@ GIMBAL = 1.2
 class FitReport:
     """What was measured and changed so that one body can do the motion.
 
-    names: the clips. spikes: impossible turns that were interpolated, per clip. ground: one fit per
-    clip. joint_error_mm: mean distance per clip between its joints and the humanoid's after
-    conversion (turns that a chain cannot make). widened: hinges whose range had to grow, with the
-    growth in degrees. excluded: body pairs that overlap in the reference. fastest: (hinge, rad/s),
-    the largest joint speed.
+    names: the clips. spikes: impossible turns that were interpolated, per clip. cycles: how the ends of
+    cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance per clip
+    between its joints and the humanoid's after conversion (turns that a chain cannot make), before a
+    cycle was closed. widened: hinges whose range had to grow, with the growth in degrees. excluded:
+    body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
     """
 
     names: tuple[str, ...]
     spikes: tuple[tuple[Spike, ...], ...]
+    cycles: tuple[Cycle | None, ...]
     ground: tuple[GroundFit, ...]
     joint_error_mm: tuple[float, ...]
     widened: tuple[tuple[str, float], ...]
     excluded: tuple[tuple[str, str], ...]
     fastest: tuple[str, float]
 
+    @property
+    def cyclic(self) -> tuple[bool, ...]:
+        """Which clips can go on from their end to their start, closed to do so."""
+        return tuple(c is not None and c.open_hinge is None for c in self.cycles)
+
     def sentences(self) -> list[str]:
         """The report in words, one line each."""
         out = []
-        columns = (self.names, self.spikes, self.ground, self.joint_error_mm)
-        for name, spikes, ground, error in zip(*columns, strict=True):
+        columns = (self.names, self.spikes, self.cycles, self.ground, self.joint_error_mm)
+        for name, spikes, cycle, ground, error in zip(*columns, strict=True):
             if spikes:
                 out.append(f"{name}: {spike_sentence(spikes)}")
+            if cycle is not None:
+                out.append(f"{name}: {cycle.sentence()}")
             out.append(f"{name}: {ground.sentence()}")
             out.append(f"{name}: the humanoid's joints lie {error:.1f} mm from the clip's on average.")
         if self.widened:
@@ -77,7 +86,7 @@ def fit_humanoid(
 
     Returns:
         the humanoid, one `qpos (T, 7 + hinges)` per clip at `rate_hz` standing on the floor, and a
-        report of every repair.
+        report of every repair. Its `cyclic` says which motions end as they began.
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
@@ -89,9 +98,15 @@ def fit_humanoid(
     for clip, q in zip(clips, motions, strict=True):
         if not np.isfinite(q).all():
             raise PoiseError("its coordinates are not finite", clip.name)
-    table, widened = _widen(table, motions, config.margin)
     error = [_joint_error(c, q, table) for c, q in zip(clips, motions, strict=True)]
-    fits = [fit_ground(q, table, rate_hz, c.cyclic) for c, q in zip(clips, motions, strict=True)]
+    hinges = [name for row in table.rows for name in row.hinge_names()]
+    joined = [
+        join_cycle(q, hinges) if c.cyclic else (q, None) for c, q in zip(clips, motions, strict=True)
+    ]
+    motions, cycles = [q for q, _ in joined], tuple(c for _, c in joined)
+    table, widened = _widen(table, motions, config.margin)
+    closed = [c is not None and c.open_hinge is None for c in cycles]
+    fits = [fit_ground(q, table, rate_hz, c) for q, c in zip(motions, closed, strict=True)]
     motions = [q for q, _ in fits]
     humanoid = make_humanoid(clips[0].skeleton, table)
     overlaps = _overlaps(humanoid, motions)
@@ -101,6 +116,7 @@ def fit_humanoid(
     report = FitReport(
         library.names,
         tuple(spikes for _, spikes in repaired),
+        cycles,
         tuple(f for _, f in fits),
         tuple(error),
         widened,

@@ -20,9 +20,9 @@ SINK_M = 0.02
 class GroundFit:
     """How a motion was set on the floor.
 
-    lift_m: constant lift of the whole clip. clear_m: `(T,)` further lift per frame that keeps every
-    shape within `SINK_M` of the floor (smooth; zero where nothing sank deeper). before_m, after_m:
-    deepest point under the floor, before and after.
+    lift_m: constant lift of the whole clip. clear_m: `(T,)` further lift per frame that lets no shape
+    sink deeper than `SINK_M` (smooth; zero where nothing did). before_m: height of the lowest point
+    before. after_m: the same after, zero where nothing is under the floor.
     """
 
     lift_m: float
@@ -33,9 +33,9 @@ class GroundFit:
     def sentence(self) -> str:
         """The fit in words."""
         return (
-            f"Lifted by {self.lift_m * 1000:+.0f} mm to stand on the floor, and by up to "
-            f"{self.clear_m.max() * 1000:.0f} mm more where a part sank in "
-            f"(deepest point {-self.before_m * 1000:.0f} mm, now {abs(self.after_m) * 1000:.1f} mm)."
+            f"Lifted by {round(self.lift_m * 1000):+d} mm to stand on the floor, and by up to "
+            f"{self.clear_m.max() * 1000:.0f} mm more where a part sank in too deep "
+            f"(deepest point {round(-self.before_m * 1000)} mm, now {abs(self.after_m) * 1000:.1f} mm)."
         )
 
 
@@ -73,7 +73,8 @@ def fit_ground(
     floor, but never so low that the tenth percentile of the lowest points sinks by twice `SINK_M`; a
     clip in which no foot stands has that percentile set on the floor.
     Parts that still sink in by more than `SINK_M`, such as the toes of a rigid foot at push-off, are
-    lifted out frame by frame, by the running maximum of the excess over 0.1 s smoothed over 0.2 s.
+    lifted out frame by frame, by the running maximum of the excess over 0.1 s smoothed over 0.2 s; in a
+    closed cycle also across the seam, so that it stays closed.
     """
     state = Kinematics(table)(torch.tensor(qpos))
     low = lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
@@ -82,19 +83,25 @@ def fit_ground(
     if len(stance) >= 3:
         # Badly solved feet point their toes down while they stand; they may not drag the rest along.
         lift = max(-float(np.median(stance)), lift - 2 * SINK_M)
-    depth = np.maximum(-(low + lift) - SINK_M, 0.0)
-    reach = max(1, round(0.1 * fps))
-    padded = np.pad(depth, reach, mode="wrap" if cyclic else "edge")
-    hull = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(-1)
-    window = np.hanning(2 * reach + 3)[1:-1]
-    clear = np.convolve(
-        np.pad(hull, reach, mode="wrap" if cyclic else "edge"), window / window.sum(), "valid"
-    )
-    clear = np.maximum(clear, 0.0) * float(depth.max() > 1e-4)
+    clear = _clearance(np.maximum(-(low + lift) - SINK_M, 0.0), max(1, round(0.1 * fps)), cyclic)
     out = np.array(qpos)
     out[:, 2] += lift + clear
     after = low + lift + clear
     return out, GroundFit(lift, clear, float(low.min()), float(min(after.min(), 0.0)))
+
+
+def _clearance(depth: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
+    """The smooth lift `(T,)` that covers `depth (T,)`, both in m."""
+    if cyclic:
+        # The last frame is the first one again, so it counts once.
+        depth = np.maximum(depth[:-1], np.append(depth[-1], depth[1:-1]))
+    mode = "wrap" if cyclic else "edge"
+    padded = np.pad(depth, reach, mode=mode)
+    hull = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(-1)
+    window = np.hanning(2 * reach + 3)[1:-1]
+    clear = np.convolve(np.pad(hull, reach, mode=mode), window / window.sum(), "valid")
+    clear = np.maximum(clear, 0.0) * float(depth.max() > 1e-4)
+    return np.append(clear, clear[0]) if cyclic else clear
 
 
 def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> np.ndarray:

@@ -35,7 +35,13 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
         template if template.frames == frames else None,
         source.name,
     )
-    return resample(motion, source.fps)
+    out = resample(motion, source.fps)
+    missing = source.frames - out.frames
+    if not 0 < missing <= np.ceil(source.fps / rate):
+        return out
+    # The source may end between two control steps; its last moment holds the last simulated pose.
+    tail = np.minimum(np.arange(source.frames), out.frames - 1)
+    return out.replaced(root_pos=out.root_pos[tail], rot=out.rot[tail])
 
 
 def deliver(

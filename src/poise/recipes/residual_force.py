@@ -129,9 +129,7 @@ def build(clips: Clip | ClipLibrary, config: ResidualForce | None = None) -> Imi
     library = ClipLibrary.of(clips) if isinstance(clips, Clip) else clips
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
     config.sim.apply(humanoid.model)
-    reference = Reference(
-        humanoid, motions, config.sim.control_hz, library.names, [c.cyclic for c in library]
-    )
+    reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
 
 

@@ -1,0 +1,116 @@
+"""Which start frames are evaluated, and what is recorded of the help."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+import torch
+
+from poise.control import ExplicitResidual
+from poise.env import Reference
+from poise.errors import PoiseError
+from poise.eval import run_episodes, start_frames
+from poise.recipes import ResidualForce, build
+from poise.recipes.imitation import Imitation
+from toy_human import swing
+
+
+def of_lengths(*lengths: int) -> Reference:
+    """All that `start_frames` reads of a reference."""
+    return cast(Reference, SimpleNamespace(length=torch.tensor(lengths)))
+
+
+class Always:
+    """A policy that asks for the same in every world and step."""
+
+    def __init__(self, action: torch.Tensor):
+        self.action = action
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.action.expand(len(obs), -1)
+
+
+def test_short_clips_start_at_every_frame():
+    clip, start = start_frames(of_lengths(31, 3))
+    assert clip.tolist() == [0] * 30 + [1] * 2
+    assert start.tolist() == [*range(30), 0, 1]
+
+
+def test_the_last_clip_that_needs_no_thinning():
+    # 283 frames cost 283 * 283 / 2 = 40 044 steps, 282 cost 39 762.
+    assert len(start_frames(of_lengths(282))[0]) == 281
+    assert len(start_frames(of_lengths(283))[0]) == 141
+
+
+@pytest.mark.parametrize("lengths", [(900,), (300, 40, 700), (50,) * 60])
+def test_long_libraries_are_thinned_evenly(lengths):
+    clip, start = start_frames(of_lengths(*lengths), most_frames=10_000)
+    cost = 0
+    for c, n in enumerate(lengths):
+        mine = start[clip == c]
+        assert mine[0] == 0 and int(mine.max()) <= n - 2
+        assert len(mine) == 1 or len((mine[1:] - mine[:-1]).unique()) == 1
+        cost += int((n - mine).sum())
+    # Frame 0 of every clip is always simulated, whatever that costs.
+    assert cost <= 10_000 + sum(lengths)
+
+
+def record(imitation: Imitation, action: torch.Tensor):
+    """Rollouts of three starts under one constant action, and a twin's wrench and poses by step."""
+    clip, start = torch.zeros(3, dtype=torch.long), torch.tensor([0, 4, 9])
+    policy = Always(action)
+    rollouts, _ = run_episodes(lambda n: imitation.env(n, auto_reset=False), policy, clip, start)
+    twin = imitation.env(3, auto_reset=False)
+    obs = twin.reset_to(clip, start)
+    steps = []
+    for _ in range(6):
+        before = twin.pose()
+        obs = twin.step(policy.act(obs)).final_obs
+        steps.append((before, twin.wrench, twin.pose()))
+    twin.close()
+    return rollouts, steps
+
+
+@pytest.mark.parametrize("bodies", [(0,), (0, 3)])
+def test_explicit_help_is_recorded_at_the_point_where_it_acts(bodies):
+    imitation = build(swing(speed=1.0), ResidualForce(method="rfc-explicit", help_limit=30.0))
+    kind = ExplicitResidual(bodies=bodies, limit_n=30.0, limit_nm=30.0)
+    imitation = replace(imitation, task=replace(imitation.task, residual=kind))
+    action = torch.zeros(len(imitation.humanoid.hinges) + kind.dims)
+    # The point lies 0.25 m ahead of each body's origin; a torque makes it turn.
+    action[-kind.dims :] = torch.tensor([0.25, 0, 0, 0.1, 0, 0.2, 0, 0.5, 0]).repeat(len(bodies))
+    rollouts, steps = record(imitation, action)
+    far = 0.0
+    for t, (before, wrench, after) in enumerate(steps, 1):
+        assert wrench is not None and wrench.body == bodies
+        arm = wrench.point - before.pos[:, list(bodies)]
+        torch.testing.assert_close(arm.norm(dim=-1), torch.full(arm.shape[:2], 0.25), atol=1e-5, rtol=0)
+        spin = torch.linalg.cross(after.angvel[:, list(bodies)], arm)
+        at_point = after.linvel[:, list(bodies)] + spin
+        torch.testing.assert_close(rollouts.point_vel[:, t], at_point, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(rollouts.ang_vel[:, t], after.angvel[:, list(bodies)])
+        torch.testing.assert_close(rollouts.force[:, t], wrench.force)
+        far = max(far, float(spin.norm(dim=-1).max()))
+    assert far > 0.05, "The point must move differently from the origin for this to tell anything."
+
+
+def test_implicit_help_acts_at_the_roots_origin():
+    imitation = build(swing(speed=1.0), ResidualForce(help_limit=30.0))
+    action = torch.zeros(len(imitation.humanoid.hinges) + 6)
+    action[-6:] = torch.tensor([0.3, 0, 0.2, 0, 0.5, 0.1])
+    rollouts, steps = record(imitation, action)
+    for t, (_, _, after) in enumerate(steps, 1):
+        assert torch.equal(rollouts.point_vel[:, t, 0], after.linvel[:, 0])
+
+
+def test_starts_of_another_shape_are_told():
+    with pytest.raises(PoiseError, match="clip and start of one length"):
+        run_episodes(
+            lambda n: pytest.fail("no environment is needed"),
+            Always(torch.zeros(1)),
+            torch.zeros(2, dtype=torch.long),
+            torch.zeros(3, dtype=torch.long),
+        )
