@@ -129,9 +129,9 @@ def main() -> None:
     command = (
         f"python benchmarks/rfc_order.py --data FOLDER --samples {args.samples} --setting {args.setting}"
     )
-    out.write_text(
-        json.dumps({"command": command, "summary": summary(runs), "runs": runs}, indent=1) + "\n"
-    )
+    lines = ",\n".join(f"  {json.dumps(name)}: {json.dumps(run)}" for name, run in runs.items())
+    head = json.dumps({"command": command, "summary": summary(runs)}, indent=1).rstrip("}").rstrip()
+    out.write_text(f'{head},\n "runs": {{\n{lines}\n }}\n}}\n')
     plot(runs, out.with_suffix(".svg"))
 
 
