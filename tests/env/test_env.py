@@ -108,12 +108,13 @@ def test_state_continues_bit_for_bit(make_env):
     other.close()
 
 
-def test_the_clips_end_and_the_horizon_are_time_outs(make_env):
+def test_the_clips_end_finishes_and_the_horizon_is_a_time_out(make_env):
     env = make_env(2, auto_reset=False)
     env.reset_to(torch.tensor([0, 0]), torch.tensor([25, 0]))
     ends = [env.step(torch.zeros(2, env.num_actions)) for _ in range(5)]
-    assert [bool(s.truncated[0]) for s in ends] == [False] * 4 + [True]
-    assert not ends[-1].truncated[1] and not any(s.terminated.any() for s in ends)
+    assert [bool(s.terminated[0]) for s in ends] == [False] * 4 + [True]
+    # Done to its end is finished, not failed, and nothing is left to bootstrap.
+    assert not ends[-1].terminated[1] and not any((s.truncated | s.failed).any() for s in ends)
     env.close()
     env = make_env(2, auto_reset=False, horizon=3)
     env.reset_to(torch.tensor([0, 0]), torch.tensor([0, 4]))
@@ -137,7 +138,7 @@ def test_an_ended_world_begins_anew_and_the_others_go_on(make_env):
     env = make_env(3)
     env.reset_to(torch.zeros(3, dtype=torch.long), torch.tensor([29, 3, 10]))
     step = env.step(torch.zeros(3, env.num_actions))
-    assert step.truncated.tolist() == [True, False, False]
+    assert step.terminated.tolist() == [True, False, False] and not step.failed.any()
     assert env.age.tolist() == [0, 1, 1] and env.frame[1:].tolist() == [4, 11]
     assert not torch.equal(step.obs[0], step.final_obs[0])
     assert torch.equal(step.obs[1:], step.final_obs[1:])

@@ -33,7 +33,7 @@ def test_single_env_steps_to_the_end_and_wraps(make_env):
         assert isinstance(reward, float) and type(terminated) is bool and type(truncated) is bool
         if terminated or truncated:
             break
-    assert truncated and not terminated and "episode" in info
+    assert terminated and not truncated and "episode" in info
     env.close()
 
 

@@ -19,7 +19,8 @@ from poise.spatial import heading_quat
 class EnvStep(NamedTuple):
     """One control step; see `poise.learn.protocols.Step` for what the learner reads in it.
 
-    obs, final_obs `(N, O)`; reward `(N,)`; terminated, truncated `(N,)` bool; log: means by name.
+    obs, final_obs `(N, O)`; reward `(N,)`; terminated (failed, or the clip was done to its end),
+    truncated (time-out), failed `(N,)` bool; log: means by name.
     """
 
     obs: Tensor
@@ -28,6 +29,7 @@ class EnvStep(NamedTuple):
     truncated: Tensor
     final_obs: Tensor
     log: dict[str, float]
+    failed: Tensor
 
 
 @dataclass(frozen=True)
@@ -154,18 +156,22 @@ class ImitationEnv:
             reward += term.weight * value
             if term.imitation:
                 self.imitation += term.weight * value
-        terminated = torch.zeros(self.num_envs, dtype=torch.bool)
+        failed = torch.zeros(self.num_envs, dtype=torch.bool)
         for done in self.task.dones:
-            terminated |= done.fn(view, **done.params)
-        over = (self.frame >= self.reference.length[self.clip] - 1) & ~self.reference.cyclic[self.clip]
-        truncated = (over | (self.age >= self.task.horizon)) & ~terminated
+            failed |= done.fn(view, **done.params)
+        # A clip that is done to its end is a finished task, whose remaining return is known to be
+        # zero; the phase in the observation tells the critic when. To bootstrap there would rest on
+        # a state whose value is never learned, and the policy comes to exploit it.
+        last = self.frame >= self.reference.length[self.clip] - 1
+        terminated = failed | (last & ~self.reference.cyclic[self.clip])
+        truncated = (self.age >= self.task.horizon) & ~terminated
         obs = final = self._observe(view)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
             if len(ids):
                 self._restart(ids)
                 obs = self._observe()
-        return EnvStep(obs, reward, terminated, truncated, final, self._log())
+        return EnvStep(obs, reward, terminated, truncated, final, self._log(), failed)
 
     def _log(self) -> dict[str, float]:
         log = {f"reward/{name}": float(value.mean()) for name, value in self.terms.items()}

@@ -19,16 +19,18 @@ class Step(NamedTuple):
     reward: Tensor
     """`(N,)` float32, reward of the step taken."""
     terminated: Tensor
-    """`(N,)` bool, the episode ended by failure: the value of what follows is 0."""
+    """`(N,)` bool, the task ended there, failed or finished: nothing follows, its value is 0."""
     truncated: Tensor
-    """`(N,)` bool, it ended by time-out or by the clip's end: the value of `final_obs` is
-    bootstrapped. Where both are set, `terminated` decides."""
+    """`(N,)` bool, it was cut by a time-out: the value of `final_obs` is bootstrapped. Where both
+    are set, `terminated` decides."""
     final_obs: Tensor
     """`(N, O)` float32, observation of the last state before the automatic reset; rows whose
     episode goes on may hold anything finite, such as `obs`."""
     log: dict[str, float]
     """Means over this step for the log (reward terms, errors, help), cheap to make. Keys keep
     their names all through a run; one that carries a reward term helps to name a faulty term."""
+    failed: Tensor | None = None
+    """`(N,)` bool, which of the terminated episodes failed, for the statistics; None: all."""
 
 
 class VecEnv(Protocol):

@@ -57,7 +57,7 @@ class Episodes:
         self.finished_length = self.finished_total = self.failures = 0.0
         self.finished = 0
 
-    def count(self, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
+    def count(self, reward: Tensor, terminated: Tensor, truncated: Tensor, failed: Tensor) -> None:
         """Adds one step of every row, `(N,)` each."""
         self.length += 1
         self.total += reward
@@ -67,7 +67,7 @@ class Episodes:
             self.finished += ended
             self.finished_length += float(self.length[done].sum())
             self.finished_total += float(self.total[done].sum())
-            self.failures += float(terminated.sum())
+            self.failures += float(failed.sum())
             self.length[done] = 0
             self.total[done] = 0.0
 
@@ -109,7 +109,8 @@ def collect(
             check_finite("final observation of a timed-out episode", reached)
             cut_at.append(rows + t * num_envs)
             cut_obs.append(norm(reached))
-        episodes.count(step.reward, step.terminated, step.truncated)
+        failed = step.terminated if step.failed is None else step.failed
+        episodes.count(step.reward, step.terminated, step.truncated, failed)
         for name, value in step.log.items():
             terms[name] = terms.get(name, 0.0) + value / horizon
         obs = step.obs
