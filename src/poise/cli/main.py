@@ -22,6 +22,7 @@ VERBS = {
     "body": "the physical body that is made for a clip: masses, hinges, gains",
     "imitate": "give one clip a body: train, simulate, score, report",
     "train": "train a recipe on one clip or a library, and no more",
+    "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
     "doctor": "what works on this machine, and what to do about the rest",
