@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.learn.config import PPOConfig
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
+from poise.learn.parallel import ALONE, Comm, average_gradients, moments, noise_name, shared_statistics
 from poise.learn.policy import PolicyBundle
 from poise.learn.rollout import Rollout
 from poise.learn.state import (
@@ -64,6 +65,7 @@ class PPO:
         config: the settings.
         seed: seeds the first weights, the action noise and the shuffling, each apart.
         device: where everything lives.
+        comm: the processes that learn together; the config's `minibatch` counts all of them.
     """
 
     def __init__(
@@ -73,8 +75,9 @@ class PPO:
         config: PPOConfig,
         seed: int,
         device: torch.device | str = "cpu",
+        comm: Comm = ALONE,
     ):
-        self.config = config
+        self.config, self.comm = config, comm
         init = make_generator(seed, "weights")
         self.actor = PolicyBundle.make(
             num_obs,
@@ -90,7 +93,7 @@ class PPO:
         self.return_norm = RunningNorm(1, clip=math.inf).to(device)
         self.actor.norm.to(device)
         self.actor.policy.to(device)
-        self.noise = make_generator(seed, "noise", device)
+        self.noise = make_generator(seed, noise_name(comm), device)
         self.shuffle = make_generator(seed, "shuffle", device)
         self._policy_params = [p for p in self.actor.policy.parameters() if p.requires_grad]
         self._value_params = list(self.critic.parameters())
@@ -139,7 +142,7 @@ class PPO:
         before = self.state()
         try:
             self.estimate(rollout)
-            explained = _explained_variance(rollout.returns, rollout.value)
+            explained = _explained_variance(self.comm, rollout.returns, rollout.value)
             if self.config.normalise_returns:
                 self._rescale_critic(rollout.returns)
             sums, kl = self._fit(rollout, train_policy)
@@ -164,12 +167,13 @@ class PPO:
         config, kl = self.config, 0.0
         obs = rollout.obs[:-1].flatten(0, 1)
         advantage = rollout.advantage.flatten()
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        mean, std = moments(self.comm, advantage)
+        advantage = (advantage - mean) / (std + 1e-8)
         target = self.return_norm(rollout.returns.view(-1, 1))
         action, mean_0 = rollout.action.flatten(0, 1), rollout.mean.flatten(0, 1)
         log_prob = rollout.log_prob.flatten()
         old_log_std = self.actor.policy.log_std.detach().clone()
-        parts = max(1, round(rollout.samples / config.minibatch))
+        parts = max(1, round(rollout.samples * self.comm.size / config.minibatch))
         means: list[dict[str, float]] = []
         for _ in range(config.epochs):
             order = torch.randperm(rollout.samples, generator=self.shuffle, device=obs.device)
@@ -191,11 +195,12 @@ class PPO:
                 norm = self._step(loss, train_policy)
                 sums += torch.stack([terms[0], value_loss.detach(), terms[1], terms[2], norm])
             # The only wait for the numbers, once per epoch.
-            mean: dict[str, float] = dict(zip(_SUMS, (sums / parts).tolist(), strict=True))
-            self._check(mean)
-            means.append(mean)
+            sums = self.comm.sum_(sums) / (parts * self.comm.size)
+            epoch: dict[str, float] = dict(zip(_SUMS, sums.tolist(), strict=True))
+            self._check(epoch)
+            means.append(epoch)
             if train_policy:
-                kl = mean["kl"]
+                kl = epoch["kl"]
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
         return {name: sum(m[name] for m in means) / len(means) for name in _SUMS}, kl
 
@@ -228,6 +233,7 @@ class PPO:
         """One Adam step; returns the policy's gradient norm before clipping."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        average_gradients(self.comm, (*self._policy_params, *self._value_params))
         config, norm = self.config, loss.new_zeros(())
         if train_policy:
             limit = math.inf if config.policy_grad_norm is None else config.policy_grad_norm
@@ -243,8 +249,9 @@ class PPO:
         """Updates the scale of the returns and leaves what the critic predicts unchanged."""
         norm, last = self.return_norm, self.critic.last
         first, (mean, std) = float(norm.count) == 0, (norm.shift.clone(), norm.std.clone())
-        norm.window = RETURN_WINDOW * returns.numel()
-        norm.observe(returns.reshape(-1, 1))
+        norm.window = RETURN_WINDOW * returns.numel() * self.comm.size
+        with shared_statistics(self.comm, norm):
+            norm.observe(returns.reshape(-1, 1))
         norm.freeze()
         if not first:
             # std' (w' h + b') + mean' = std (w h + b) + mean
@@ -304,6 +311,6 @@ class PPO:
         self.shuffle.set_state(take(state, "generator/shuffle").cpu())
 
 
-def _explained_variance(returns: Tensor, value: Tensor) -> float:
-    spread = float(returns.var())
-    return 1 - float((returns - value).var()) / spread if spread > 0 else 0.0
+def _explained_variance(comm: Comm, returns: Tensor, value: Tensor) -> float:
+    spread = float(moments(comm, returns)[1])
+    return 1 - (float(moments(comm, returns - value)[1]) / spread) ** 2 if spread > 0 else 0.0

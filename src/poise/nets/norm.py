@@ -42,8 +42,12 @@ class RunningNorm(nn.Module):
     def observe(self, x: Tensor) -> None:
         """Merges the samples `x (..., size)` into the statistics (Chan et al. 1979)."""
         x = x.reshape(-1, x.shape[-1]).double()
-        n_b, mean_b = float(len(x)), x.mean(0)
-        m2_b = ((x - mean_b) ** 2).sum(0)
+        mean_b = x.mean(0)
+        self.merge(float(len(x)), mean_b, ((x - mean_b) ** 2).sum(0))
+
+    @torch.no_grad()
+    def merge(self, n_b: float, mean_b: Tensor, m2_b: Tensor) -> None:
+        """Merges `n_b` samples of mean `mean_b` and summed squared deviation `m2_b`, `(size)` each."""
         # n = n_a + n_b;  d = mean_b - mean_a
         n_a = self.count
         n = n_a + n_b
