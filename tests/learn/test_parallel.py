@@ -51,9 +51,10 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_two_processes_equal_one(two: Path, tmp_path: Path) -> None:
+def test_two_processes_equal_one(two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = Trainer(TwinEnv(32, 3), TOY, seed=3, character="point")
-    twin_draws(one.ppo.actor.policy, (make_generator(3, "noise"), make_generator(3, "noise 1")))
+    noises = (make_generator(3, "noise"), make_generator(3, "noise 1"))
+    twin_draws(one.ppo.actor.policy, monkeypatch, noises)
     run(one, Until(iterations=5), tmp_path, tensorboard=False)
     a, meta = load_checkpoint(two / LATEST)
     b, _ = load_checkpoint(tmp_path / LATEST)
@@ -184,8 +185,8 @@ def test_merging_statistics_equals_observing_all() -> None:
 
 def test_more_samples_per_minibatch_are_counted_over_all(two: Path) -> None:
     """With the whole batch as minibatch one Adam step is taken per epoch, in one process or two."""
-    steps = load_checkpoint(two / LATEST)[0]["adam/0/step"]
+    steps = load_checkpoint(two / LATEST)[0]["adam/policy/0/step"]
     alone = trainer(config=replace(TOY))
     for _ in range(5):
         alone.iterate()
-    assert float(steps) == float(alone.ppo.state()["adam/0/step"]) == 5 * TOY.epochs
+    assert float(steps) == float(alone.ppo.state()["adam/policy/0/step"]) == 5 * TOY.epochs

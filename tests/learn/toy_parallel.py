@@ -6,10 +6,12 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor
 from toy_point_env import PointEnv
 
+import poise.learn.rollout
 from poise.errors import PoiseError
 from poise.learn import PPOConfig, Step, Trainer, Until, run
 from poise.learn.parallel import ALONE, Comm, joined, rank_seed
@@ -17,6 +19,7 @@ from poise.nets import GaussianPolicy
 
 torch.set_num_threads(1)
 TOY = PPOConfig(
+    products="float32",
     std=0.3,
     horizon=8,
     epochs=2,
@@ -47,15 +50,22 @@ class TwinEnv(PointEnv):
         return Step(*(torch.cat([x, y]) for x, y in zip(a[:5], b[:5], strict=True)), log)
 
 
-def twin_draws(policy: GaussianPolicy, noises: tuple[torch.Generator, torch.Generator]) -> None:
-    """Makes a policy draw its noise for each half of the rows as a process of its own would."""
+def twin_draws(
+    policy: GaussianPolicy, patch: pytest.MonkeyPatch, noises: tuple[torch.Generator, torch.Generator]
+) -> None:
+    """Makes a trainer draw its noise for each half of the rows as a process of its own would."""
     sample = policy.sample
 
     def halves(obs: Tensor, _: object) -> tuple[Tensor, ...]:
         parts = [sample(x, n) for x, n in zip(obs.chunk(2), noises, strict=True)]
         return tuple(torch.cat(x) for x in zip(*parts, strict=True))
 
-    policy.sample = halves  # type: ignore[method-assign]
+    def normal(out: Tensor, _: torch.Generator) -> None:
+        for half, n in zip(out.chunk(2, 1), noises, strict=True):
+            half.copy_(torch.randn(half.shape, generator=n))
+
+    patch.setattr(policy, "sample", halves)
+    patch.setattr(poise.learn.rollout, "standard_normal", normal)
 
 
 def trainer(comm: Comm = ALONE, config: PPOConfig = TOY, seed: int = 3, bad_rank: int = -1) -> Trainer:

@@ -25,6 +25,7 @@ VERBS = {
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
+    "bench": "how fast the engine is against its limit, and whether its physics is true",
     "doctor": "what works on this machine, and what to do about the rest",
 }
 _FIRST = (

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,8 +93,8 @@ class Trainer:
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
         warm_start: a policy whose weights and observation statistics to start from; the action
             noise stays the config's.
-        update_threads: torch's threads during the update, when the environment's own threads rest;
-            0 leaves torch as it is. Another number may change the last digits.
+        update_threads: with more than one, policy and critic are trained side by side, while the
+            environment's own threads rest; the numbers are the same.
         comm: the processes that train together, each with a trainer and environments of its own but
             with the same seed, config and number of environments.
     """
@@ -108,7 +107,7 @@ class Trainer:
         character: str = "",
         metadata: Mapping[str, Any] | None = None,
         warm_start: PolicyBundle | None = None,
-        update_threads: int = 0,
+        update_threads: int = 1,
         comm: Comm = ALONE,
     ):
         self.env, self.config, self.seed = env, config or PPOConfig(), seed
@@ -142,8 +141,8 @@ class Trainer:
                 self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise
             )
         collected = time.perf_counter()
-        with _torch_threads(self.update_threads):
-            update = ppo.update(rollout, train_policy=self.iteration >= self.config.critic_warmup)
+        train_policy = self.iteration >= self.config.critic_warmup
+        update = ppo.update(rollout, train_policy, self.update_threads)
         done = time.perf_counter()
         self.iteration += 1
         self.samples += rollout.samples * self.comm.size
@@ -274,16 +273,3 @@ class Trainer:
         )
         self.load_state(tensors)
         return meta
-
-
-@contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    """Torch with `count` threads inside the block, as before outside; 0 changes nothing."""
-    before = torch.get_num_threads()
-    if count and count != before:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        if count and count != before:
-            torch.set_num_threads(before)

@@ -78,6 +78,6 @@ class Imitation:
             self.config.seed,
             self.humanoid.identity,
             metadata=metadata,
-            update_threads=min(cores, 4),
+            update_threads=cores,
             comm=comm,
         )
