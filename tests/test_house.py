@@ -14,7 +14,7 @@ PACKAGE = ROOT / "src" / "poise"
 LONGEST_FILE = 400
 
 _MACHINE = tuple(
-    rf"(?<![\w.$}}>)~]){path}" for path in ("/work/", "/root/", "/home/[a-z]", "/tmp/", "/opt/")
+    rf"(?<![\w.$}}>)~])/{path}" for path in ("work/", "root/", "home/[a-z]", "tmp/", "opt/")
 )
 _HOSTS = ("pypi\\.org", "pythonhosted", "npmjs", "download\\.pytorch", "anaconda\\.org", "index-url")
 _UNFINISHED = (r"\bTODO\b", r"\bFIXME\b", r"\bXXX\b", "NotImplementedError")
