@@ -26,6 +26,8 @@ class Options:
     """Print JSON alone: what score.json holds."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
+    help_limit: Annotated[float | None, arg(metavar="NEWTONS", help_behavior_hint="")] = None
+    """The help dial: the most residual force, from 0; by default what training has left of it."""
 
 
 def run(options: Options, argv: Sequence[str]) -> int:
@@ -36,7 +38,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
     with working("simulating every start frame"):
         imitation = reopen(folder)
         policy, meta = trained_policy(folder, imitation)
-        card = evaluate(imitation, policy, meta, options.rule).card
+        card = evaluate(imitation, policy, meta, options.rule, options.help_limit).card
     if options.json:
         say_json(card.to_dict())
     else:

@@ -37,14 +37,19 @@ class Imitation:
         auto_reset: bool = True,
         threads: int = 0,
         dumps: Path | None = None,
+        help_scale: float = 1.0,
     ) -> ImitationEnv:
-        """An environment of this task; without `auto_reset` for evaluation from given frames."""
+        """An environment of this task; without `auto_reset` for evaluation from given frames.
+
+        help_scale: what is left of the residual force's limits.
+        """
         backend = CpuBackend(self.humanoid.model, num_envs or self.config.num_envs, threads)
         seed = int(self.config.seed if seed is None else seed)
         guard = NanGuard(backend, dumps, seed=seed)
         task = replace(self.task, auto_reset=auto_reset)
         env = ImitationEnv(self.reference, backend, task, self.config.sim.substeps, seed, guard=guard)
         guard.where = env.where
+        env.help.set(help_scale)
         return env
 
     def ppo(self) -> PPOConfig:
