@@ -12,12 +12,12 @@ import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
+from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.cycle import Cycle, join_cycle
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground
 from poise.motion import Clip, ClipLibrary, resample
-from poise.motion.repair import Spike, remove_spikes, spike_sentence
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 
 #: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
@@ -30,15 +30,15 @@ GIMBAL = 1.2
 class FitReport:
     """What was measured and changed so that one body can do the motion.
 
-    names: the clips. spikes: impossible turns that were interpolated, per clip. cycles: how the ends of
-    cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance per clip
-    between its joints and the humanoid's after conversion (turns that a chain cannot make), before a
-    cycle was closed. widened: hinges whose range had to grow, with the growth in degrees. excluded:
-    body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
+    names: the clips. clean: flips and impossible speeds that were repaired, per clip. cycles: how the
+    ends of cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance
+    per clip between its joints and the humanoid's after conversion (turns that a chain cannot make),
+    before a cycle was closed. widened: hinges whose range had to grow, with the growth in degrees.
+    excluded: body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
     """
 
     names: tuple[str, ...]
-    spikes: tuple[tuple[Spike, ...], ...]
+    clean: tuple[CleanReport, ...]
     cycles: tuple[Cycle | None, ...]
     ground: tuple[GroundFit, ...]
     joint_error_mm: tuple[float, ...]
@@ -54,10 +54,9 @@ class FitReport:
     def sentences(self) -> list[str]:
         """The report in words, one line each."""
         out = []
-        columns = (self.names, self.spikes, self.cycles, self.ground, self.joint_error_mm)
-        for name, spikes, cycle, ground, error in zip(*columns, strict=True):
-            if spikes:
-                out.append(f"{name}: {spike_sentence(spikes)}")
+        columns = (self.names, self.clean, self.cycles, self.ground, self.joint_error_mm)
+        for name, clean, cycle, ground, error in zip(*columns, strict=True):
+            out += [f"{name}: {sentence}" for sentence in clean.sentences()]
             if cycle is not None:
                 out.append(f"{name}: {cycle.sentence()}")
             out.append(f"{name}: {ground.sentence()}")
@@ -90,7 +89,7 @@ def fit_humanoid(
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
-    repaired = [remove_spikes(c) for c in library]
+    repaired = [clean_clip(c) for c in library]
     clips = [resample(c, rate_hz) for c, _ in repaired]
     table = generate_table(clips[0].skeleton, config, clips)
     table = _choose_orders(table, clips)
@@ -115,7 +114,7 @@ def fit_humanoid(
         humanoid = make_humanoid(clips[0].skeleton, table)
     report = FitReport(
         library.names,
-        tuple(spikes for _, spikes in repaired),
+        tuple(found for _, found in repaired),
         cycles,
         tuple(f for _, f in fits),
         tuple(error),
