@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from poise.body import Anatomy, find_anatomy
-from poise.kin.flips import Flip, unflip
+from poise.kin.flips import Flip, out_of_reach, unflip
 from poise.kin.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds
 from poise.motion import Clip
 
@@ -16,14 +16,16 @@ from poise.motion import Clip
 class CleanReport:
     """What was repaired in one clip; empty for a clean one. Frames are the file's.
 
-    flips: feet and hands that were turned back. speeds: turns faster than a human joint.
+    flips: feet and hands that were turned back. speeds: turns faster than a human joint. left: (joint,
+    frames) of feet and hands that are still where none reaches, since no repair was sure enough.
     """
 
     flips: tuple[Flip, ...] = ()
     speeds: tuple[SpeedRepair, ...] = ()
+    left: tuple[tuple[str, int], ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.flips or self.speeds)
+        return bool(self.flips or self.speeds or self.left)
 
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
@@ -42,6 +44,9 @@ class CleanReport:
                 parts.append(f"{joint} {_frames(mine)} ({before:.0f} rad/s, now {after:.0f})")
             more = f" and {len(groups) - 4} more joints" if len(groups) > 4 else ""
             out.append(f"Faster than a human joint, so interpolated: {', '.join(parts)}{more}.")
+        if self.left:
+            parts = [f"{joint} in {frames} frames" for joint, frames in self.left]
+            out.append(f"Left where no joint reaches: {', '.join(parts)}.")
         return out
 
     def to_dict(self) -> dict[str, Any]:
@@ -67,4 +72,4 @@ def clean_clip(clip: Clip, anatomy: Anatomy | None = None) -> tuple[Clip, CleanR
     anatomy = anatomy or find_anatomy(clip.skeleton)
     turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
-    return slowed, CleanReport(flips, speeds)
+    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy))

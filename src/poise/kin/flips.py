@@ -89,6 +89,18 @@ def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip
     return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
 
 
+def out_of_reach(clip: Clip, anatomy: Anatomy) -> tuple[tuple[str, int], ...]:
+    """(joint, frames) of feet and hands that are where none reaches."""
+    neutral, _ = neutral_pose(clip, anatomy)
+    out = []
+    for part in anatomy.parts:
+        if part.kind in UNREACHABLE:
+            away = _from(neutral[part.joint], torch.tensor(clip.rot[:, part.joint]))
+            frames = int((away > UNREACHABLE[part.kind]).sum())
+            out += [(clip.skeleton.names[part.joint], frames)] if frames else []
+    return tuple(out)
+
+
 def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
     """`(J, 4)` wxyz local rotations from which reach is measured, and whether they are the rest pose.
 

@@ -27,6 +27,8 @@ GAP_S, MARGIN_S = 0.05, 0.017
 LONGEST_S, END_S = 0.3, 0.1
 #: Widest deviation (s) of the Gaussian that smooths what cannot be interpolated.
 WIDEST_S = 0.1
+#: A smoothed stretch is preferred where it changes this much less than an interpolated one.
+CLEARLY_LESS = 0.7
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
 
     Steps above the limit are gathered into spells. A spell is replaced by a slerp over the shortest
     stretch around it whose ends can be joined at half the limit; at an end of the clip the joint is
-    held. Where no stretch of `LONGEST_S` does, the joint is smoothed there, as little as it takes.
+    held. Where no stretch of `LONGEST_S` does, or where it would lead clearly farther from the file
+    (a real turn, only too fast), the joint is smoothed there, as little as it takes.
     """
     rot = torch.tensor(clip.rot)
     found: list[SpeedRepair] = []
@@ -81,16 +84,9 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
             continue
         for first, last in spells(steps.numpy() > limit, round(GAP_S * clip.fps)):
             old = track.clone()
-            stretch = _shortest(track, first, last + 1, limit, clip.fps)
-            if stretch is None:
-                way, (a, b) = "smoothed", _smooth(track, first, last + 1, limit, clip.fps)
-            else:
-                way, (a, b) = "interpolated", stretch
-                _join(track, a, b)
-                if a < 0 or b >= len(track):
-                    way = "held"
+            way, (a, b) = _repair(track, first, last + 1, limit, clip.fps)
             lo, hi = max(a + 1, 0), min(b - 1, len(track) - 1)
-            change = quat_angle(quat_mul(quat_conj(old), track))[lo : hi + 1].max()
+            change = _change(old, track)
             here = slice(max(lo - 1, 0), hi + 1)
             rot[lo : hi + 1, j] = normalize(track[lo : hi + 1])
             before, after = float(steps[first : last + 1].max()), float(_steps(track)[here].max())
@@ -107,12 +103,39 @@ def _steps(track: Tensor) -> Tensor:
     return quat_angle(quat_mul(quat_conj(track[:-1]), track[1:]))
 
 
+def _change(old: Tensor, new: Tensor) -> float:
+    return float(quat_angle(quat_mul(quat_conj(old), new)).max())
+
+
+def _repair(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[str, tuple[int, int]]:
+    """Repairs frames a to b in place; how, and the unchanged frames on both sides."""
+    old, smooth = track.clone(), track.clone()
+    stretch = _shortest(track, a, b, limit, fps)
+    if stretch is not None:
+        _join(track, *stretch)
+        if stretch[0] < 0 or stretch[1] >= len(track):
+            return "held", stretch
+        if stretch[1] - stretch[0] <= b - a + 2 * _margin(fps):
+            return "interpolated", stretch
+    sides = _smooth(smooth, a, b, limit, fps)
+    calm = float(_steps(smooth)[max(sides[0], 0) : sides[1]].max()) * fps <= limit
+    if stretch is None or (calm and _change(old, smooth) < CLEARLY_LESS * _change(old, track)):
+        track[:] = smooth
+        return "smoothed", sides
+    return "interpolated", stretch
+
+
+def _margin(fps: float) -> int:
+    """Frames beside the damage that are not trusted either."""
+    return max(1, round(MARGIN_S * fps)) - 1
+
+
 def _shortest(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[int, int] | None:
     """The kept frames next to the shortest stretch around frames a to b that can be joined.
 
     -1 or `len(track)` where the stretch reaches an end of the clip.
     """
-    frames, margin = len(track), max(1, round(MARGIN_S * fps)) - 1
+    frames, margin = len(track), _margin(fps)
     a, b = a - margin, b + margin
     while b - a <= max(2, round(LONGEST_S * fps)):
         if a <= 0 or b >= frames - 1:
