@@ -1,6 +1,6 @@
 """Kinematics of a humanoid: clips cleaned, to generalized coordinates and back, cycles, ground."""
 
-from poise.kin.clean import CleanReport, clean_clip
+from poise.kin.clean import CleanReport, Faults, clean_clip, find_faults
 from poise.kin.contacts import contact_labels
 from poise.kin.coords import clip_to_qpos, qpos_to_clip
 from poise.kin.cycle import Cycle, close_cycle, cycle_step, cycle_velocity
@@ -13,6 +13,7 @@ from poise.kin.velocity import qpos_velocity
 __all__ = [
     "CleanReport",
     "Cycle",
+    "Faults",
     "FitReport",
     "GroundFit",
     "Kinematics",
@@ -24,6 +25,7 @@ __all__ = [
     "contact_labels",
     "cycle_step",
     "cycle_velocity",
+    "find_faults",
     "fit_ground",
     "fit_humanoid",
     "lowest_height",

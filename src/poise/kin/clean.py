@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from poise.body import Anatomy, find_anatomy
+from poise.body import Anatomy, find_anatomy, generate_table
+from poise.errors import PoiseError
+from poise.kin.flight import clip_flights, likely_rate, rate_sentence
 from poise.kin.flips import Flip, out_of_reach, unflip
 from poise.kin.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds
 from poise.motion import Clip
@@ -73,3 +75,24 @@ def clean_clip(clip: Clip, anatomy: Anatomy | None = None) -> tuple[Clip, CleanR
     turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy))
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What a clip's fit will repair or doubt: in words, and as numbers (`CleanReport.to_dict` and
+    `likely_fps`, the frame rate that gravity vouches for where it is far from the file's)."""
+
+    sentences: tuple[str, ...]
+    numbers: dict[str, Any]
+
+
+def find_faults(clip: Clip) -> Faults | None:
+    """The faults of a clip, before a body is fitted; None where its joints are no human's."""
+    try:
+        cleaned, report = clean_clip(clip)
+        flights = clip_flights(cleaned, generate_table(cleaned.skeleton, None, [cleaned]))
+    except PoiseError:
+        return None
+    doubt = rate_sentence(flights, clip.fps)
+    numbers = {**report.to_dict(), "likely_fps": likely_rate(flights, clip.fps)}
+    return Faults((*([doubt] if doubt else []), *report.sentences()), numbers)
