@@ -15,11 +15,11 @@ from poise.kin import Kinematics, clip_to_qpos, fit_ground, fit_humanoid
 from poise.kin.flight import (
     Flight,
     centre_of_mass,
-    clip_flights,
     find_flights,
     likely_rate,
     rate_sentence,
 )
+from poise.kin.ground import clip_flights
 from poise.motion import Clip, read_clip
 from toy_human import human, swing
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from poise.body import find_anatomy
-from poise.kin import clean_clip
+from poise.body import find_anatomy, generate_table
+from poise.kin import clean_clip, clip_to_qpos, fit_humanoid, qpos_to_clip
 from poise.kin.flips import neutral_pose, spells, unflip
 from poise.kin.speeds import TRUNK_SPEED
 from poise.motion import Clip, read_clip
@@ -126,6 +126,30 @@ def test_spells():
     bad = np.array([0, 1, 1, 0, 1, 0, 0, 0, 1], dtype=bool)
     assert spells(bad, 1) == [(1, 4), (8, 8)] and spells(bad, 0) == [(1, 2), (4, 4), (8, 8)]
     assert spells(~bad & False, 1) == []
+
+
+def test_planted_branch_flips_of_the_hinges_vanish(clip):
+    table = generate_table(human())
+    qpos = clip_to_qpos(clip, table)
+    other, start = qpos.copy(), 7
+    for row in table.rows:
+        if len(row.order) == 3:
+            # The same rotation in its other Euler branch, and a whole turn on top.
+            a = other[20:40, start : start + 3]
+            a[:] = np.stack((a[:, 0] + math.pi, math.pi - a[:, 1], a[:, 2] - math.pi), 1)
+        start += len(row.order)
+    assert np.abs(np.diff(other[:, 7:], axis=0)).max() > 3.0
+    broken = qpos_to_clip(other, table, clip.skeleton, clip.fps, clip)
+    _, (mended,), report = fit_humanoid(broken, None, 60.0)
+    np.testing.assert_allclose(mended, fit_humanoid(clip, None, 60.0)[1][0], atol=1e-6)
+    assert not report.clean[0] and np.abs(np.diff(mended[:, 7:], axis=0)).max() < 0.1
+
+
+@pytest.mark.parametrize(("take", "foot", "least"), [("01", "rFoot", 90), ("02", "lFoot", 60)])
+def test_flipped_feet_of_another_skeleton_are_turned_back(data_dir, take, foot, least):
+    _, report = clean_clip(read_clip(data_dir / f"cmu_bvh/acrnn_salsa/{take}.bvh"))
+    assert sum(f.frames for f in report.flips if f.joint == foot) >= least
+    assert all(f.after_deg < 60 for f in report.flips) and not report.left
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ from typing import Any
 
 from poise.body import Anatomy, find_anatomy, generate_table
 from poise.errors import PoiseError
-from poise.kin.flight import clip_flights, likely_rate, rate_sentence
+from poise.kin.flight import likely_rate, rate_sentence
 from poise.kin.flips import Flip, out_of_reach, unflip
+from poise.kin.ground import clip_flights
 from poise.kin.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds
 from poise.motion import Clip
 

@@ -17,8 +17,8 @@ from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.cycle import Cycle, join_cycle
 from poise.kin.fk import Kinematics
-from poise.kin.flight import Flight, clear_fall, clip_flights, likely_rate, rate_sentence
-from poise.kin.ground import GroundFit, fit_ground, lowest_height
+from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
+from poise.kin.ground import GroundFit, clip_flights, fit_ground, lowest_height
 from poise.motion import Clip, ClipLibrary, resample
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 

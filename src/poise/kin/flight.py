@@ -12,7 +12,6 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kin.flips import spells
-from poise.motion import Clip
 from poise.spatial import quat_rotate
 
 GRAVITY = 9.81
@@ -70,16 +69,6 @@ def find_flights(low: np.ndarray, height: np.ndarray, fps: float) -> tuple[Fligh
         if fit[2] >= GRAVITY / 2 and rms <= PARABOLA_M:
             found.append(Flight(start, stop, float(fit[2]), rms))
     return tuple(found)
-
-
-def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
-    """The flights of a clip at its own frame rate."""
-    from poise.kin.ground import lowest_height
-
-    joints = [r.joint for r in table.rows]
-    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
-    low = lowest_height(table, pos, quat).min(-1).values.numpy()
-    return find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), clip.fps)
 
 
 def clear_fall(flights: Sequence[Flight]) -> float | None:

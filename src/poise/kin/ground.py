@@ -12,6 +12,7 @@ from poise.body import BodyTable
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, centre_of_mass, find_flights
 from poise.kin.flips import spells
+from poise.motion import Clip
 from poise.spatial import quat_rotate
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
@@ -75,6 +76,14 @@ def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
         heights = [_lowest(g, pos[..., i, :], quat[..., i, :]) for g in row.geoms]
         out.append(torch.stack(heights, -1).min(-1).values)
     return torch.stack(out, -1)
+
+
+def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
+    """The flights of a clip at its own frame rate."""
+    joints = [r.joint for r in table.rows]
+    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
+    low = lowest_height(table, pos, quat).min(-1).values.numpy()
+    return find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), clip.fps)
 
 
 def _lowest(geom, pos: Tensor, quat: Tensor) -> Tensor:
