@@ -52,7 +52,6 @@ def test_the_state_goes_on_where_it_was(make_env):
         make_env(4, help_start=100.0, help_limit=0.0),
         make_env(4, help_start=100.0, help_limit=0.0),
     )
-    one.task = replace(one.task, help=None)
     one.help.schedule = two.help.schedule = SuccessHelp(factor=0.9, every=3)
     g = torch.Generator().manual_seed(0)
     one.reset()
