@@ -1,15 +1,20 @@
 """Control laws: what turns a state and an action into a `Drive`."""
 
 from poise.control.drive import Drive
+from poise.control.inverse import ContactRule, InverseDynamics, inverse_dynamics, step_midpoints
 from poise.control.pd import PDTargets, stable_pd_torque
 from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
 
 __all__ = [
+    "ContactRule",
     "Drive",
     "ExplicitResidual",
     "ImplicitResidual",
+    "InverseDynamics",
     "PDTargets",
     "Residual",
     "Wrench",
+    "inverse_dynamics",
     "stable_pd_torque",
+    "step_midpoints",
 ]

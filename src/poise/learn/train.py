@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,12 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
 from poise.learn.config import PPOConfig
-from poise.learn.policy import PolicyBundle
+from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import VecEnv
 from poise.learn.rollout import Episodes, Rollout, collect
 from poise.learn.state import State, load_module, prefixed, take, under
+from poise.learn.threads import torch_threads
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ class Trainer:
         character: identity of the body that is trained, such as a hash; a checkpoint of another
             one is refused.
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
-        warm_start: a policy whose weights and observation statistics to start from; the action
-            noise stays the config's.
+        warm_start: a policy whose weights and observation statistics to start from, or a `WarmStart`
+            that may bring a critic and counts what it cost; the action noise stays the config's.
         update_threads: torch's threads during the update, when the environment's own threads rest;
             0 leaves torch as it is. Another number may change the last digits.
     """
@@ -95,22 +95,22 @@ class Trainer:
         seed: int = 0,
         character: str = "",
         metadata: Mapping[str, Any] | None = None,
-        warm_start: PolicyBundle | None = None,
+        warm_start: PolicyBundle | WarmStart | None = None,
         update_threads: int = 0,
     ):
         self.env, self.config, self.seed = env, config or PPOConfig(), seed
         self.update_threads = update_threads
         self.character, self.metadata = character, dict(metadata or {})
         self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device)
-        if warm_start is not None:
-            load_module(self.ppo.actor.norm, prefixed("norm", warm_start.norm.state_dict()), "norm")
-            mean = prefixed("policy/mean", warm_start.policy.mean.state_dict())
-            load_module(self.ppo.actor.policy.mean, mean, "policy/mean")
+        start = WarmStart(warm_start) if isinstance(warm_start, PolicyBundle) else warm_start
+        if start is not None:
+            _take_over(self.ppo, start)
         self.rollout = Rollout(
             self.config.horizon, env.num_envs, env.num_obs, env.num_actions, torch.device(env.device)
         )
         self.episodes = Episodes(env.num_envs, torch.device(env.device))
-        self.iteration, self.samples, self.seconds = 0, 0, 0.0
+        self.iteration = 0
+        self.samples, self.seconds = (start.samples, start.seconds) if start else (0, 0.0)
         # Length, reward and failure share of the last episodes that ended.
         self._ended = (math.nan, math.nan, math.nan)
         self._obs: Tensor | None = None
@@ -128,7 +128,7 @@ class Trainer:
             self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise
         )
         collected = time.perf_counter()
-        with _torch_threads(self.update_threads):
+        with torch_threads(self.update_threads):
             update = ppo.update(rollout, train_policy=self.iteration >= self.config.critic_warmup)
         done = time.perf_counter()
         self.iteration += 1
@@ -240,14 +240,11 @@ class Trainer:
         return meta
 
 
-@contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    """Torch with `count` threads inside the block, as before outside; 0 changes nothing."""
-    before = torch.get_num_threads()
-    if count and count != before:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        if count and count != before:
-            torch.set_num_threads(before)
+def _take_over(ppo: PPO, start: WarmStart) -> None:
+    """Copies weights and statistics of a warm start into a fresh learner."""
+    norm, mean = start.policy.norm.state_dict(), start.policy.policy.mean.state_dict()
+    load_module(ppo.actor.norm, prefixed("norm", norm), "norm")
+    load_module(ppo.actor.policy.mean, prefixed("policy/mean", mean), "policy/mean")
+    if start.critic is not None:
+        load_module(ppo.critic, start.critic, "critic")
+        load_module(ppo.return_norm, start.critic, "return_norm")
