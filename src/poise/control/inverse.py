@@ -54,9 +54,8 @@ class InverseDynamics:
 
     def on_bodies(self, bodies: int) -> np.ndarray:
         """Net floor force on each of `bodies` rows, `(T, B, 3)` N."""
-        out = np.zeros((len(self.torque), bodies, 3))
-        np.add.at(out, (slice(None), self.contact_body), self.contact_force)
-        return out
+        member = self.contact_body[:, None] == np.arange(bodies)
+        return np.einsum("tpk,pb->tbk", self.contact_force, member)
 
 
 def step_midpoints(

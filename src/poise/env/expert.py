@@ -6,7 +6,7 @@ It needs no learning and follows most clips, so that a policy can start by imita
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -44,7 +44,7 @@ class ExpertConfig:
     turn_frequency: float = 7.0
     turn_damping: float = 0.2
     lead: float = 0.75
-    contacts: ContactRule = ContactRule()
+    contacts: ContactRule = field(default_factory=ContactRule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Plan:
 
 
 def make_plan(reference: Reference, contacts: ContactRule | None = None) -> Plan:
-    """Solves all steps of all clips; a clip's last frame, which no step leaves, repeats the one before."""
+    """Solves all steps of all clips; a last frame, which no step leaves, repeats the one before."""
     model, parts = reference.humanoid.model, []
     torque, force, turn = [], [], []
     for start, length in zip(reference.start.tolist(), reference.length.tolist(), strict=True):
@@ -113,7 +113,7 @@ class Expert:
         return joints if self._residual is None else torch.cat((joints, self._help(rows)), -1)
 
     def _joints(self, rows: Tensor) -> Tensor:
-        """Targets u = q_ref + tau / kp, with kp (u - q) inside the torque limits, as this env's action."""
+        """Targets u = q_ref + tau / kp, with kp (u - q) inside the torque limits, as actions."""
         env, reference = self.env, self.env.reference
         ahead = reference.rows(env.clip, env.frame + 1)
         now, then = reference.qpos[rows, 7:].float(), reference.qpos[ahead, 7:].float()

@@ -29,7 +29,7 @@ from poise.learn.threads import torch_threads
 class CloneConfig:
     """Settings of cloning; the defaults take half a minute on two cores with 512 environments."""
 
-    steps: int = 80
+    steps: int = 64
     """Control steps per environment and round."""
     rounds: int = 3
     """DAgger rounds after the teacher's own."""
@@ -38,9 +38,9 @@ class CloneConfig:
     noise: tuple[float, ...] = (0.0, 1.0, 2.0)
     """Exploration of the teacher's episodes in units of the policy's action noise; every
     environment keeps one of these levels through a round. The student explores with 1."""
-    epochs: tuple[int, int] = (12, 6)
+    epochs: tuple[int, int] = (8, 4)
     """Passes over all data after round 0 and after each later one."""
-    minibatch: int = 1024
+    minibatch: int = 2048
     lr: float = 1e-3
     """Adam's step size; it falls to a tenth over each round's fit."""
     critic_steps: int = 48

@@ -10,7 +10,7 @@ from typing import Any, cast
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.kin import FitReport
-from poise.learn import PPOConfig, Trainer, VecEnv
+from poise.learn import PPOConfig, Trainer, VecEnv, WarmStart
 from poise.motion import ClipLibrary
 from poise.sim import CpuBackend, NanGuard
 
@@ -54,16 +54,24 @@ class Imitation:
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
         return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
 
-    def trainer(self, threads: int = 0, dumps: Path | None = None, **metadata: Any) -> Trainer:
-        """A PPO trainer on a fresh environment."""
+    def trainer(
+        self,
+        threads: int = 0,
+        dumps: Path | None = None,
+        warm_start: WarmStart | None = None,
+        ppo: PPOConfig | None = None,
+        **metadata: Any,
+    ) -> Trainer:
+        """A PPO trainer on a fresh environment; `ppo` in place of this task's own settings."""
         env = self.env(threads=threads, dumps=dumps)
         cores = threads or len(os.sched_getaffinity(0))
         return Trainer(
             # An EnvStep has the fields of the learner's Step; neither room knows the other.
             cast(VecEnv, env),
-            self.ppo(),
+            ppo or self.ppo(),
             self.config.seed,
             self.humanoid.identity,
             metadata=metadata,
+            warm_start=warm_start,
             update_threads=min(cores, 4),
         )

@@ -36,6 +36,7 @@ from poise.learn import (
 )
 from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
+from poise.recipes.expert import Beginning, begin_training, some_starts
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
 from poise.sim import SimConfig
@@ -104,9 +105,10 @@ def train(
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     threads: int = 0,
     tensorboard: bool = True,
+    beginning: Beginning | None = None,
 ) -> RunResult:
-    """Trains, or goes on training, in `folder`; see `poise.learn.run`."""
-    trainer = imitation.trainer(threads=threads, dumps=folder / "dumps")
+    """Trains, or goes on training, in `folder`; see `poise.learn.run` and `recipes.expert`."""
+    trainer = begin_training(imitation, folder, threads, beginning)
     try:
         return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
     finally:
@@ -123,12 +125,19 @@ def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, di
 
 
 def evaluate(
-    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], rule: str = "phc"
+    imitation: Imitation,
+    policy: Policy,
+    meta: Mapping[str, Any],
+    rule: str = "phc",
+    most: int | None = None,
 ) -> Evaluation:
-    """Every start frame simulated to the end with the deterministic policy, and its score card."""
+    """Start frames simulated to the end with the deterministic policy, and the score card.
+
+    Every start frame, or at most `most`, evenly spread.
+    """
     config = imitation.config
     limit = 0.0 if config.method == "deepmimic" else config.help_limit
-    clip, start = start_frames(imitation.reference)
+    clip, start = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
     rollouts, recordings = run_episodes(
         lambda n: imitation.env(n, auto_reset=False), policy, clip, start, limit, limit
     )
