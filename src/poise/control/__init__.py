@@ -4,8 +4,10 @@ from poise.control.drive import Drive
 from poise.control.inverse import ContactRule, InverseDynamics, inverse_dynamics, step_midpoints
 from poise.control.pd import PDTargets, stable_pd_torque
 from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
+from poise.control.touch import ClearanceRule, clearance
 
 __all__ = [
+    "ClearanceRule",
     "ContactRule",
     "Drive",
     "ExplicitResidual",
@@ -14,6 +16,7 @@ __all__ = [
     "PDTargets",
     "Residual",
     "Wrench",
+    "clearance",
     "inverse_dynamics",
     "stable_pd_torque",
     "step_midpoints",

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from poise.control.touch import TouchPoints
 from poise.errors import PoiseError
 
 
@@ -110,7 +111,7 @@ def inverse_dynamics(
     model = copy.deepcopy(model)
     # Contact and limit forces of the simulator would be a second answer to the same question.
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    points, data = _Points(model), mujoco.MjData(model)
+    points, data = TouchPoints(model), mujoco.MjData(model)
     mu = points.friction if rule.friction is None else rule.friction
     out = InverseDynamics(
         torque=np.zeros((frames, model.nv - 6)),
@@ -169,45 +170,3 @@ def _contact_forces(
     share, n = np.zeros(4 * k), 4 * k
     mujoco.mju_boxQP(share, np.zeros(n * (n + 7)), None, hessian, -columns @ goal, np.zeros(n), None)
     return (share.reshape(k, 4) @ edges) * weight
-
-
-class _Points:
-    """The points at which a body can touch a level floor: corners of boxes, ends of capsules."""
-
-    def __init__(self, model: mujoco.MjModel):
-        bodies, centres, radii = [], [], []
-        kinds = mujoco.mjtGeom
-        for g in range(model.ngeom):
-            if model.geom_bodyid[g] == 0 or not (model.geom_contype[g] or model.geom_conaffinity[g]):
-                continue
-            size, kind = model.geom_size[g], model.geom_type[g]
-            turn = np.zeros(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[g])
-            if kind == kinds.mjGEOM_BOX:
-                signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, 8).T
-                local, radius = signs * size, 0.0
-            elif kind == kinds.mjGEOM_CAPSULE:
-                local, radius = np.array([[0, 0, -size[1]], [0, 0, size[1]]]), size[0]
-            elif kind == kinds.mjGEOM_SPHERE:
-                local, radius = np.zeros((1, 3)), size[0]
-            else:
-                continue
-            centres.append(model.geom_pos[g] + local @ turn.reshape(3, 3).T)
-            bodies += [model.geom_bodyid[g]] * len(local)
-            radii += [radius] * len(local)
-        self.body, self.radius = np.array(bodies, dtype=int), np.array(radii)
-        self.centre = np.concatenate(centres)
-        floor = model.geom_friction[model.geom_bodyid == 0, 0]
-        self.friction = float(max(floor.max(initial=0.0), model.geom_friction[:, 0].max()))
-
-    def place(self, data: mujoco.MjData) -> np.ndarray:
-        """Lowest point around each centre, `(P, 3)` m, world."""
-        turn = data.xmat[self.body].reshape(-1, 3, 3)
-        out = data.xpos[self.body] + np.einsum("pij,pj->pi", turn, self.centre)
-        out[:, 2] -= self.radius
-        return out
-
-    def velocity(self, data: mujoco.MjData, place: np.ndarray) -> np.ndarray:
-        """Velocity of the body at each point, `(P, 3)` m/s, world."""
-        spin, linear = data.cvel[self.body, :3], data.cvel[self.body, 3:]
-        return linear + np.cross(spin, place - data.subtree_com[1])

@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from poise.control import (
+    ClearanceRule,
     ContactRule,
     ExplicitResidual,
     ImplicitResidual,
     InverseDynamics,
+    clearance,
     inverse_dynamics,
     step_midpoints,
 )
@@ -36,15 +38,20 @@ class ExpertConfig:
     same about the root's axes with the body's moment of inertia.
     lead: where in a control step its joint torque is meant to hold, 0 its begin, 1 its end; MuJoCo's
     implicit stiffness acts late in it.
-    contacts: which points may carry weight in the inverse dynamics.
+    deadband_m, deadband_rad: root errors so small pull nothing: a body that stands on the floor need
+    not be pressed down to a reference whose soles lie a centimetre under it.
+    contacts: which points may carry weight in the inverse dynamics. clear: how swinging feet are lifted.
     """
 
     frequency: float = 7.0
     damping: float = 0.8
-    turn_frequency: float = 7.0
+    turn_frequency: float = 10.0
     turn_damping: float = 0.2
     lead: float = 0.75
+    deadband_m: float = 0.0
+    deadband_rad: float = 0.0
     contacts: ContactRule = field(default_factory=ContactRule)
+    clear: ClearanceRule = field(default_factory=ClearanceRule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,29 +59,34 @@ class Plan:
     """Inverse dynamics of every step of a reference; row r leads from frame r to the next.
 
     torque `(F, n)` N m per hinge; force_h `(F, 3)` N, root residual in the reference root's heading
-    frame at the step's begin; torque_b `(F, 3)` N m, in the root's axes; float32.
+    frame at the step's begin; torque_b `(F, 3)` N m, in the root's axes; lift `(F, n)` rad, added to the
+    frame's hinge angles so that swinging feet clear the floor; float32.
     parts: what was solved, clip by clip.
     """
 
     torque: Tensor
     force_h: Tensor
     torque_b: Tensor
+    lift: Tensor
     parts: tuple[InverseDynamics, ...]
 
 
-def make_plan(reference: Reference, contacts: ContactRule | None = None) -> Plan:
+def make_plan(reference: Reference, config: ExpertConfig | None = None) -> Plan:
     """Solves all steps of all clips; a last frame, which no step leaves, repeats the one before."""
+    config = config or ExpertConfig()
     model, parts = reference.humanoid.model, []
-    torque, force, turn = [], [], []
+    torque, force, turn, lift = [], [], [], []
     for start, length in zip(reference.start.tolist(), reference.length.tolist(), strict=True):
         rows = slice(start, start + length)
         qpos, qvel = reference.qpos[rows].numpy(), reference.qvel[rows].numpy()
-        part = inverse_dynamics(model, *step_midpoints(model, qpos, qvel, reference.rate_hz), contacts)
+        steps = step_midpoints(model, qpos, qvel, reference.rate_hz)
+        part = inverse_dynamics(model, *steps, config.contacts)
+        lift.append(torch.tensor(clearance(model, qpos, qvel, config.clear)).float())
         parts.append(part)
         for rows_, value in ((torque, part.torque), (force, part.root_force), (turn, part.root_torque)):
             rows_.append(torch.tensor(np.concatenate((value, value[-1:]))).float())
     force_h = quat_rotate_inv(heading_quat(reference.qpos[:, 3:7].float()), torch.cat(force))
-    return Plan(torch.cat(torque), force_h, torch.cat(turn), tuple(parts))
+    return Plan(torch.cat(torque), force_h, torch.cat(turn), torch.cat(lift), tuple(parts))
 
 
 class Expert:
@@ -88,7 +100,7 @@ class Expert:
 
     def __init__(self, env: ImitationEnv, config: ExpertConfig | None = None, plan: Plan | None = None):
         self.env, self.config = env, config or ExpertConfig()
-        self.plan = plan or make_plan(env.reference, self.config.contacts)
+        self.plan = plan or make_plan(env.reference, self.config)
         self._residual = env.task.residual
         if isinstance(self._residual, ExplicitResidual) and 0 not in self._residual.bodies:
             raise PoiseError("the expert needs a residual force on the root, body row 0")
@@ -117,7 +129,9 @@ class Expert:
         env, reference = self.env, self.env.reference
         ahead = reference.rows(env.clip, env.frame + 1)
         now, then = reference.qpos[rows, 7:].float(), reference.qpos[ahead, 7:].float()
-        target = torch.lerp(now, then, self.config.lead) + self.plan.torque[rows] / self._kp
+        plan, lead = self.plan, self.config.lead
+        path = torch.lerp(now + plan.lift[rows], then + plan.lift[ahead], lead)
+        target = path + plan.torque[rows] / self._kp
         q, reach = env.backend.state.qpos[:, 7:].float(), self._most / self._kp
         target = torch.maximum(torch.minimum(target, q + reach), q - reach)
         pd = env.task.pd
@@ -133,7 +147,8 @@ class Expert:
         quat, ref_quat = qpos[:, 3:7], ref.qpos[:, 3:7]
         # F = F_ID + K (p^ - p) + D (v^ - v), world axes
         force = quat_rotate(ref.heading, self.plan.force_h[rows])
-        force = force + k * (ref.qpos[:, :3] - qpos[:, :3]) + d * (ref.qvel[:, :3] - qvel[:, :3])
+        away = _beyond(ref.qpos[:, :3] - qpos[:, :3], self.config.deadband_m)
+        force = force + k * away + d * (ref.qvel[:, :3] - qvel[:, :3])
         # T = T_ID + K log(q^-1 q^) + D (w^ - w), the root's axes
         turn = quat_mul(quat_conj(quat), ref_quat)
         spin = quat_rotate(turn, ref.qvel[:, 3:6]) - qvel[:, 3:6]
@@ -164,6 +179,11 @@ def _within(vector: Tensor, limit: float) -> Tensor:
         return torch.zeros_like(vector)
     unit = vector / limit
     return unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
+
+
+def _beyond(vector: Tensor, band: float) -> Tensor:
+    """`vector (N, 3)` shortened by `band`, or zero where it is shorter."""
+    return vector * (1.0 - band / vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_min(0.0)
 
 
 def _turning_inertia(reference: Reference) -> float:
