@@ -9,6 +9,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from poise.cli.beginning import first_delivery
 from poise.cli.console import say
 from poise.cli.options import Body, Reading, Training
 from poise.cli.progress import working
@@ -36,7 +37,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
     again = command_line("imitate", argv)
     job = Job((o.clip,), o.out, o.out / "run", o.training, o.body, o.reading, again)
     imitation = job.start()
-    result = job.train(imitation)
+    result = job.train(imitation, first_delivery(imitation, o.out))
     if result.interrupted:
         return job.stopped("Stopped; the training so far is saved.")
     from poise.recipes.deliver import deliver

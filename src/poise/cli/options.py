@@ -90,6 +90,8 @@ class Training:
     """Threads of the physics; 0 takes every core."""
     iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Stop after so many iterations as well; for tests."""
+    expert: bool = True
+    """Start from a scripted expert (inverse dynamics and feedback) that is cloned first."""
     resume: bool = False
     """Go on with the run that is in the folder."""
 
@@ -117,6 +119,7 @@ class Training:
             help_limit=self.help_limit,
             reward=self.reward,
             seed=self.seed,
+            expert=self.expert,
             body=body.config(),
         )
         return config if self.envs is None else replace(config, num_envs=self.envs)

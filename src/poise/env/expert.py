@@ -36,8 +36,7 @@ class ExpertConfig:
     frequency: rad/s and damping: ratio of the root's spring, stiffness m w^2 and damping 2 z m w for a
     character of mass m, so that heavy and light ones follow alike; turn_frequency, turn_damping: the
     same about the root's axes with the body's moment of inertia.
-    lead: where in a control step its joint torque is meant to hold, 0 its begin, 1 its end; MuJoCo's
-    implicit stiffness acts late in it.
+    lead: which moment of a control step the joint targets are taken from, 0 its begin, 1 its end.
     deadband_m, deadband_rad: root errors so small pull nothing: a body that stands on the floor need
     not be pressed down to a reference whose soles lie a centimetre under it.
     contacts: which points may carry weight in the inverse dynamics. clear: how swinging feet are lifted.
@@ -47,7 +46,7 @@ class ExpertConfig:
     damping: float = 0.8
     turn_frequency: float = 10.0
     turn_damping: float = 0.2
-    lead: float = 0.75
+    lead: float = 0.5
     deadband_m: float = 0.0
     deadband_rad: float = 0.0
     contacts: ContactRule = field(default_factory=ContactRule)

@@ -29,23 +29,23 @@ from poise.learn.threads import torch_threads
 class CloneConfig:
     """Settings of cloning; the defaults take half a minute on two cores with 512 environments."""
 
-    steps: int = 64
+    steps: int = 56
     """Control steps per environment and round."""
-    rounds: int = 3
+    rounds: int = 2
     """DAgger rounds after the teacher's own."""
-    beta: float = 0.5
+    beta: float = 0.3
     """Share of the episodes of round k that the teacher drives: beta^k, so all of them in round 0."""
     noise: tuple[float, ...] = (0.0, 1.0, 2.0)
     """Exploration of the teacher's episodes in units of the policy's action noise; every
     environment keeps one of these levels through a round. The student explores with 1."""
-    epochs: tuple[int, int] = (8, 4)
+    epochs: tuple[int, int] = (6, 4)
     """Passes over all data after round 0 and after each later one."""
     minibatch: int = 2048
     lr: float = 1e-3
     """Adam's step size; it falls to a tenth over each round's fit."""
-    critic_steps: int = 48
+    critic_steps: int = 32
     """Control steps per environment whose returns teach the critic; 0 leaves it untrained."""
-    critic_passes: int = 4
+    critic_passes: int = 3
     """Times that the critic learns from them, with returns estimated anew."""
 
     def __post_init__(self) -> None:
