@@ -132,7 +132,7 @@ def inverse_dynamics(
             low = low[velocity[low] < rule.speed]
         if velocity is not None and len(low):
             height = np.maximum(place[low, 2], 0.0) / rule.height_m
-            dear = 1.0 + 4.0 * height**2 + 4.0 * (velocity[low] / rule.speed) ** 2
+            dear = 1.0 + 30.0 * height**2 + 4.0 * (velocity[low] / rule.speed) ** 2
             force = _contact_forces(model, data, rest, place[low], dear, mu, rule)
             out.contact_force[t, low] = force
             for p, f in zip(low, force, strict=True):

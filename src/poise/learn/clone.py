@@ -31,7 +31,7 @@ class CloneConfig:
 
     steps: int = 56
     """Control steps per environment and round."""
-    rounds: int = 2
+    rounds: int = 3
     """DAgger rounds after the teacher's own."""
     beta: float = 0.3
     """Share of the episodes of round k that the teacher drives: beta^k, so all of them in round 0."""
