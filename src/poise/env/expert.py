@@ -42,10 +42,10 @@ class ExpertConfig:
     contacts: which points may carry weight in the inverse dynamics. clear: how swinging feet are lifted.
     """
 
-    frequency: float = 7.0
-    damping: float = 0.8
-    turn_frequency: float = 10.0
-    turn_damping: float = 0.2
+    frequency: float = 5.0
+    damping: float = 0.4
+    turn_frequency: float = 14.0
+    turn_damping: float = 0.1
     lead: float = 0.5
     deadband_m: float = 0.0
     deadband_rad: float = 0.0
