@@ -37,8 +37,6 @@ class ExpertConfig:
     character of mass m, so that heavy and light ones follow alike; turn_frequency, turn_damping: the
     same about the root's axes with the body's moment of inertia.
     lead: which moment of a control step the joint targets are taken from, 0 its begin, 1 its end.
-    deadband_m, deadband_rad: root errors so small pull nothing: a body that stands on the floor need
-    not be pressed down to a reference whose soles lie a centimetre under it.
     contacts: which points may carry weight in the inverse dynamics. clear: how swinging feet are lifted.
     """
 
@@ -47,8 +45,6 @@ class ExpertConfig:
     turn_frequency: float = 14.0
     turn_damping: float = 0.1
     lead: float = 0.5
-    deadband_m: float = 0.0
-    deadband_rad: float = 0.0
     contacts: ContactRule = field(default_factory=ContactRule)
     clear: ClearanceRule = field(default_factory=ClearanceRule)
 
@@ -146,8 +142,7 @@ class Expert:
         quat, ref_quat = qpos[:, 3:7], ref.qpos[:, 3:7]
         # F = F_ID + K (p^ - p) + D (v^ - v), world axes
         force = quat_rotate(ref.heading, self.plan.force_h[rows])
-        away = _beyond(ref.qpos[:, :3] - qpos[:, :3], self.config.deadband_m)
-        force = force + k * away + d * (ref.qvel[:, :3] - qvel[:, :3])
+        force = force + k * (ref.qpos[:, :3] - qpos[:, :3]) + d * (ref.qvel[:, :3] - qvel[:, :3])
         # T = T_ID + K log(q^-1 q^) + D (w^ - w), the root's axes
         turn = quat_mul(quat_conj(quat), ref_quat)
         spin = quat_rotate(turn, ref.qvel[:, 3:6]) - qvel[:, 3:6]
@@ -178,11 +173,6 @@ def _within(vector: Tensor, limit: float) -> Tensor:
         return torch.zeros_like(vector)
     unit = vector / limit
     return unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
-
-
-def _beyond(vector: Tensor, band: float) -> Tensor:
-    """`vector (N, 3)` shortened by `band`, or zero where it is shorter."""
-    return vector * (1.0 - band / vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_min(0.0)
 
 
 def _turning_inertia(reference: Reference) -> float:
