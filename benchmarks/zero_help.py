@@ -88,7 +88,7 @@ class Watch:
 
     def check(self, starts: int | None) -> dict:
         policy, meta = trained_policy(self.run, self.judged)
-        result = evaluate(self.judged, policy, meta, starts=starts)
+        result = evaluate(self.judged, policy, meta, most=starts)
         card, r = result.card, authors_reward(result.rollouts)
         row = {
             "seconds": round(self.seconds),

@@ -9,6 +9,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from poise.cli.beginning import first_delivery
 from poise.cli.console import say
 from poise.cli.options import Body, Reading, Training
 from poise.cli.progress import working
@@ -39,7 +40,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
 
     with joined() as comm:
         imitation = job.start(comm)
-        result = job.train(imitation, comm)
+        result = job.train(imitation, comm, first_delivery(imitation, o.out))
     if result.interrupted:
         return job.stopped("Stopped; the training so far is saved.")
     if comm.rank:

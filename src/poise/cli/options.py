@@ -92,6 +92,8 @@ class Training:
     """Threads of the physics; 0 takes every core."""
     iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Stop after so many iterations as well; for tests."""
+    expert: bool = True
+    """Start from a scripted expert (inverse dynamics and feedback) that is cloned first."""
     resume: bool = False
     """Go on with the run that is in the folder."""
 
@@ -118,6 +120,7 @@ class Training:
             help_start=self.help_start,
             reward=self.reward,
             seed=self.seed,
+            expert=self.expert,
             body=body.config(),
         )
         return config if self.envs is None else replace(config, num_envs=self.envs)

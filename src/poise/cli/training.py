@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
+from poise.cli.beginning import First, beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Body, Reading, Training
 from poise.cli.output import claimed
@@ -84,15 +85,16 @@ class Job:
             clips.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
         return ClipLibrary(tuple(clips))
 
-    def train(self, imitation: Imitation, comm: Comm) -> RunResult:
-        """Trains until the limit or Ctrl-C; either way everything is saved."""
+    def train(self, imitation: Imitation, comm: Comm, first: First | None = None) -> RunResult:
+        """Trains until the limit or Ctrl-C; either way everything is saved. `first` gets the clone."""
         from poise.learn import RunResult, Until
         from poise.recipes.session import train
 
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
         try:
             with progress.training(until) as show:
-                return train(imitation, self.run, until, show, self.training.threads, comm=comm)
+                threads, begins = self.training.threads, beginning(first)
+                return train(imitation, self.run, until, show, threads, comm=comm, beginning=begins)
         except KeyboardInterrupt:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)

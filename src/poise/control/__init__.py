@@ -1,19 +1,27 @@
 """Control laws: what turns a state and an action into a `Drive`."""
 
 from poise.control.drive import Drive
+from poise.control.inverse import ContactRule, InverseDynamics, inverse_dynamics, step_midpoints
 from poise.control.pd import PDTargets, stable_pd_torque
 from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
 from poise.control.schedule import HelpSchedule, LinearHelp, SuccessHelp
+from poise.control.touch import ClearanceRule, clearance
 
 __all__ = [
+    "ClearanceRule",
+    "ContactRule",
     "Drive",
     "ExplicitResidual",
     "HelpSchedule",
     "ImplicitResidual",
+    "InverseDynamics",
     "LinearHelp",
     "PDTargets",
     "Residual",
     "SuccessHelp",
     "Wrench",
+    "clearance",
+    "inverse_dynamics",
     "stable_pd_torque",
+    "step_midpoints",
 ]

@@ -93,6 +93,20 @@ class PolicyBundle:
         save_checkpoint(path, self.state(), meta)
 
 
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """What reinforcement learning may start from.
+
+    policy: weights and observation statistics. critic: `PPO.state()` entries under "critic/" and
+    "return_norm/", or None for an untrained critic. samples, seconds: what it cost to make.
+    """
+
+    policy: PolicyBundle
+    critic: State | None = None
+    samples: int = 0
+    seconds: float = 0.0
+
+
 def load_policy(
     path: str | Path,
     character: str | None = None,

@@ -68,6 +68,14 @@ class VecEnv(Protocol):
         ...
 
 
+class Teacher(Protocol):
+    """What cloning learns from: it knows the environment's state and what to do there."""
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions `(N, A)` for the environment as it stands now, whose observation is `obs (N, O)`."""
+        ...
+
+
 class Policy(Protocol):
     """What acts: evaluation, viewers and live loops ask for no more than this."""
 

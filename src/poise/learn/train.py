@@ -26,7 +26,7 @@ from poise.learn.parallel import (
     sums,
     together,
 )
-from poise.learn.policy import PolicyBundle
+from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import VecEnv
 from poise.learn.rollout import Episodes, Rollout, collect
@@ -91,8 +91,8 @@ class Trainer:
         character: identity of the body that is trained, such as a hash; a checkpoint of another
             one is refused.
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
-        warm_start: a policy whose weights and observation statistics to start from; the action
-            noise stays the config's.
+        warm_start: a policy whose weights and observation statistics to start from, or a `WarmStart`
+            that may bring a critic and counts what it cost; the action noise stays the config's.
         update_threads: with more than one, policy and critic are trained side by side, while the
             environment's own threads rest; the numbers are the same.
         comm: the processes that train together, each with a trainer and environments of its own but
@@ -106,7 +106,7 @@ class Trainer:
         seed: int = 0,
         character: str = "",
         metadata: Mapping[str, Any] | None = None,
-        warm_start: PolicyBundle | None = None,
+        warm_start: PolicyBundle | WarmStart | None = None,
         update_threads: int = 1,
         comm: Comm = ALONE,
     ):
@@ -114,18 +114,32 @@ class Trainer:
         self.update_threads, self.comm = update_threads, comm
         self.character, self.metadata = character, dict(metadata or {})
         self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device, comm)
-        if warm_start is not None:
-            load_module(self.ppo.actor.norm, prefixed("norm", warm_start.norm.state_dict()), "norm")
-            mean = prefixed("policy/mean", warm_start.policy.mean.state_dict())
-            load_module(self.ppo.actor.policy.mean, mean, "policy/mean")
+        start = WarmStart(warm_start) if isinstance(warm_start, PolicyBundle) else warm_start
+        if start is not None:
+            _take_over(self.ppo, start)
         self.rollout = Rollout(
             self.config.horizon, env.num_envs, env.num_obs, env.num_actions, torch.device(env.device)
         )
         self.episodes = Episodes(env.num_envs, torch.device(env.device))
-        self.iteration, self.samples, self.seconds = 0, 0, 0.0
+        self.iteration = 0
+        self.samples, self.seconds = (start.samples, start.seconds) if start else (0, 0.0)
         # Length, reward and failure share of the last episodes that ended.
         self._ended = (math.nan, math.nan, math.nan)
         self._obs: Tensor | None = None
+
+    def share_start(self) -> None:
+        """Makes every process begin as the first one does, which alone had a warm start."""
+        if self.comm.size == 1:
+            return
+        state = self.ppo.state()
+        for name, value in state.items():
+            if value.is_floating_point() and not name.startswith("generator/"):
+                self.comm.sum_(value.zero_() if self.comm.rank else value)
+        self.ppo.load_state(state)
+        samples, self.seconds = sums(
+            self.comm, (0.0, 0.0) if self.comm.rank else (self.samples, self.seconds)
+        )
+        self.samples = int(samples)
 
     def iterate(self) -> IterationStats:
         """Collects one batch and learns from it.
@@ -273,3 +287,13 @@ class Trainer:
         )
         self.load_state(tensors)
         return meta
+
+
+def _take_over(ppo: PPO, start: WarmStart) -> None:
+    """Copies weights and statistics of a warm start into a fresh learner."""
+    norm, mean = start.policy.norm.state_dict(), start.policy.policy.mean.state_dict()
+    load_module(ppo.actor.norm, prefixed("norm", norm), "norm")
+    load_module(ppo.actor.policy.mean, prefixed("policy/mean", mean), "policy/mean")
+    if start.critic is not None:
+        load_module(ppo.critic, start.critic, "critic")
+        load_module(ppo.return_norm, start.critic, "return_norm")

@@ -10,7 +10,7 @@ from typing import Any, cast
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.kin import FitReport
-from poise.learn import PPOConfig, Trainer, VecEnv
+from poise.learn import PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.motion import ClipLibrary
 from poise.sim import CpuBackend, NanGuard
@@ -61,9 +61,15 @@ class Imitation:
         return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
 
     def trainer(
-        self, threads: int = 0, dumps: Path | None = None, comm: Comm = ALONE, **metadata: Any
+        self,
+        threads: int = 0,
+        dumps: Path | None = None,
+        comm: Comm = ALONE,
+        warm_start: WarmStart | None = None,
+        ppo: PPOConfig | None = None,
+        **metadata: Any,
     ) -> Trainer:
-        """A PPO trainer on a fresh environment.
+        """A PPO trainer on a fresh environment; `ppo` in place of this task's own settings.
 
         threads: of the physics; 0 takes this process's share of the machine's cores. comm: the
         processes that train together; they share the config's environments out evenly.
@@ -79,10 +85,11 @@ class Imitation:
         return Trainer(
             # An EnvStep has the fields of the learner's Step; neither room knows the other.
             cast(VecEnv, env),
-            self.ppo(),
+            ppo or self.ppo(),
             self.config.seed,
             self.humanoid.identity,
             metadata=metadata,
+            warm_start=warm_start,
             update_threads=cores,
             comm=comm,
         )

@@ -55,6 +55,7 @@ class ResidualForce:
     done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
     residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
     that of the joints. 0.3 is the paper's; with the joints' 0.055 the help is hardly tried.
+    expert: start from a cloned expert (`recipes.expert`); without it PPO starts from nothing.
     """
 
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
@@ -68,6 +69,7 @@ class ResidualForce:
     faithful: Literal["paper", "code"] = "paper"
     done: Literal["bodies", "height"] = "bodies"
     residual_std: float = 0.3
+    expert: bool = True
     num_envs: int = 512
     horizon: int = 300
     seed: int = 0
@@ -167,7 +169,13 @@ def build(clips: Clip | ClipLibrary, config: ResidualForce | None = None) -> Imi
 def paper(config: ResidualForce) -> ResidualForce:
     """The paper's own setting: phase observation, absolute action, root height rule, its PPO."""
     slow = SimConfig(rate_hz=450.0, integrator="implicitfast")
-    faithful = {"observation": "phase", "action": "absolute", "done": "height", "sim": slow}
+    faithful = {
+        "observation": "phase",
+        "action": "absolute",
+        "done": "height",
+        "sim": slow,
+        "expert": False,
+    }
     return replace(config, ppo=PPOConfig.paper(), **faithful)
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.body import BodyConfig
 from poise.env.budget import scale_in
@@ -36,9 +35,10 @@ from poise.learn import (
     run,
     save_checkpoint,
 )
-from poise.learn.parallel import ALONE, Comm, together
+from poise.learn.parallel import ALONE, Comm
 from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
+from poise.recipes.expert import Beginning, begin_training, some_starts
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build, most_help
 from poise.sim import SimConfig
@@ -108,10 +108,10 @@ def train(
     threads: int = 0,
     tensorboard: bool = True,
     comm: Comm = ALONE,
+    beginning: Beginning | None = None,
 ) -> RunResult:
-    """Trains, or goes on training, in `folder`; see `poise.learn.run`."""
-    with together(comm):
-        trainer = imitation.trainer(threads=threads, dumps=folder / "dumps", comm=comm)
+    """Trains, or goes on training, in `folder`; see `poise.learn.run` and `recipes.expert`."""
+    trainer = begin_training(imitation, folder, threads, beginning, comm)
     try:
         return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
     finally:
@@ -151,19 +151,15 @@ def evaluate(
     meta: Mapping[str, Any],
     rule: str = "phc",
     help_limit: float | None = None,
-    starts: int | None = None,
+    most: int | None = None,
 ) -> Evaluation:
-    """Simulates every start frame to the end with the deterministic policy, and scores it.
+    """Start frames simulated to the end with the deterministic policy, and the score card.
 
-    Args:
-        help_limit: N and N m; by default what training has left of it (`meta["help_limit"]`).
-        starts: no more than so many start frames, evenly spread; None takes all.
+    Every start frame, or at most `most`, evenly spread.
+    help_limit: N and N m; by default what training has left of it (`meta["help_limit"]`).
     """
     config, (limit, scale) = imitation.config, help_left(imitation, meta, help_limit)
-    clip, start = start_frames(imitation.reference)
-    if starts is not None and starts < len(clip):
-        some = torch.linspace(0, len(clip) - 1, starts).long()
-        clip, start = clip[some], start[some]
+    clip, start = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
     rollouts, recordings = run_episodes(
         lambda n: imitation.env(n, auto_reset=False, help_scale=scale), policy, clip, start, limit, limit
     )

@@ -1,0 +1,59 @@
+"""What is said while a run begins: the expert's score, the rounds of cloning, the first result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from poise.cli.console import tell
+from poise.cli.progress import clock
+
+if TYPE_CHECKING:
+    from poise.eval import ScoreCard
+    from poise.learn import CloneStats, PolicyBundle, WarmStart
+    from poise.recipes.expert import Beginning
+    from poise.recipes.imitation import Imitation
+
+First = Callable[["PolicyBundle", "WarmStart"], None]
+
+
+def beginning(first: First | None = None) -> Beginning:
+    """Tells the steps of a beginning; `first` gets the clone."""
+    from poise.recipes.expert import Beginning
+
+    def expert(card: ScoreCard) -> None:
+        tell(f"expert, without learning: {summary(card)}")
+
+    def cloned_round(s: CloneStats) -> None:
+        tell(f"{clock(s.seconds)}  cloning, round {s.round}: {s.samples:,} samples, error {s.loss:.3f}")
+
+    def failed(why: str) -> None:
+        tell(f"Training starts from nothing, since the expert failed: {why}")
+
+    return Beginning(expert, cloned_round, first, failed)
+
+
+def first_delivery(imitation: Imitation, out: Path) -> First:
+    """Writes the clone's motion, score and report into `out`; training then goes on and better it."""
+
+    def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
+        from poise.recipes.deliver import deliver
+        from poise.recipes.expert import FIRST_STARTS
+        from poise.recipes.session import evaluate
+
+        meta = {"seconds": start.seconds, "samples": start.samples}
+        evaluation = evaluate(imitation, policy, meta, most=FIRST_STARTS)
+        paths = deliver(imitation, evaluation, out, {})
+        tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
+
+    return deliver_first
+
+
+def summary(card: ScoreCard) -> str:
+    """A score card in half a line: "succ 97 %, 19 mm, help 69 N and 28 N m"."""
+    aid = card.help
+    return (
+        f"succ {100 * card.succ:.0f} %, {card.mpjpe_mm:.0f} mm, "
+        f"help {aid.force_mean_n:.0f} N and {aid.torque_mean_nm:.0f} N m"
+    )

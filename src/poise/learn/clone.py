@@ -1,0 +1,231 @@
+"""Behaviour cloning with DAgger (Ross et al. 2011): a policy that acts as a teacher does.
+
+Round 0 is driven by the teacher with noise, so that the data hold ways back to the path. In each later
+round the student drives most episodes itself, and the teacher says what it would have done there. The
+last round's returns teach a critic, so that reinforcement learning can go on at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.errors import PoiseError
+from poise.learn.config import PPOConfig
+from poise.learn.guard import TrainingError, check_finite
+from poise.learn.policy import PolicyBundle, WarmStart
+from poise.learn.ppo import PPO
+from poise.learn.protocols import Teacher, VecEnv
+from poise.learn.rollout import Episodes, Rollout, collect
+from poise.learn.state import State, make_generator, prefixed
+from poise.learn.threads import torch_threads
+
+
+@dataclass(frozen=True)
+class CloneConfig:
+    """Settings of cloning; the defaults take half a minute on two cores with 512 environments."""
+
+    steps: int = 56
+    """Control steps per environment and round."""
+    rounds: int = 3
+    """DAgger rounds after the teacher's own."""
+    beta: float = 0.3
+    """Share of the episodes of round k that the teacher drives: beta^k, so all of them in round 0."""
+    noise: tuple[float, ...] = (0.0, 1.0, 2.0)
+    """Exploration of the teacher's episodes in units of the policy's action noise; every
+    environment keeps one of these levels through a round. The student explores with 1."""
+    epochs: tuple[int, int] = (6, 4)
+    """Passes over all data after round 0 and after each later one."""
+    minibatch: int = 2048
+    lr: float = 1e-3
+    """Adam's step size; it falls to a tenth over each round's fit."""
+    critic_steps: int = 32
+    """Control steps per environment whose returns teach the critic; 0 leaves it untrained."""
+    critic_passes: int = 3
+    """Times that the critic learns from them, with returns estimated anew."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 1), ("rounds", 0), ("minibatch", 1), ("critic_steps", 0)):
+            if getattr(self, name) < least:
+                raise PoiseError(
+                    f"{name} must be at least {least}, got {getattr(self, name)}", "CloneConfig"
+                )
+        if not 0 <= self.beta <= 1 or not self.noise or min(self.noise) < 0 or self.lr <= 0:
+            raise PoiseError(
+                "beta must lie in [0, 1], lr above 0, and noise needs levels of at least 0",
+                "CloneConfig",
+            )
+
+
+@dataclass(frozen=True)
+class CloneStats:
+    """What one round did."""
+
+    round: int
+    """0 is the teacher's own."""
+    samples: int
+    """Control steps seen so far."""
+    loss: float
+    """Mean squared error of the actions, in units of the action noise, in the last pass."""
+    reward: float
+    """Mean reward per control step of the round's rollout."""
+    failure_rate: float
+    """Share of the round's finished episodes that failed; NaN where none finished."""
+    seconds: float
+    """Since the start."""
+
+
+def clone(
+    env: VecEnv,
+    teacher: Teacher,
+    config: CloneConfig | None = None,
+    ppo: PPOConfig | None = None,
+    seed: int = 0,
+    on_round: Callable[[CloneStats], bool | None] | None = None,
+    update_threads: int = 0,
+) -> tuple[WarmStart, tuple[CloneStats, ...]]:
+    """A policy (and critic) that acts like `teacher`, ready for `Trainer(warm_start=...)`.
+
+        min E |(mean(s) - teacher(s)) / sigma|^2 over the states that teacher and student visit
+
+    Args:
+        env: is reset here; its episodes must restart by themselves.
+        teacher: acts for the environment's present state.
+        ppo: the network sizes, action noise sigma, discount and critic settings.
+        on_round: called after each round; returning False ends the cloning there.
+        update_threads: torch's threads while the networks learn, as for `Trainer`.
+
+    The same seed on the same environment gives the same bits. Numbers that are not finite raise a
+    `TrainingError`.
+    """
+    config, ppo = config or CloneConfig(), ppo or PPOConfig()
+    begun = time.perf_counter()
+    device = torch.device(env.device)
+    learner = PPO(env.num_obs, env.num_actions, ppo, seed, device)
+    fitter = _Fitter(learner.actor, config, (config.rounds + 1) * config.steps * env.num_envs, seed)
+    stats: list[CloneStats] = []
+    obs = env.reset()
+    for k in range(config.rounds + 1):
+        obs, reward, failures = _gather(env, teacher, learner.actor, fitter, config, k, obs, seed)
+        with torch_threads(update_threads):
+            loss = fitter.fit(config.epochs[min(k, 1)])
+        elapsed = time.perf_counter() - begun
+        stats.append(CloneStats(k, fitter.size, loss, reward, failures, elapsed))
+        if on_round is not None and on_round(stats[-1]) is False:
+            break
+    policy, samples, critic = learner.actor.copy(), fitter.size, None
+    if config.critic_steps:
+        with torch_threads(update_threads):
+            critic = _fit_critic(env, learner, config, obs, seed)
+        samples += config.critic_steps * env.num_envs
+    return WarmStart(policy, critic, samples, time.perf_counter() - begun), tuple(stats)
+
+
+class _Fitter:
+    """All states seen so far with the teacher's actions, and the regression on them."""
+
+    def __init__(self, actor: PolicyBundle, config: CloneConfig, capacity: int, seed: int):
+        self.actor, self.config, self.size = actor, config, 0
+        device = actor.norm.shift.device
+        self.obs = torch.empty(capacity, actor.num_obs, device=device)
+        self.action = torch.empty(capacity, actor.num_actions, device=device)
+        self.shuffle = make_generator(seed, "clone shuffle", device)
+        self.params = list(actor.policy.mean.parameters())
+        self.optimizer = torch.optim.Adam(self.params, lr=config.lr, fused=True)
+
+    def add(self, obs: Tensor, action: Tensor) -> None:
+        """Keeps one step of every environment."""
+        rows = slice(self.size, self.size + len(obs))
+        self.obs[rows], self.action[rows] = obs, action
+        self.size += len(obs)
+        self.actor.norm.observe(obs)
+
+    def fit(self, epochs: int) -> float:
+        """Some passes over everything; the loss of the last one."""
+        policy, norm = self.actor.policy, self.actor.norm
+        norm.freeze()
+        scale = (-policy.log_std.detach()).exp()
+        parts = max(1, round(self.size / self.config.minibatch))
+        mean = 0.0
+        for epoch in range(epochs):
+            order = torch.randperm(self.size, generator=self.shuffle, device=self.obs.device)
+            # From lr to lr / 10, geometrically.
+            for group in self.optimizer.param_groups:
+                group["lr"] = self.config.lr * 0.1 ** (epoch / max(1, epochs - 1))
+            total = torch.zeros((), device=self.obs.device)
+            for index in order.tensor_split(parts):
+                error = policy(norm(self.obs.index_select(0, index)))
+                error = (error - self.action.index_select(0, index)) * scale
+                loss = error.square().mean()
+                self.optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.params, 10.0, foreach=True)
+                self.optimizer.step()
+                total += loss.detach()
+            mean = float(total) / parts
+            if not mean < float("inf"):
+                raise TrainingError("the loss of cloning is not finite", hint="Lower CloneConfig.lr")
+        return mean
+
+
+@torch.no_grad()
+def _gather(
+    env: VecEnv,
+    teacher: Teacher,
+    student: PolicyBundle,
+    data: _Fitter,
+    config: CloneConfig,
+    round_: int,
+    obs: Tensor,
+    seed: int,
+) -> tuple[Tensor, float, float]:
+    """One round of steps from the raw `obs (N, O)`; where it ended, mean reward, failure rate."""
+    noise = make_generator(seed, f"clone noise {round_}", obs.device)
+    n, beta = env.num_envs, config.beta**round_
+    levels = torch.tensor(config.noise, device=obs.device)[torch.arange(n) % len(config.noise)]
+    std = student.policy.log_std.exp()
+
+    def drawn(count: int) -> Tensor:
+        return torch.rand(count, generator=noise, device=obs.device) < beta
+
+    taught = drawn(n)
+    reward, ended, failed = 0.0, 0, 0
+    for _ in range(config.steps):
+        check_finite("observation", obs)
+        wish = teacher.act(obs)
+        check_finite("teacher's action", wish)
+        data.add(obs, wish)
+        action, level = wish, levels
+        if round_:
+            action = torch.where(taught[:, None], wish, student.act(obs))
+            level = torch.where(taught, levels, torch.ones_like(levels))
+        draw = torch.randn(action.shape, generator=noise, device=obs.device)
+        step = env.step(action + draw * std * level[:, None])
+        check_finite("reward", step.reward, step.log)
+        reward += float(step.reward.mean()) / config.steps
+        done = step.terminated | step.truncated
+        if count := int(done.sum()):
+            lost = step.terminated if step.failed is None else step.failed
+            ended, failed = ended + count, failed + int(lost.sum())
+            # Who drives is drawn per episode, so that errors of the student can grow.
+            taught[done] = drawn(count)
+        obs = step.obs
+    return obs, reward, failed / ended if ended else float("nan")
+
+
+def _fit_critic(env: VecEnv, learner: PPO, config: CloneConfig, obs: Tensor, seed: int) -> State:
+    """The critic's state after learning the lambda-returns of the student's own episodes."""
+    device = torch.device(env.device)
+    rollout = Rollout(config.critic_steps, env.num_envs, env.num_obs, env.num_actions, device)
+    episodes = Episodes(env.num_envs, device)
+    policy, norm = learner.actor.policy, learner.actor.norm
+    collect(env, policy, norm, rollout, obs, episodes, make_generator(seed, "clone critic", device))
+    for _ in range(config.critic_passes):
+        learner.update(rollout, train_policy=False)
+    return prefixed("critic", learner.critic.state_dict()) | prefixed(
+        "return_norm", learner.return_norm.state_dict()
+    )
