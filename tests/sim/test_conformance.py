@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from poise.sim import (
     Backend,
     CpuBackend,
     SimConfig,
+    WarpBackend,
     body_angular_velocity_w,
     body_com_velocity_w,
     body_linear_velocity_w,
@@ -32,7 +34,7 @@ class Kind:
     tolerance: float
 
 
-KINDS = {"cpu": Kind(CpuBackend, 1e-12)}
+KINDS = {"cpu": Kind(CpuBackend, 1e-12), "warp": Kind(partial(WarpBackend, device="cpu"), 2e-4)}
 
 
 @pytest.fixture(params=list(KINDS))

@@ -13,6 +13,7 @@ from poise.sim.contacts import add_contact_sensors, contact_columns
 from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
 from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
+from poise.sim.warp import WarpBackend
 
 __all__ = [
     "CONES",
@@ -28,6 +29,7 @@ __all__ = [
     "SimConfig",
     "SimState",
     "UnstableError",
+    "WarpBackend",
     "add_contact_sensors",
     "body_angular_velocity_w",
     "body_com_velocity_w",
