@@ -51,8 +51,8 @@ _HUGE = 1e10  # MuJoCo's mjMAXVAL, above which it calls a value bad.
 class WarpBackend:
     """`num_envs` worlds of one model on a GPU, or on the CPU for tests; see `Backend`.
 
-    All numbers are float32. The state, the drive and the bound fields are Warp's own arrays. On
-    CUDA `step(n)` is one captured graph from its second call on (the first one compiles), on
+    All numbers are float32. The state, the drive and the bound fields are Warp's own arrays.
+    `step(n)` is one captured graph from its second call on (the first one compiles), launched on
     torch's current stream. A bad world (not finite) stays bad until it is written: unlike MuJoCo,
     Warp does not reset it. Contacts and constraint rows have fixed room; a step that needs more
     raises, since its result would be wrong.
@@ -273,20 +273,32 @@ class WarpBackend:
             self._mjw.step1(self._shared.m, self._live)
 
     def _launch(self, nstep: int) -> None:
-        plain = self._device.type == "cpu" or not self._wp.is_mempool_enabled(str(self._device))
-        if plain or nstep not in self._stepped:
-            # The first run compiles and loads the kernels, which a capture cannot.
-            self._steps(nstep)
-            self._stepped.add(nstep)
-            return
         if nstep not in self._graphs:
-            # The legacy stream, torch's default, cannot be captured, but Warp's own can.
-            torch.cuda.synchronize(self._device)
-            own = self._wp.Stream(str(self._device))
-            with self._wp.ScopedStream(own), self._wp.ScopedCapture(stream=own) as capture:
+            # The first run compiles and loads the kernels, which a capture cannot.
+            if nstep in self._stepped and self._can_capture():
+                self._graphs[nstep] = self._captured(nstep)
+            else:
                 self._steps(nstep)
-            self._graphs[nstep] = capture.graph
+                self._stepped.add(nstep)
+                return
         self._wp.capture_launch(self._graphs[nstep])
+
+    def _can_capture(self) -> bool:
+        """Whether what steps allocate in passing may be part of a graph: it needs memory pools."""
+        return self._device.type == "cpu" or self._wp.is_mempool_enabled(str(self._device))
+
+    def _captured(self, nstep: int) -> Any:
+        """The launches of `_steps(nstep)` as one graph; nothing runs meanwhile."""
+        if self._device.type == "cpu":
+            with self._wp.ScopedCapture("cpu") as capture:
+                self._steps(nstep)
+            return capture.graph
+        # The legacy stream, torch's default, cannot be captured, but one of our own can.
+        torch.cuda.synchronize(self._device)
+        own = self._wp.Stream(str(self._device))
+        with self._wp.ScopedStream(own), self._wp.ScopedCapture(stream=own) as capture:
+            self._steps(nstep)
+        return capture.graph
 
     def _forward(self, to: Tensor | slice) -> None:
         """Derived fields of these worlds; force fields of the others still tell of their last step."""

@@ -34,7 +34,10 @@ class WarpModel:
             raise PoiseError(f"mujoco-warp cannot run this model: {error}") from error
         self.m.opt.warn_overflow = 0  # The backend raises instead of printing.
         self.m.opt.deterministic = deterministic
-        self.m.opt.graph_conditional = self._wp.is_conditional_graph_supported()
+        # The solver stops when all worlds have converged: in a CUDA graph by a conditional node, which
+        # drivers older than 12.4 lack (then it makes all its iterations), on the CPU by itself.
+        cuda = self._wp.get_device().is_cuda
+        self.m.opt.graph_conditional = not cuda or self._wp.is_conditional_graph_supported()
         self._model, self._num_envs = model, num_envs
         self.expanded: dict[str, Tensor] = {}
 
