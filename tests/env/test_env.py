@@ -35,7 +35,7 @@ def test_a_start_lies_exactly_on_the_reference(make_env):
     assert torch.equal(state.qpos, env.reference.qpos[rows])
     assert torch.equal(state.qvel, env.reference.qvel[rows])
     assert len(env.frame.unique()) > 4 and int(env.frame.max()) < int(env.reference.length[0]) - 1
-    view = env._frame(ahead=False)
+    view = env._frame()
     for term in env.task.rewards:
         torch.testing.assert_close(term.fn(view, **term.params), torch.ones(16), atol=1e-3, rtol=0)
     for name in ("pos", "quat", "linvel", "angvel", "com", "heading"):
@@ -145,6 +145,15 @@ def test_an_ended_world_begins_anew_and_the_others_go_on(make_env):
     rows = env.reference.rows(env.clip, env.frame)
     assert torch.equal(env.backend.state.qpos[0], env.reference.qpos[rows][0])
     assert not env.action[0].any()
+    env.close()
+
+
+def test_the_callers_actions_stay_the_callers(make_env):
+    env = make_env(3)
+    env.reset_to(torch.zeros(3, dtype=torch.long), torch.tensor([29, 3, 10]))
+    given = actions(env)
+    before = given.clone()
+    assert env.step(given).terminated.any() and torch.equal(given, before)
     env.close()
 
 

@@ -52,8 +52,10 @@ def a_pose(seed: int = 0) -> Pose:
 
     quat, pos = normalize(randn(B, 4)), randn(B, 3)
     qpos = torch.cat((pos[:, 0], quat[:, 0], randn(H)), -1)
+    linvel, qvel = randn(B, 3), randn(6 + H)
+    qvel[:, :3] = linvel[:, 0]
     return Pose(
-        qpos, randn(6 + H), pos, quat, randn(B, 3), randn(B, 3), randn(3), normalize(randn(J, 4)),
+        qpos, qvel, pos, quat, linvel, randn(B, 3), randn(3), normalize(randn(J, 4)),
         heading_quat(quat[:, 0]),
     )  # fmt: skip
 
@@ -143,10 +145,10 @@ def test_root_rewards_by_hand():
     leaning = replace(upright, quat=lean.repeat(N, B, 1), heading=heading_quat(lean.repeat(N, 1)))
     value = reward.root_pose(a_frame(upright, leaning))
     torch.testing.assert_close(value, torch.full((N,), math.exp(-300 * 0.0036)), rtol=1e-4, atol=0)
-    linear, angular = upright.linvel.clone(), upright.angvel.clone()
-    linear[:, 0, 1] += 0.5
+    qvel, angular = upright.qvel.clone(), upright.angvel.clone()
+    qvel[:, 1] += 0.5
     angular[:, 0, 2] += 2.0
-    value = reward.root_velocity(a_frame(upright, replace(upright, linvel=linear, angvel=angular)))
+    value = reward.root_velocity(a_frame(upright, replace(upright, qvel=qvel, angvel=angular)))
     torch.testing.assert_close(value, torch.full((N,), math.exp(-0.25 - 0.1 * 4.0)), rtol=1e-4, atol=0)
 
 

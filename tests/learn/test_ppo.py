@@ -105,9 +105,9 @@ def test_warm_up_trains_only_the_critic():
 
 def test_the_reported_kl_is_that_of_the_old_and_new_policy():
     # With one minibatch per epoch the last epoch's KL is measured before its own step.
-    ppo = PPO(4, 2, replace(TOY, epochs=2, minibatch=10_000), seed=0)
+    ppo = PPO(4, 2, replace(TOY, products="float32", epochs=2, minibatch=10_000), seed=0)
     rollout = filled(ppo)
-    one = PPO(4, 2, replace(TOY, epochs=1, minibatch=10_000), seed=0)
+    one = PPO(4, 2, replace(TOY, products="float32", epochs=1, minibatch=10_000), seed=0)
     kl = ppo.update(rollout).kl
     one.update(filled(one))
     with torch.no_grad():

@@ -77,7 +77,8 @@ def test_a_resumed_run_may_change_what_the_config_fixes(tmp_path):
     changed = replace(fixed, policy_lr=1e-5, value_lr=1e-6, std=0.2)
     trainer = Trainer(PointEnv(32), changed, character="point")
     trainer.load(tmp_path / "c")
-    assert [g["lr"] for g in trainer.ppo.optimizer.param_groups] == [1e-5, 1e-6]
+    groups = (trainer.ppo.optimizer.param_groups[0], trainer.ppo.value_optimizer.param_groups[0])
+    assert [g["lr"] for g in groups] == [1e-5, 1e-6]
     assert trainer.iterate().update.std == pytest.approx(0.2)
 
 
@@ -212,7 +213,8 @@ sys.exit(os.WEXITSTATUS(status))
 @pytest.mark.parametrize("every", [1, 4])
 def test_kills_at_random_moments_change_nothing(every, tmp_path):
     here = str(Path(__file__).parent)
-    environment = {**os.environ, "PYTHONPATH": here}
+    paths = [here, *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     seed = str(random.randrange(10**6))
     command = [sys.executable, "-c", KILLER, str(tmp_path / "killed"), seed, str(every)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

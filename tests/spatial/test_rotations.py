@@ -196,7 +196,21 @@ def test_heading_of_an_upside_down_root_is_defined():
 def test_sixd_is_the_first_two_columns():
     q = quats(4)
     m = spatial.quat_to_matrix(q)
-    assert torch.equal(spatial.quat_to_sixd(q), torch.cat((m[:, :, 0], m[:, :, 1]), -1))
+    columns = torch.cat((m[:, :, 0], m[:, :, 1]), -1)
+    torch.testing.assert_close(spatial.quat_to_sixd(q), columns, atol=1e-12, rtol=0)
+
+
+def test_the_short_ways_equal_the_long_ones():
+    a, b, v = quats(50), quats(50, seed=3), vectors(50, 7)
+    apart = spatial.quat_angle(spatial.quat_mul(a, spatial.quat_conj(b)))
+    torch.testing.assert_close(spatial.quat_distance(a, b), apart)
+    torch.testing.assert_close(spatial.quat_distance(a, -b), apart)
+    assert not spatial.quat_distance(a.float(), -a.float()).any()
+    near = spatial.quat_mul(a, spatial.rotvec_to_quat(torch.tensor([1e-5, 0, 0]).double())).float()
+    assert float(spatial.quat_distance(a.float(), near).max()) < 2e-5
+    heading = spatial.heading_quat(a)
+    turned = spatial.quat_rotate_inv(heading[:, None].expand(50, 7, 4), v)
+    torch.testing.assert_close(spatial.into_heading(heading, v), turned)
 
 
 def test_unwrap_flips_signs_only():

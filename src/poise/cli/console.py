@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -15,12 +16,27 @@ from rich.text import Text
 _PIPE_WIDTH = 120
 
 
-def _console(stream: Any) -> Console:
+def _console(stream: Any, everywhere: bool = False) -> Console:
     # Made anew for each use, so that a stream that was replaced (by a test, a notebook) is honoured.
     terminal = hasattr(stream, "isatty") and stream.isatty()
     return Console(
-        file=stream, highlight=False, markup=False, emoji=False, width=None if terminal else _PIPE_WIDTH
+        file=stream,
+        highlight=False,
+        markup=False,
+        emoji=False,
+        width=None if terminal else _PIPE_WIDTH,
+        quiet=rank() > 0 and not everywhere,
     )
+
+
+def launched() -> bool:
+    """Whether `torchrun` started this process."""
+    return "TORCHELASTIC_RUN_ID" in os.environ
+
+
+def rank() -> int:
+    """This process's number among those that `torchrun` started, of which only 0 speaks; else 0."""
+    return int(os.environ["RANK"]) if launched() else 0
 
 
 def out() -> Console:
@@ -43,11 +59,16 @@ def tell(text: str, style: str = "") -> None:
     err().print(Text(text, style=style), soft_wrap=True)
 
 
-def error(sentence: str) -> None:
-    """Exactly one line `error: ...` on stderr, whatever the sentence holds."""
+def error(sentence: str, everywhere: bool = False) -> None:
+    """Exactly one line `error: ...` on stderr, whatever the sentence holds.
+
+    everywhere: of several processes also those speak that are silent otherwise.
+    """
     line = " ".join(sentence.split())
     line = "".join(c if c.isprintable() else "?" for c in line)
-    err().print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
+    if rank():
+        line = f"process {rank()}: {line}"
+    _console(sys.stderr, everywhere).print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
 
 
 def say_json(value: Any) -> None:

@@ -35,10 +35,15 @@ def run(options: Options, argv: Sequence[str]) -> int:
     o = options
     again = command_line("imitate", argv)
     job = Job((o.clip,), o.out, o.out / "run", o.training, o.body, o.reading, again)
-    imitation = job.start()
-    result = job.train(imitation)
+    from poise.learn.parallel import joined
+
+    with joined() as comm:
+        imitation = job.start(comm)
+        result = job.train(imitation, comm)
     if result.interrupted:
         return job.stopped("Stopped; the training so far is saved.")
+    if comm.rank:
+        return 0
     from poise.recipes.deliver import deliver
     from poise.recipes.session import evaluate, learning_curve, trained_policy
 

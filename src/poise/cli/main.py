@@ -22,8 +22,10 @@ VERBS = {
     "body": "the physical body that is made for a clip: masses, hinges, gains",
     "imitate": "give one clip a body: train, simulate, score, report",
     "train": "train a recipe on one clip or a library, and no more",
+    "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
+    "bench": "how fast the engine is against its limit, and whether its physics is true",
     "doctor": "what works on this machine, and what to do about the rest",
 }
 _FIRST = (
@@ -96,15 +98,14 @@ def _run(argv: list[str]) -> int:
 
 def _share_cores() -> None:
     """One thread for torch, since the physics uses the cores; OMP_NUM_THREADS overrules it."""
-    if "OMP_NUM_THREADS" in os.environ:
-        return
     try:
         import mujoco
         import torch
     except ImportError:
         # Only `doctor` runs without them, and it says what to do.
         return
-    torch.set_num_threads(1)
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
     # The guard reports instabilities; MuJoCo's own log would litter the user's folder.
     mujoco.set_mju_user_warning(lambda _: None)
 
@@ -125,7 +126,8 @@ def _fail(sentence: str, code: int) -> int:
 
     if os.environ.get("POISE_DEBUG") and code != _INTERRUPTED:
         traceback.print_exc()
-    error(sentence)
+    # A mistake of the user's is told by rank 0 for all processes; a fault may be one process's own.
+    error(sentence, everywhere=code == 1)
     return code
 
 

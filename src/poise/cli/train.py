@@ -44,8 +44,11 @@ def run(options: Options, argv: Sequence[str]) -> int:
         raise PoiseError("no clip was given", hint=f"Write poise train {o.recipe} CLIP -o RUNDIR")
     again = command_line("train", argv)
     job = Job(o.clips, o.out, o.out, o.training, o.body, o.reading, again)
-    imitation = job.start()
-    result = job.train(imitation)
+    from poise.learn.parallel import joined
+
+    with joined() as comm:
+        imitation = job.start(comm)
+        result = job.train(imitation, comm)
     if result.interrupted:
         return job.stopped("Stopped; the training so far is saved.")
     if result.last is None:

@@ -1,7 +1,12 @@
-"""What `imitate` and `train` share: check, read, build, train, and the way to go on."""
+"""What `imitate` and `train` share: check, read, build, train, and the way to go on.
+
+Under `torchrun` several processes do one job: rank 0 reads, writes and prints, the others open the
+run folder that it made and train with it.
+"""
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,13 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
-from poise.cli.console import notes, say, tell
+from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Body, Reading, Training
 from poise.cli.output import claimed
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.learn import RunResult
+    from poise.learn.parallel import Comm
     from poise.motion import ClipLibrary
     from poise.recipes.imitation import Imitation
 
@@ -33,9 +39,21 @@ class Job:
     again: str
     """The command line that goes on with it."""
 
-    def start(self) -> Imitation:
+    def start(self, comm: Comm) -> Imitation:
+        """The task on every process: rank 0 begins the run, the others open its folder."""
+        from poise.learn.parallel import share_of, together
+        from poise.recipes.session import reopen
+
+        with together(comm):
+            self.training.check()
+            if comm.size > 1:
+                share_of(self.training.config(self.body).num_envs, comm)
+            imitation = self.begin() if comm.rank == 0 else None
+        with together(comm):
+            return imitation or reopen(self.run)
+
+    def begin(self) -> Imitation:
         """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""
-        self.training.check()
         config = self.training.config(self.body)
         from poise.recipes.session import RUN_FILE, begin
 
@@ -66,7 +84,7 @@ class Job:
             clips.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
         return ClipLibrary(tuple(clips))
 
-    def train(self, imitation: Imitation) -> RunResult:
+    def train(self, imitation: Imitation, comm: Comm) -> RunResult:
         """Trains until the limit or Ctrl-C; either way everything is saved."""
         from poise.learn import RunResult, Until
         from poise.recipes.session import train
@@ -74,7 +92,7 @@ class Job:
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
         try:
             with progress.training(until) as show:
-                return train(imitation, self.run, until, show, self.training.threads)
+                return train(imitation, self.run, until, show, self.training.threads, comm=comm)
         except KeyboardInterrupt:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)
@@ -87,6 +105,11 @@ class Job:
 
 
 def command_line(verb: str, argv: Sequence[str]) -> str:
-    """The command line that resumes `poise VERB ARGV`."""
+    """The command line that resumes `poise VERB ARGV`, as one process or as `torchrun` runs it."""
     more = () if "--resume" in argv else ("--resume",)
-    return shlex.join(("poise", verb, *argv, *more))
+    program: tuple[str, ...] = ("poise",)
+    if launched():
+        here, all_ = os.environ["LOCAL_WORLD_SIZE"], os.environ["WORLD_SIZE"]
+        nodes = () if here == all_ else ("--nnodes", str(int(all_) // int(here)))
+        program = ("torchrun", *nodes, "--nproc-per-node", here, "-m", "poise")
+    return shlex.join((*program, verb, *argv, *more))

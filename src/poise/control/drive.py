@@ -33,6 +33,9 @@ class Drive:
     xfrc_applied: Tensor
 
     def __post_init__(self) -> None:
+        if torch.jit.is_tracing():
+            # While operations are recorded for any number of worlds, sizes are no plain numbers.
+            return
         n = self.ctrl.shape[0]
         shapes = tuple(self.ctrl.shape), tuple(self.qfrc_applied.shape), tuple(self.xfrc_applied.shape)
         if [len(s) for s in shapes] != [2, 2, 3] or shapes[2][2] != 6 or {s[0] for s in shapes} != {n}:

@@ -94,12 +94,13 @@ class ImplicitResidual:
     def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
         """Adds the root's generalized force eta_r; body row 0 is the root (MuJoCo body 1)."""
         root = xquat[:, 1].to(action.dtype)
+        # Force and torque are one vector each, so that both are capped and turned together.
         unit = action.reshape(-1, 2, 3)
-        force = quat_rotate(heading_quat(root), _capped(unit[:, :1])[:, 0] * self.limit_n)
-        torque_b = _capped(unit[:, 1:])[:, 0] * self.limit_nm
+        local = unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
+        local = local * local.new_tensor([[self.limit_n], [self.limit_nm]])
+        force, torque = quat_rotate(torch.stack((heading_quat(root), root), 1), local).unbind(1)
         drive.qfrc_applied[:, 0:3].add_(force)
-        drive.qfrc_applied[:, 3:6].add_(torque_b)
-        torque = quat_rotate(root, torque_b)
+        drive.qfrc_applied[:, 3:6].add_(local[:, 1])
         return Wrench(force[:, None], torque[:, None], xpos[:, 1:2].to(action.dtype), (0,))
 
     def regularizer(self, action: Tensor) -> Tensor:

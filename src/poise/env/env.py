@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from poise.control import PDTargets, Residual, Wrench
+from poise.control import Drive, PDTargets, Residual, Wrench
 from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm
+from poise.env.means import Means
+from poise.env.record import TensorFunction, record
 from poise.env.reference import Reference
+from poise.env.terms.evaluate import Seen, Terms, sim_pose
 from poise.errors import PoiseError
-from poise.sim import Backend, NanGuard, body_linear_velocity_w
-from poise.spatial import heading_quat
+from poise.sim import Backend, NanGuard
 
 
 class EnvStep(NamedTuple):
@@ -21,6 +24,7 @@ class EnvStep(NamedTuple):
 
     obs, final_obs `(N, O)`; reward `(N,)`; terminated (failed, or the clip was done to its end),
     truncated (time-out), failed `(N,)` bool; log: means by name.
+    `obs` lies in a buffer that the next step fills again.
     """
 
     obs: Tensor
@@ -28,7 +32,7 @@ class EnvStep(NamedTuple):
     terminated: Tensor
     truncated: Tensor
     final_obs: Tensor
-    log: dict[str, float]
+    log: Mapping[str, float]
     failed: Tensor
 
 
@@ -55,6 +59,8 @@ class ImitationEnv:
 
     An action is `hinges` joint actions followed by the residual's. At step t the character stands at
     reference frame t, acts toward frame t + 1, and is rewarded there.
+
+    fused: terms are recorded once and replayed as a whole, see `Terms`; off, one by one.
     """
 
     def __init__(
@@ -66,6 +72,7 @@ class ImitationEnv:
         seed: int = 0,
         weights: Tensor | None = None,
         guard: NanGuard | None = None,
+        fused: bool = True,
     ):
         self.reference, self.backend, self.task, self.substeps = reference, backend, task, substeps
         self.num_envs, self.device = backend.num_envs, torch.device("cpu")
@@ -88,8 +95,18 @@ class ImitationEnv:
         self.wrench: Wrench | None = None
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n)
+        # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
+        shares = [[t.weight, t.weight * t.imitation] for t in task.rewards]
+        self._reward_weights = torch.tensor(shares).reshape(-1, 2).T.contiguous()
+        # What the reference does one step from now, packed; kept up to date by whatever moves a world.
+        self._goal, self._goal_rows = torch.empty(0), torch.empty(0, dtype=torch.long)
+        self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long)
+        self._control: TensorFunction | None = None
+        self._helped: tuple[int, ...] = ()
+        self._terms = Terms(task.obs, task.rewards, task.dones, self._frame_of, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
+        self._obs = torch.empty(n, self.num_obs)
 
     # --- episodes -----------------------------------------------------------------------------
 
@@ -112,6 +129,7 @@ class ImitationEnv:
         self.age.zero_()
         self.action.zero_()
         self.backend.write(None, *self.reference.coordinates(self.clip, self.frame))
+        self._aim()
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
     def _restart(self, ids: Tensor) -> None:
@@ -124,6 +142,13 @@ class ImitationEnv:
         self.age[ids] = 0
         self.action[ids] = 0.0
         self.backend.write(ids, *self.reference.coordinates(pick, frame))
+        self._goal_rows[ids] = self.reference.rows(pick, frame + 1)
+        self._goal[ids] = self.reference.gather_packed(pick, frame + 1)
+
+    def _aim(self) -> None:
+        """Looks up where the reference goes from here."""
+        self._goal_rows = self.reference.rows(self.clip, self.frame + 1)
+        self._goal = self.reference.gather_packed(self.clip, self.frame + 1, self._goal_rows)
 
     # --- stepping -----------------------------------------------------------------------------
 
@@ -133,95 +158,123 @@ class ImitationEnv:
             raise PoiseError(
                 f"actions must be ({self.num_envs}, {self.num_actions}), got {tuple(actions.shape)}"
             )
-        self.action = actions.float()
-        drive, state = self.backend.drive, self.backend.state
-        drive.clear()
-        rows = self.reference.rows(self.clip, self.frame + 1)
-        joints, extra = self.action[:, : self.hinges], self.action[:, self.hinges :]
-        self.task.pd.apply(joints, self.reference.qpos[rows, 7:], drive)
-        if self.task.residual is not None:
-            self.wrench = self.task.residual.apply(extra, state.xpos, state.xquat, state.xipos, drive)
+        # A copy, since a restart clears its rows and the caller's actions are the caller's.
+        self.action.copy_(actions)
+        self._apply()
         if self._guard is not None:
             self._guard.step(self.substeps)
         else:
             self.backend.step(self.substeps)
         self.frame += 1
         self.age += 1
-        view = self._frame(ahead=False)
-        reward = torch.zeros(self.num_envs)
-        self.imitation = torch.zeros(self.num_envs)
-        for term in self.task.rewards:
-            value = term.fn(view, **term.params)
-            self.terms[term.name] = value
-            reward += term.weight * value
-            if term.imitation:
-                self.imitation += term.weight * value
-        failed = torch.zeros(self.num_envs, dtype=torch.bool)
-        for done in self.task.dones:
-            failed |= done.fn(view, **done.params)
+        ref = self._goal
+        self._aim()
+        final, values, failed = self._terms.judge(self._seen(ref, self._goal))
+        self.terms = {t.name: values[k] for k, t in enumerate(self.task.rewards)}
+        reward, self.imitation = (self._reward_weights @ values).unbind(0)
         # A clip that is done to its end is a finished task, whose remaining return is known to be
         # zero; the phase in the observation tells the critic when. To bootstrap there would rest on
         # a state whose value is never learned, and the policy comes to exploit it.
         last = self.frame >= self.reference.length[self.clip] - 1
         terminated = failed | (last & ~self.reference.cyclic[self.clip])
         truncated = (self.age >= self.task.horizon) & ~terminated
-        obs = final = self._observe(view)
+        obs = final
+        log = Means(self.terms, self.imitation, self.wrench)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
             if len(ids):
                 self._restart(ids)
-                obs = self._observe()
-        return EnvStep(obs, reward, terminated, truncated, final, self._log(), failed)
+                ref = self.reference.gather_packed(self.clip[ids], self.frame[ids])
+                obs = self._obs.copy_(final)
+                obs[ids] = self._terms.observe(self._seen(ref, self._goal[ids], ids))
+        return EnvStep(obs, reward, terminated, truncated, final, log, failed)
 
-    def _log(self) -> dict[str, float]:
-        log = {f"reward/{name}": float(value.mean()) for name, value in self.terms.items()}
-        log["imitation"] = float(self.imitation.mean())
-        if self.wrench is not None:
-            log["help/force_n"] = float(self.wrench.force.norm(dim=-1).sum(-1).mean())
-            log["help/torque_nm"] = float(self.wrench.torque.norm(dim=-1).sum(-1).mean())
-        return log
+    def _apply(self) -> None:
+        """Turns the action into what drives the characters, held over the control step."""
+        state, drive, residual = self.backend.state, self.backend.drive, self.task.residual
+        given = (
+            self.action,
+            self.reference.hinges.index_select(0, self._goal_rows),
+            state.xpos,
+            state.xquat,
+            state.xipos,
+            drive.ctrl,
+            drive.qfrc_applied,
+            drive.xfrc_applied,
+        )
+        if self._control is None:
+            self._control = record(self._controlled, given) if self._terms.fused else self._controlled
+        done = self._control(*given)
+        if residual is not None:
+            force, torque, point = done
+            self.wrench = Wrench(force, torque, point, self._helped)
+
+    def _controlled(self, action: Tensor, targets: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """Fills the drive (the last three of `state`) anew; the wrench's force, torque and point."""
+        xpos, xquat, xipos, *applied = state
+        drive = Drive(*applied)
+        drive.clear()
+        joints, extra = action[:, : self.hinges], action[:, self.hinges :]
+        self.task.pd.apply(joints, targets, drive)
+        if self.task.residual is None:
+            return (joints,)
+        force, torque, point, self._helped = self.task.residual.apply(extra, xpos, xquat, xipos, drive)
+        return force, torque, point
 
     # --- views --------------------------------------------------------------------------------
 
     def pose(self) -> Pose:
-        """The simulated characters now."""
-        state, model = self.backend.state, self.backend.model
-        qpos = state.qpos.float()
-        return Pose(
-            qpos,
-            state.qvel.float(),
-            state.xpos[:, 1:].float(),
-            state.xquat[:, 1:].float(),
-            body_linear_velocity_w(state, model)[:, 1:].float(),
-            state.cvel[:, 1:, :3].float(),
-            state.subtree_com[:, 1].float(),
-            self.reference.local(qpos),
-            heading_quat(qpos[:, 3:7]),
-        )
+        """The simulated characters now; read it before the next step."""
+        return sim_pose(self._seen(self._goal, self._goal), self.reference.local, self._roots)
 
     def where(self, env: int) -> str:
         """Which frame of which clip world `env` is at, for messages."""
         return f"{self.reference.names[int(self.clip[env])]} frame {int(self.frame[env])}"
 
-    def _frame(self, ahead: bool) -> Frame:
-        extra = self.action[:, self.hinges :]
-        reg = self.task.residual.regularizer(extra) if self.task.residual else torch.ones(self.num_envs)
-        return Frame(
-            self.pose(),
-            self.reference.gather(self.clip, self.frame),
-            self.reference.gather(self.clip, self.frame + 1) if ahead else None,
-            self.reference.phase(self.clip, self.frame),
-            extra,
-            reg,
-            self.reference.min_height[self.clip],
+    def _seen(self, ref: Tensor, ahead: Tensor, ids: Tensor | None = None) -> Seen:
+        """What the terms are worked out from, of all worlds or of the worlds `ids`."""
+        state = self.backend.state
+        clip, frame, action = self.clip, self.frame, self.action
+        if ids is not None:
+            clip, frame, action = clip[ids], frame[ids], action[ids]
+
+        def of(field: Tensor) -> Tensor:
+            return field if ids is None else field[ids]
+
+        return Seen(
+            of(state.qpos),
+            of(state.qvel),
+            of(state.xpos),
+            of(state.xquat),
+            of(state.cvel),
+            of(state.subtree_com),
+            ref,
+            ahead,
+            self.reference.phase(clip, frame),
+            action[:, self.hinges :],
+            self.reference.min_height[clip],
         )
 
-    def _observe(self, view: Frame | None = None) -> Tensor:
-        view = view or self._frame(ahead=True)
-        if view.ahead is None:
-            ahead = self.reference.gather(self.clip, self.frame + 1)
-            view = Frame(view.sim, view.ref, ahead, view.phase, view.residual, view.reg, view.min_height)
-        return torch.cat([term.fn(view, **term.params) for term in self.task.obs], -1)
+    def _frame_of(self, seen: Seen) -> Frame:
+        residual, reference = self.task.residual, self.reference
+        return Frame(
+            sim_pose(seen, reference.local, self._roots),
+            reference.unpacked(seen.ref),
+            reference.unpacked(seen.ahead),
+            seen.phase,
+            seen.residual,
+            residual.regularizer(seen.residual) if residual else torch.ones_like(seen.phase),
+            seen.low,
+        )
+
+    def _frame(self) -> Frame:
+        """What the terms see of all worlds, from nothing but where they are."""
+        packed = (self.reference.gather_packed(self.clip, self.frame + k) for k in (0, 1))
+        return self._frame_of(self._seen(*packed))
+
+    def _observe(self) -> Tensor:
+        frame = self._frame()
+        return torch.cat([term.fn(frame, **term.params) for term in self.task.obs], -1)
 
     # --- persistence --------------------------------------------------------------------------
 
@@ -242,6 +295,7 @@ class ImitationEnv:
         for name in ("clip", "frame", "age"):
             getattr(self, name).copy_(state[name])
         self.action = state["action"].clone()
+        self._aim()
         self._rng.set_state(state["rng"])
 
     def close(self) -> None:

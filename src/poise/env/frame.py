@@ -30,12 +30,30 @@ class Pose:
     heading: Tensor
 
 
+class LazyPose(Pose):
+    """A pose whose fields are made when a term first asks for them, and kept.
+
+    makers: a function for every field. What is asked for must be asked for before the state that the
+    functions read moves on.
+    """
+
+    def __init__(self, **makers: Callable[[], Tensor]):
+        self.__dict__["_makers"] = makers
+
+    def __getattr__(self, name: str) -> Tensor:
+        makers = self.__dict__.get("_makers", {})
+        if name not in makers:
+            raise AttributeError(name)
+        value = self.__dict__[name] = makers[name]()
+        return value
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """Everything that a term may use; tensors only.
 
     sim: the character now. ref: the reference at the same time. ahead: the reference one control
-    step later (None while rewards are computed). phase `(N,)` in [0, 1]: place in the clip.
+    step later, where it is known. phase `(N,)` in [0, 1]: place in the clip.
     residual `(N, k)`: unscaled residual action of the last step. reg `(N,)`: its regularizer.
     min_height `(N,)` m: lowest root height of the reference clip.
     """

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -13,6 +15,9 @@ from poise.env.frame import Pose
 from poise.errors import PoiseError
 from poise.kin import Kinematics, cycle_step, cycle_velocity, qpos_velocity
 from poise.spatial import heading_quat, quat_mul, quat_rotate
+
+#: The fields of a pose in the order in which they are packed.
+FIELDS = tuple(f.name for f in fields(Pose))
 
 
 class Reference:
@@ -51,6 +56,7 @@ class Reference:
         )
         self.qpos, self.qvel = qpos, qvel
         self.pose = self._pose(qpos, qvel)
+        self.hinges = qpos[:, 7:].contiguous()
         self.length = torch.tensor([len(q) for q in motions])
         self.start = torch.cumsum(self.length, 0) - self.length
         self.cyclic = torch.tensor(cyclic)
@@ -113,13 +119,42 @@ class Reference:
             frame = torch.where(self.cyclic[clip], torch.remainder(frame, last), frame)
         return torch.minimum(frame, last).float() / last.float()
 
+    @property
+    def pose(self) -> Pose:
+        """Every frame of every clip, as it stands in the clip."""
+        return self.unpacked(self._packed)
+
+    @pose.setter
+    def pose(self, pose: Pose) -> None:
+        shapes = [getattr(pose, name).shape[1:] for name in FIELDS]
+        self._shapes = tuple(shapes)
+        self._widths = [math.prod(shape) for shape in shapes]
+        self._packed = _pack(pose)
+
     def gather(self, clip: Tensor, frame: Tensor) -> Pose:
         """The reference pose of `frame (N)` of `clip (N)`; cyclic clips are carried on."""
-        rows = self.rows(clip, frame)
-        p = self.pose
-        out = Pose(*(getattr(p, name)[rows] for name in p.__dataclass_fields__))
+        return self.unpacked(self.gather_packed(clip, frame))
+
+    def gather_packed(self, clip: Tensor, frame: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same poses as rows `(N, W)` of all their numbers, for `unpacked`.
+
+        rows: what `self.rows(clip, frame)` gives, where it is known already.
+        """
+        packed = self._packed.index_select(0, self.rows(clip, frame) if rows is None else rows)
         carry = self._carry(clip, frame)
-        return out if carry is None else _carried(out, carry[0].float(), carry[1].float())
+        if carry is None:
+            return packed
+        return _pack(_carried(self.unpacked(packed), carry[0].float(), carry[1].float()))
+
+    def unpacked(self, packed: Tensor) -> Pose:
+        """The poses whose numbers are the rows of `packed (N, W)`, as views of it."""
+        parts = packed.split_with_sizes(self._widths, -1)
+        return Pose(
+            *(
+                part if len(shape) == 1 else part.unflatten(-1, shape)
+                for part, shape in zip(parts, self._shapes, strict=True)
+            )
+        )
 
     def coordinates(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """`qpos (N, 7 + n)` and `qvel (N, 6 + n)`, float64, of the poses that `gather` gives."""
@@ -171,3 +206,7 @@ def _carried(pose: Pose, turn: Tensor, move: Tensor) -> Pose:
         pose.local,
         quat_mul(turn, pose.heading),
     )
+
+
+def _pack(pose: Pose) -> Tensor:
+    return torch.cat([getattr(pose, name).flatten(1) for name in FIELDS], 1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.spatial import euler_to_quat, quat_mul, quat_rotate
+from poise.spatial import quat_mul, quat_rotate
 
 
 class BodyState(NamedTuple):
@@ -43,12 +43,16 @@ class Kinematics:
         self.hinges = at
         #: Rows that have hinges, in order.
         self.hinged = tuple(i for i, r in enumerate(self._rows) if r[4])
+        # Chains of one order of axes are computed together: where they stand, and their hinges, all
+        # first ones, then all second ones and so on.
         self._groups = []
         for order in dict.fromkeys(self._rows[i][4] for i in self.hinged):
             places = [k for k, i in enumerate(self.hinged) if self._rows[i][4] == order]
-            starts = [7 + self._rows[self.hinged[k]][6] for k in places]
-            columns = torch.tensor([[s + d for d in range(len(order))] for s in starts])
-            self._groups.append((order, torch.tensor(places), columns))
+            starts = [self._rows[self.hinged[k]][6] for k in places]
+            columns = [s + d for d in range(len(order)) for s in starts]
+            self._groups.append((order, places, torch.tensor(columns)))
+        placed = [k for _, places, _ in self._groups for k in places]
+        self._order = torch.tensor(placed).argsort()
 
     def __call__(self, qpos: Tensor, qvel: Tensor | None = None) -> BodyState:
         """World body states of `qpos (..., 7 + n)` and, where given, `qvel (..., 6 + n)`."""
@@ -88,7 +92,26 @@ class Kinematics:
         turns are stated in that frame.
         """
         qpos = qpos.to(self.dtype)
-        out = qpos.new_empty(*qpos.shape[:-1], len(self.hinged), 4)
+        # Hinges come first, so that every pass runs over numbers that lie side by side.
+        half = 0.5 * qpos[..., 7:].movedim(-1, 0).contiguous()
+        cos, sin = half.cos(), half.sin()
+        turns = []
         for order, places, columns in self._groups:
-            out[..., places, :] = euler_to_quat(qpos[..., columns], order)
-        return out
+            of = (x.index_select(0, columns).unflatten(0, (-1, len(places))) for x in (cos, sin))
+            turns.append(_chain(order, *of))
+        joints = torch.cat(turns, 1).index_select(1, self._order)
+        return joints.movedim((0, 1), (-1, -2)).contiguous()
+
+
+def _chain(order: str, cos: Tensor, sin: Tensor) -> Tensor:
+    """Quaternions `(4, J, ...)` of J hinge chains from the halved angles' `cos`, `sin (n, J, ...)`."""
+    zero = torch.zeros_like(cos[0])
+    turn = [cos[0], zero, zero, zero]
+    turn[1 + "XYZ".index(order[0])] = sin[0]
+    for i, letter in enumerate(order[1:], 1):
+        c, s = cos[i], sin[i]
+        w, u, v, t = (0, *(1 + ("XYZ".index(letter) + k) % 3 for k in range(3)))
+        # (w, u, v, t) times (c, s) about u's axis; v and t are the axes that follow it cyclically.
+        turn[w], turn[u] = turn[w] * c - turn[u] * s, turn[u] * c + turn[w] * s
+        turn[v], turn[t] = turn[v] * c + turn[t] * s, turn[t] * c - turn[v] * s
+    return torch.stack(turn)

@@ -95,6 +95,7 @@ def check_fits(meta: Mapping[str, Any], path: str | Path | None = None, **expect
         if want is None or found == want:
             continue
         words = {
+            "processes": f"the checkpoint was saved by {found} processes together, this run has {want}",
             "character": f"the checkpoint belongs to the character '{found}', not to '{want}'",
             "num_obs": f"the checkpoint's policy takes {found} observations, the environment has {want}",
             "num_actions": f"the checkpoint's policy gives {found} actions, the environment has {want}",

@@ -61,6 +61,10 @@ class PPOConfig:
     critic_warmup: int = 0
     """First iterations that train only the critic; a warm-started policy needs about 8, since a
     cold critic would undo it."""
+    products: Literal["auto", "float32", "bfloat16"] = "auto"
+    """How the update multiplies the hidden layers; weights, moments, output layers and the policy that
+    acts are float32. auto takes bfloat16 where the processor multiplies it itself, at half the cost.
+    float32 gives the same numbers on processors with and without."""
     normalise_returns: bool = True
     """The critic learns returns scaled to mean 0 and deviation 1 (PopArt, van Hasselt 2016)."""
     obs_clip: float = 5.0
@@ -76,6 +80,9 @@ class PPOConfig:
         for name in ("horizon", "epochs", "minibatch", "policy_lr", "value_lr", "clip"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "PPOConfig")
+        if self.products not in ("auto", "float32", "bfloat16"):
+            hint = "Use auto, float32 or bfloat16"
+            raise PoiseError(f"products cannot be in '{self.products}'", "PPOConfig", hint)
         for name in ("gamma", "lam"):
             if not 0 <= getattr(self, name) <= 1:
                 raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "PPOConfig")

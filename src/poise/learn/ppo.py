@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from torch import Tensor
 from poise.learn.config import PPOConfig
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
+from poise.learn.parallel import ALONE, Comm, average_gradients, moments, noise_name, shared_statistics
 from poise.learn.policy import PolicyBundle
 from poise.learn.rollout import Rollout
 from poise.learn.state import (
@@ -24,9 +27,18 @@ from poise.learn.state import (
     take,
     under,
 )
-from poise.nets import MLP, RunningNorm, gaussian_entropy, gaussian_kl, gaussian_log_prob
+from poise.nets import (
+    MLP,
+    RunningNorm,
+    bfloat16_is_fast,
+    gaussian_entropy,
+    gaussian_kl,
+    gaussian_log_prob,
+    half_forward,
+)
 
-_SUMS: tuple[str, ...] = ("policy loss", "value loss", "kl", "clip fraction", "policy gradient")
+_SUMS: tuple[str, ...] = ("policy loss", "kl", "clip fraction", "policy gradient")
+_LOGGED = (*_SUMS, "value loss")
 RETURN_WINDOW = 10  # Batches over which the scale of the returns is remembered.
 
 
@@ -49,6 +61,18 @@ class UpdateStats:
     policy_lr: float
 
 
+class _Batch(NamedTuple):
+    """What the minibatches are taken from, `(T N, ...)` each."""
+
+    obs: Tensor
+    advantage: Tensor
+    target: Tensor
+    action: Tensor
+    log_prob: Tensor
+    mean: Tensor
+    log_std: Tensor
+
+
 def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip: float) -> Tensor:
     """The policy loss: -mean min(r A, clip(r, 1 - e, 1 + e) A) with r = pi / pi_old; a scalar."""
     ratio = (log_prob - old_log_prob).exp()
@@ -64,6 +88,7 @@ class PPO:
         config: the settings.
         seed: seeds the first weights, the action noise and the shuffling, each apart.
         device: where everything lives.
+        comm: the processes that learn together; the config's `minibatch` counts all of them.
     """
 
     def __init__(
@@ -73,8 +98,9 @@ class PPO:
         config: PPOConfig,
         seed: int,
         device: torch.device | str = "cpu",
+        comm: Comm = ALONE,
     ):
-        self.config = config
+        self.config, self.comm = config, comm
         init = make_generator(seed, "weights")
         self.actor = PolicyBundle.make(
             num_obs,
@@ -90,25 +116,34 @@ class PPO:
         self.return_norm = RunningNorm(1, clip=math.inf).to(device)
         self.actor.norm.to(device)
         self.actor.policy.to(device)
-        self.noise = make_generator(seed, "noise", device)
+        self.noise = make_generator(seed, noise_name(comm), device)
         self.shuffle = make_generator(seed, "shuffle", device)
         self._policy_params = [p for p in self.actor.policy.parameters() if p.requires_grad]
         self._value_params = list(self.critic.parameters())
-        groups = [
-            {"params": self._policy_params, "lr": config.policy_lr},
-            {"params": self._value_params, "lr": config.value_lr},
-        ]
-        self.optimizer = torch.optim.Adam(groups, lr=config.policy_lr, fused=True)
+        # Policy and critic share nothing, so that each can be trained in a thread of its own.
+        self.optimizer = torch.optim.Adam(self._policy_params, lr=config.policy_lr, fused=True)
+        self.value_optimizer = torch.optim.Adam(self._value_params, lr=config.value_lr, fused=True)
+        here = torch.device(device).type == "cpu"
+        self._half = config.products == "bfloat16" or (
+            config.products == "auto" and here and bfloat16_is_fast()
+        )
+        self._pool: ThreadPoolExecutor | None = None
 
     def value(self, obs: Tensor) -> Tensor:
         """V of normalised observations `(..., O)` in units of reward, `(...)`."""
         return self.return_norm.inverse(self.critic(obs)).squeeze(-1)
 
     @torch.no_grad()
-    def estimate(self, rollout: Rollout) -> None:
+    def _value(self, obs: Tensor) -> Tensor:
+        return self.value(obs)
+
+    @torch.no_grad()
+    def estimate(self, rollout: Rollout, parallel: bool = False) -> None:
         """Fills the rollout's values, advantages and returns."""
         config = self.config
-        value = self.value(rollout.obs)
+        rows = rollout.obs.tensor_split(2)
+        second = self._beside(parallel, self._value, rows[1])
+        value = torch.cat((self._value(rows[0]), second()))
         rollout.value.copy_(value[:-1])
         rollout.next_value.copy_(value[1:])
         terminated = rollout.terminated
@@ -130,19 +165,22 @@ class PPO:
         rollout.advantage.copy_(advantage)
         rollout.returns.copy_(returns)
 
-    def update(self, rollout: Rollout, train_policy: bool = True) -> UpdateStats:
+    def update(self, rollout: Rollout, train_policy: bool = True, threads: int = 1) -> UpdateStats:
         """Learns from a collected rollout, then takes the new observation statistics into use.
+
+        With more than one of `threads`, policy and critic are trained at the same time, to the same
+        numbers.
 
         A loss or weight that is not finite raises a `TrainingError` and puts back the weights,
         moments and generators from before this update.
         """
         before = self.state()
         try:
-            self.estimate(rollout)
-            explained = _explained_variance(rollout.returns, rollout.value)
+            self.estimate(rollout, threads > 1)
+            explained = _explained_variance(self.comm, rollout.returns, rollout.value)
             if self.config.normalise_returns:
                 self._rescale_critic(rollout.returns)
-            sums, kl = self._fit(rollout, train_policy)
+            sums, kl = self._fit(rollout, train_policy, threads > 1)
             self._adapt_lr(kl)
         except TrainingError:
             self.load_state(before)
@@ -159,49 +197,109 @@ class PPO:
             policy_lr=self.optimizer.param_groups[0]["lr"],
         )
 
-    def _fit(self, rollout: Rollout, train_policy: bool) -> tuple[dict[str, float], float]:
+    def _fit(
+        self, rollout: Rollout, train_policy: bool, parallel: bool
+    ) -> tuple[dict[str, float], float]:
         """All epochs; the mean of each sum and the KL of the last epoch of the policy."""
         config, kl = self.config, 0.0
-        obs = rollout.obs[:-1].flatten(0, 1)
         advantage = rollout.advantage.flatten()
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        target = self.return_norm(rollout.returns.view(-1, 1))
-        action, mean_0 = rollout.action.flatten(0, 1), rollout.mean.flatten(0, 1)
-        log_prob = rollout.log_prob.flatten()
-        old_log_std = self.actor.policy.log_std.detach().clone()
-        parts = max(1, round(rollout.samples / config.minibatch))
+        obs = rollout.obs[:-1].flatten(0, 1)
+        action, old_mean, log_prob = rollout.action.flatten(0, 1), rollout.mean, rollout.log_prob
+        if self._half:
+            # The old policy in the arithmetic of the new one, so that both are equal at first.
+            obs, policy = obs.bfloat16(), self.actor.policy
+            with torch.no_grad():
+                old_mean = half_forward(policy.mean, obs)
+                log_prob = gaussian_log_prob(action, old_mean, policy.log_std)
+        mean, std = moments(self.comm, advantage)
+        batch = _Batch(
+            obs,
+            (advantage - mean) / (std + 1e-8),
+            self.return_norm(rollout.returns.view(-1, 1)),
+            action,
+            log_prob.flatten(),
+            old_mean.reshape(action.shape),
+            self.actor.policy.log_std.detach().clone(),
+        )
+        parts = max(1, round(rollout.samples * self.comm.size / config.minibatch))
+        # Processes that share gradients make the same calls in the same order, so in one thread.
+        parallel = parallel and self.comm.size == 1
         means: list[dict[str, float]] = []
         for _ in range(config.epochs):
             order = torch.randperm(rollout.samples, generator=self.shuffle, device=obs.device)
-            sums = torch.zeros(len(_SUMS), device=obs.device)
-            for index in order.tensor_split(parts):
-                batch_obs = obs.index_select(0, index)
-                value_loss = (self.critic(batch_obs) - target.index_select(0, index)).square().mean()
-                loss, terms = value_loss, [value_loss.new_zeros(())] * 3
-                if train_policy:
-                    policy_loss, *terms = self._policy_loss(
-                        batch_obs,
-                        advantage.index_select(0, index),
-                        action.index_select(0, index),
-                        log_prob.index_select(0, index),
-                        mean_0.index_select(0, index),
-                        old_log_std,
-                    )
-                    loss = loss + policy_loss
-                norm = self._step(loss, train_policy)
-                sums += torch.stack([terms[0], value_loss.detach(), terms[1], terms[2], norm])
+            indices = order.tensor_split(parts)
+            value = self._beside(parallel and train_policy, self._fit_value, batch, indices)
+            try:
+                sums = (
+                    self._fit_policy(batch, indices) if train_policy else advantage.new_zeros(len(_SUMS))
+                )
+            finally:
+                # The critic's thread never outlives the epoch.
+                value_loss = value()
             # The only wait for the numbers, once per epoch.
-            mean: dict[str, float] = dict(zip(_SUMS, (sums / parts).tolist(), strict=True))
-            self._check(mean)
-            means.append(mean)
+            sums = self.comm.sum_(torch.cat((sums, value_loss.view(1)))) / (parts * self.comm.size)
+            epoch: dict[str, float] = dict(zip(_LOGGED, sums.tolist(), strict=True))
+            self._check(epoch)
+            means.append(epoch)
             if train_policy:
-                kl = mean["kl"]
+                kl = epoch["kl"]
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
-        return {name: sum(m[name] for m in means) / len(means) for name in _SUMS}, kl
+        return {name: sum(m[name] for m in means) / len(means) for name in means[0]}, kl
+
+    def _beside(self, parallel: bool, work: Callable[..., Tensor], *args: Any) -> Callable[[], Tensor]:
+        """Starts `work` in the critic's thread, or at once where not `parallel`; gives its result."""
+        if not parallel:
+            result = work(*args)
+            return lambda: result
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, "critic", torch.set_num_threads, (1,))
+        return self._pool.submit(work, *args).result
+
+    def _net(self, net: MLP, batch: _Batch, index: Tensor) -> Tensor:
+        """The network's output for some samples, multiplied as the config wants it."""
+        obs = batch.obs.index_select(0, index)
+        return half_forward(net, obs) if self._half else net(obs)
+
+    def _fit_value(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
+        """One epoch of the critic; the sum of its losses."""
+        total = batch.target.new_zeros(())
+        for index in indices:
+            value = self._net(self.critic, batch, index)
+            loss = (value - batch.target.index_select(0, index)).square().mean()
+            self.value_optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            average_gradients(self.comm, self._value_params)
+            if (limit := self.config.value_grad_norm) is not None:
+                torch.nn.utils.clip_grad_norm_(self._value_params, limit, foreach=True)
+            self.value_optimizer.step()
+            total += loss.detach()
+        return total
+
+    def _fit_policy(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
+        """One epoch of the policy; the sums of `_SUMS`."""
+        sums = batch.advantage.new_zeros(len(_SUMS))
+        given = self.config.policy_grad_norm
+        limit = math.inf if given is None else given
+        for index in indices:
+            loss, *terms = self._policy_loss(
+                self._net(self.actor.policy.mean, batch, index),
+                batch.advantage.index_select(0, index),
+                batch.action.index_select(0, index),
+                batch.log_prob.index_select(0, index),
+                batch.mean.index_select(0, index),
+                batch.log_std,
+            )
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            average_gradients(self.comm, self._policy_params)
+            norm = torch.nn.utils.clip_grad_norm_(self._policy_params, limit, foreach=True)
+            self.optimizer.step()
+            sums += torch.stack([*terms, norm])
+        return sums
 
     def _policy_loss(
         self,
-        obs: Tensor,
+        mean: Tensor,
         advantage: Tensor,
         action: Tensor,
         old_log_prob: Tensor,
@@ -209,8 +307,7 @@ class PPO:
         old_log_std: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The loss to descend, and for the log: itself, the KL and the share of clipped ratios."""
-        config, policy = self.config, self.actor.policy
-        mean, log_std = policy(obs), policy.log_std
+        config, log_std = self.config, self.actor.policy.log_std
         log_prob = gaussian_log_prob(action, mean, log_std)
         loss = clipped_surrogate(log_prob, old_log_prob, advantage, config.clip)
         if config.entropy_weight:
@@ -224,27 +321,14 @@ class PPO:
             clipped = ((log_prob - old_log_prob).expm1().abs() > config.clip).float().mean()
         return loss, loss.detach(), kl, clipped
 
-    def _step(self, loss: Tensor, train_policy: bool) -> Tensor:
-        """One Adam step; returns the policy's gradient norm before clipping."""
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        config, norm = self.config, loss.new_zeros(())
-        if train_policy:
-            limit = math.inf if config.policy_grad_norm is None else config.policy_grad_norm
-            norm = torch.nn.utils.clip_grad_norm_(self._policy_params, limit, foreach=True)
-        if config.value_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_(self._value_params, config.value_grad_norm, foreach=True)
-        # Parameters without a gradient, as the policy's in a warm-up, are left alone.
-        self.optimizer.step()
-        return norm
-
     @torch.no_grad()
     def _rescale_critic(self, returns: Tensor) -> None:
         """Updates the scale of the returns and leaves what the critic predicts unchanged."""
         norm, last = self.return_norm, self.critic.last
         first, (mean, std) = float(norm.count) == 0, (norm.shift.clone(), norm.std.clone())
-        norm.window = RETURN_WINDOW * returns.numel()
-        norm.observe(returns.reshape(-1, 1))
+        norm.window = RETURN_WINDOW * returns.numel() * self.comm.size
+        with shared_statistics(self.comm, norm):
+            norm.observe(returns.reshape(-1, 1))
         norm.freeze()
         if not first:
             # std' (w' h + b') + mean' = std (w h + b) + mean
@@ -279,7 +363,8 @@ class PPO:
             self.actor.state()
             | prefixed("critic", self.critic.state_dict())
             | prefixed("return_norm", self.return_norm.state_dict())
-            | prefixed("adam", optimizer_state(self.optimizer))
+            | prefixed("adam/policy", optimizer_state(self.optimizer))
+            | prefixed("adam/value", optimizer_state(self.value_optimizer))
             | {"generator/noise": self.noise.get_state(), "generator/shuffle": self.shuffle.get_state()}
         )
 
@@ -293,17 +378,17 @@ class PPO:
         self.actor.load_state(state)
         load_module(self.critic, state, "critic")
         load_module(self.return_norm, state, "return_norm")
-        load_optimizer_state(self.optimizer, under("adam", state))
-        policy_group, value_group = self.optimizer.param_groups
-        value_group["lr"] = self.config.value_lr
+        load_optimizer_state(self.optimizer, under("adam/policy", state))
+        load_optimizer_state(self.value_optimizer, under("adam/value", state))
+        self.value_optimizer.param_groups[0]["lr"] = self.config.value_lr
         if self.config.kl_target is None:
-            policy_group["lr"] = self.config.policy_lr
+            self.optimizer.param_groups[0]["lr"] = self.config.policy_lr
         if not self.config.learn_std:
             self.actor.policy.log_std.data.copy_(fixed_log_std)
         self.noise.set_state(take(state, "generator/noise").cpu())
         self.shuffle.set_state(take(state, "generator/shuffle").cpu())
 
 
-def _explained_variance(returns: Tensor, value: Tensor) -> float:
-    spread = float(returns.var())
-    return 1 - float((returns - value).var()) / spread if spread > 0 else 0.0
+def _explained_variance(comm: Comm, returns: Tensor, value: Tensor) -> float:
+    spread = float(moments(comm, returns)[1])
+    return 1 - (float(moments(comm, returns - value)[1]) / spread) ** 2 if spread > 0 else 0.0

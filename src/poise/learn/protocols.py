@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import torch
@@ -26,7 +27,7 @@ class Step(NamedTuple):
     final_obs: Tensor
     """`(N, O)` float32, observation of the last state before the automatic reset; rows whose
     episode goes on may hold anything finite, such as `obs`."""
-    log: dict[str, float]
+    log: Mapping[str, float]
     """Means over this step for the log (reward terms, errors, help), cheap to make. Keys keep
     their names all through a run; one that carries a reward term helps to name a faulty term."""
     failed: Tensor | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -72,6 +74,11 @@ class Episodes:
             self.total[done] = 0.0
 
 
+def standard_normal(out: Tensor, noise: torch.Generator) -> None:
+    """Fills `out (T, N, A)` with draws of mean 0 and deviation 1."""
+    torch.randn(out.shape, generator=noise, out=out)
+
+
 @torch.no_grad()
 def collect(
     env: VecEnv,
@@ -88,17 +95,24 @@ def collect(
     to go on from. A number that is not finite raises a `TrainingError`.
     """
     episodes.begin()
-    terms: dict[str, float] = {}
+    logs: list[Mapping[str, float]] = []
     cut_at: list[Tensor] = []
     cut_obs: list[Tensor] = []
     horizon, num_envs = rollout.reward.shape
+    std, started = policy.log_std.exp(), float(norm.count) > 0
+    # All noise of the iteration at once, into the place where the actions will stand.
+    standard_normal(rollout.action, noise)
     check_finite("observation", obs)
     for t in range(horizon):
-        norm.observe(obs)
-        rollout.obs[t] = norm(obs)
-        action, rollout.mean[t] = policy.sample(rollout.obs[t], noise)
-        rollout.action[t] = action
-        step = env.step(action)
+        if started:
+            rollout.obs[t], sums = norm.normalise(obs)
+            norm.add(num_envs, sums)
+        else:
+            norm.observe(obs)
+            rollout.obs[t] = norm(obs)
+        rollout.mean[t] = policy(rollout.obs[t])
+        # a = mean + sigma z
+        step = env.step(rollout.action[t].mul_(std).add_(rollout.mean[t]))
         check_finite("observation", step.obs)
         check_finite("reward", step.reward, step.log)
         rollout.reward[t], rollout.terminated[t] = step.reward, step.terminated
@@ -111,12 +125,12 @@ def collect(
             cut_obs.append(norm(reached))
         failed = step.terminated if step.failed is None else step.failed
         episodes.count(step.reward, step.terminated, step.truncated, failed)
-        for name, value in step.log.items():
-            terms[name] = terms.get(name, 0.0) + value / horizon
+        logs.append(step.log)
         obs = step.obs
     rollout.obs[horizon] = norm(obs)
     rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, policy.log_std))
-    rollout.cut_at = torch.cat(cut_at) if cut_at else rollout.cut_at[:0]
-    rollout.cut_obs = torch.cat(cut_obs) if cut_obs else rollout.cut_obs[:0]
-    rollout.terms = terms
-    return obs
+    rollout.cut_at = torch.cat([rollout.cut_at[:0], *cut_at])
+    rollout.cut_obs = torch.cat([rollout.cut_obs[:0], *cut_obs])
+    rollout.terms = {name: sum(log[name] for log in logs) / horizon for name in logs[0]}
+    # The environment may fill its own tensor again before the next iteration.
+    return obs.clone()

@@ -13,6 +13,7 @@ from poise.errors import PoiseError
 from poise.learn.checkpoint import BEST, LAST_GOOD, LATEST, remove_partial
 from poise.learn.guard import TrainingError
 from poise.learn.log import Log
+from poise.learn.parallel import any_of, together
 from poise.learn.train import IterationStats, Trainer
 
 
@@ -77,23 +78,30 @@ def run(
 
     Ctrl-C ends the run after the present iteration, with a checkpoint; a second one at once. After
     a `TrainingError` the policy of the last good iteration is in `last_good.safetensors`.
+
+    Processes that train together (`poise.learn.parallel`) all call this with the same folder, which
+    rank 0 writes; a wish to stop in one of them stops all after the same iteration.
     """
     if every < 1:
         raise PoiseError(f"the interval of checkpoints must be at least 1, got {every}")
-    keeper = None if folder is None else _Keeper(trainer, Path(folder), resume, tensorboard)
+    with together(trainer.comm):
+        keeper = None if folder is None else _Keeper(trainer, Path(folder), resume, tensorboard)
     stats: IterationStats | None = None
+    stop = until.reached(trainer)
     try:
         with _interruptible() as interrupt:
-            while not until.reached(trainer) and not interrupt.is_set():
+            while not any_of(trainer.comm, stop or interrupt.is_set()):
                 stats = trainer.iterate()
+                stop = until.reached(trainer)
                 if keeper is not None:
-                    last = until.reached(trainer) or interrupt.is_set()
+                    last = any_of(trainer.comm, stop or interrupt.is_set())
                     keeper.keep(stats, last or trainer.iteration % every == 0, score)
                 try:
                     if on_iteration is not None and on_iteration(stats) is False:
-                        break
+                        stop = True
                 except KeyboardInterrupt:
                     interrupt.set()
+            interrupted = any_of(trainer.comm, interrupt.is_set())
             if keeper is not None and keeper.saved != trainer.iteration:
                 keeper.save()
     except TrainingError:
@@ -101,9 +109,9 @@ def run(
             keeper.save_policy(LAST_GOOD)
         raise
     finally:
-        if keeper is not None:
+        if keeper is not None and keeper.log is not None:
             keeper.log.close()
-    return RunResult(stats, interrupt.is_set(), None if keeper is None else keeper.path)
+    return RunResult(stats, interrupted, None if keeper is None else keeper.path)
 
 
 class _Keeper:
@@ -111,8 +119,9 @@ class _Keeper:
 
     def __init__(self, trainer: Trainer, folder: Path, resume: bool, tensorboard: bool):
         self.trainer, self.folder, self.path = trainer, folder, folder / LATEST
-        self.best = float("-inf")
-        folder.mkdir(parents=True, exist_ok=True)
+        self.best, writes = float("-inf"), trainer.comm.rank == 0
+        if writes:
+            folder.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
             if not resume:
                 raise PoiseError(
@@ -121,15 +130,17 @@ class _Keeper:
             saved = trainer.load(self.path)["metadata"]
             if "best_score" in saved:
                 self.best = trainer.metadata["best_score"] = saved["best_score"]
-        remove_partial(folder)
+        if writes:
+            remove_partial(folder)
         self.saved = trainer.iteration if self.path.exists() else -1
-        self.log = Log(folder, trainer.iteration, tensorboard)
+        self.log = Log(folder, trainer.iteration, tensorboard) if writes else None
 
     def keep(
         self, stats: IterationStats, save: bool, score: Callable[[IterationStats], float] | None
     ) -> None:
         # Rows first: a row after the last checkpoint is dropped on resume, a missing one is lost.
-        self.log.write(stats.row())
+        if self.log is not None:
+            self.log.write(stats.row())
         if score is not None and (value := score(stats)) > self.best:
             self.best = value
             self.trainer.metadata["best_score"] = value
@@ -138,11 +149,14 @@ class _Keeper:
             self.save()
 
     def save_policy(self, name: str) -> None:
+        if self.trainer.comm.rank:
+            return
         extra = {**self.trainer.metadata, "iteration": self.trainer.iteration}
         self.trainer.ppo.actor.save(self.folder / name, self.trainer.character, extra)
 
     def save(self) -> None:
-        self.log.flush()
+        if self.log is not None:
+            self.log.flush()
         self.trainer.save(self.path)
         self.saved = self.trainer.iteration
 

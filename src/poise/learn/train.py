@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,16 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
 from poise.learn.config import PPOConfig
+from poise.learn.guard import TrainingError, check_finite
+from poise.learn.parallel import (
+    ALONE,
+    Comm,
+    gather_state,
+    own_state,
+    shared_statistics,
+    sums,
+    together,
+)
 from poise.learn.policy import PolicyBundle
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import VecEnv
@@ -84,8 +93,10 @@ class Trainer:
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
         warm_start: a policy whose weights and observation statistics to start from; the action
             noise stays the config's.
-        update_threads: torch's threads during the update, when the environment's own threads rest;
-            0 leaves torch as it is. Another number may change the last digits.
+        update_threads: with more than one, policy and critic are trained side by side, while the
+            environment's own threads rest; the numbers are the same.
+        comm: the processes that train together, each with a trainer and environments of its own but
+            with the same seed, config and number of environments.
     """
 
     def __init__(
@@ -96,12 +107,13 @@ class Trainer:
         character: str = "",
         metadata: Mapping[str, Any] | None = None,
         warm_start: PolicyBundle | None = None,
-        update_threads: int = 0,
+        update_threads: int = 1,
+        comm: Comm = ALONE,
     ):
         self.env, self.config, self.seed = env, config or PPOConfig(), seed
-        self.update_threads = update_threads
+        self.update_threads, self.comm = update_threads, comm
         self.character, self.metadata = character, dict(metadata or {})
-        self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device)
+        self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device, comm)
         if warm_start is not None:
             load_module(self.ppo.actor.norm, prefixed("norm", warm_start.norm.state_dict()), "norm")
             mean = prefixed("policy/mean", warm_start.policy.mean.state_dict())
@@ -124,44 +136,63 @@ class Trainer:
         start = time.perf_counter()
         obs = self._begin() if self._obs is None else self._obs
         ppo, rollout = self.ppo, self.rollout
-        self._obs = collect(
-            self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise
-        )
+        with shared_statistics(self.comm, ppo.actor.norm), together(self.comm, TrainingError):
+            self._obs = collect(
+                self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise
+            )
         collected = time.perf_counter()
-        with _torch_threads(self.update_threads):
-            update = ppo.update(rollout, train_policy=self.iteration >= self.config.critic_warmup)
+        train_policy = self.iteration >= self.config.critic_warmup
+        update = ppo.update(rollout, train_policy, self.update_threads)
         done = time.perf_counter()
         self.iteration += 1
-        self.samples += rollout.samples
-        self.seconds += done - start
+        self.samples += rollout.samples * self.comm.size
+        reward, seconds, terms = self._share(float(rollout.reward.mean()), done - start, rollout.terms)
+        self.seconds += seconds
         ended = self.episodes
         if ended.finished:
-            sums = (ended.finished_length, ended.finished_total, ended.failures)
-            self._ended = (sums[0] / ended.finished, sums[1] / ended.finished, sums[2] / ended.finished)
+            totals = (ended.finished_length, ended.finished_total, ended.failures)
+            a, b, c = (x / ended.finished for x in totals)
+            self._ended = (a, b, c)
         return IterationStats(
             iteration=self.iteration,
             samples=self.samples,
-            reward=float(rollout.reward.mean()),
+            reward=reward,
             episode_length=self._ended[0],
             episode_reward=self._ended[1],
             failure_rate=self._ended[2],
             episodes=ended.finished,
             update=update,
-            terms=rollout.terms,
+            terms=terms,
             seconds=self.seconds,
             collect_seconds=collected - start,
             update_seconds=done - collected,
-            batch=rollout.samples,
+            batch=rollout.samples * self.comm.size,
         )
+
+    def _share(
+        self, reward: float, seconds: float, terms: dict[str, float]
+    ) -> tuple[float, float, dict[str, float]]:
+        """The numbers of this iteration over all processes: means, summed episodes, one clock."""
+        comm, e = self.comm, self.episodes
+        if comm.size == 1:
+            return reward, seconds, terms
+        names = sorted(terms)
+        mine = [e.finished, e.finished_length, e.finished_total, e.failures]
+        mine += [0.0 if comm.rank else seconds, reward, *(terms[k] for k in names)]
+        count, e.finished_length, e.finished_total, e.failures, seconds, *means = sums(comm, mine)
+        e.finished = round(count)
+        reward, *values = (x / comm.size for x in means)
+        return reward, seconds, dict(zip(names, values, strict=True))
 
     def _begin(self) -> Tensor:
         """The first observation, after some steps that only gather statistics."""
         obs, norm = self.env.reset(), self.ppo.actor.norm
         if float(norm.count) > 0:
             return obs
-        for _ in range(self.config.norm_warmup):
-            norm.observe(obs)
-            with torch.no_grad():
+        with shared_statistics(self.comm, norm), together(self.comm, TrainingError), torch.no_grad():
+            for _ in range(self.config.norm_warmup):
+                check_finite("observation", obs)
+                norm.observe(obs)
                 obs = self.env.step(self.ppo.actor.policy.act(norm(obs), self.ppo.noise)).obs
         norm.freeze()
         return obs
@@ -171,24 +202,21 @@ class Trainer:
         return self.ppo.actor.copy()
 
     def state(self) -> State:
-        """Copies of everything that training goes on from."""
+        """Copies of everything that training goes on from; of all processes only on rank 0."""
         if self._obs is None:
             self._obs = self._begin()
         counters = (self.iteration, self.samples, self.seconds, *self._ended)
-        return (
-            self.ppo.state()
-            | prefixed("env", self.env.state())
-            | {
-                "trainer/obs": self._obs.clone(),
-                "trainer/episode_length": self.episodes.length.clone(),
-                "trainer/episode_reward": self.episodes.total.clone(),
-                "trainer/counters": torch.tensor(counters, dtype=torch.float64),
-            }
-        )
+        own = {
+            "trainer/obs": self._obs.clone(),
+            "trainer/episode_length": self.episodes.length.clone(),
+            "trainer/episode_reward": self.episodes.total.clone(),
+            "trainer/counters": torch.tensor(counters, dtype=torch.float64),
+        }
+        return gather_state(self.comm, self.ppo.state() | prefixed("env", self.env.state()) | own)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from what `state` returned, with the same environment and network sizes."""
-        device = torch.device(self.env.device)
+        device, state = torch.device(self.env.device), own_state(self.comm, state)
         obs = take(state, "trainer/obs")
         if obs.shape != (self.env.num_envs, self.env.num_obs):
             raise PoiseError(
@@ -205,11 +233,15 @@ class Trainer:
         self.iteration, self.samples, self._ended = int(iteration), int(samples), (a, b, c)
 
     def save(self, path: str | Path) -> None:
-        """Writes the whole state as a checkpoint, from which `load` or `load_policy` reads."""
+        """Writes the whole state as a checkpoint, from which `load` or `load_policy` reads.
+
+        Of several processes all must call it, and rank 0 writes for all.
+        """
         meta = {
             "kind": "trainer",
             **self.ppo.actor.identity(self.character),
-            "num_envs": self.env.num_envs,
+            "num_envs": self.env.num_envs * self.comm.size,
+            "processes": self.comm.size,
             "seed": self.seed,
             "config": dataclasses.asdict(self.config),
             "iteration": self.iteration,
@@ -217,7 +249,9 @@ class Trainer:
             "seconds": self.seconds,
             "metadata": self.metadata,
         }
-        save_checkpoint(path, self.state(), meta)
+        state = self.state()
+        if self.comm.rank == 0:
+            save_checkpoint(path, state, meta)
 
     def load(self, path: str | Path) -> dict[str, Any]:
         """Goes on from a checkpoint and returns its metadata.
@@ -230,24 +264,12 @@ class Trainer:
             meta,
             path,
             kind="trainer",
+            processes=self.comm.size if "processes" in meta else None,
             character=self.character,
             num_obs=self.env.num_obs,
             num_actions=self.env.num_actions,
-            num_envs=self.env.num_envs,
+            num_envs=self.env.num_envs * self.comm.size,
             policy=self.ppo.actor.shape,
         )
         self.load_state(tensors)
         return meta
-
-
-@contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    """Torch with `count` threads inside the block, as before outside; 0 changes nothing."""
-    before = torch.get_num_threads()
-    if count and count != before:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        if count and count != before:
-            torch.set_num_threads(before)

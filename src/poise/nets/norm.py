@@ -42,8 +42,31 @@ class RunningNorm(nn.Module):
     def observe(self, x: Tensor) -> None:
         """Merges the samples `x (..., size)` into the statistics (Chan et al. 1979)."""
         x = x.reshape(-1, x.shape[-1]).double()
-        n_b, mean_b = float(len(x)), x.mean(0)
-        m2_b = ((x - mean_b) ** 2).sum(0)
+        mean_b = x.mean(0)
+        self.merge(float(len(x)), mean_b, ((x - mean_b) ** 2).sum(0))
+
+    def normalise(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised `x (N, size)`, and its sums for `add`, by fewer passes than `observe` takes.
+
+        Sums `(2, size)` float32: of x - shift and of (x - shift)^2.
+        """
+        d = x - self.shift
+        sums = torch.stack((d.sum(0), d.square().sum(0)))
+        d.div_(self.std)
+        return (d if math.isinf(self.clip) else d.clamp_(-self.clip, self.clip)), sums
+
+    @torch.no_grad()
+    def add(self, count: int, sums: Tensor) -> None:
+        """Adds `count` samples by their sums `(2, size)`; the same as `observe` but for rounding.
+
+        The rounding is that of float32 around the frozen mean, so there must have been a `freeze`.
+        """
+        first, second = sums.double() / count
+        self.merge(count, self.shift + first, (second - first.square()).clamp_min(0.0) * count)
+
+    @torch.no_grad()
+    def merge(self, n_b: float, mean_b: Tensor, m2_b: Tensor) -> None:
+        """Merges `n_b` samples of mean `mean_b` and summed squared deviation `m2_b`, `(size)` each."""
         # n = n_a + n_b;  d = mean_b - mean_a
         n_a = self.count
         n = n_a + n_b

@@ -11,6 +11,7 @@ from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.kin import FitReport
 from poise.learn import PPOConfig, Trainer, VecEnv
+from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.motion import ClipLibrary
 from poise.sim import CpuBackend, NanGuard
 
@@ -54,9 +55,21 @@ class Imitation:
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
         return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
 
-    def trainer(self, threads: int = 0, dumps: Path | None = None, **metadata: Any) -> Trainer:
-        """A PPO trainer on a fresh environment."""
-        env = self.env(threads=threads, dumps=dumps)
+    def trainer(
+        self, threads: int = 0, dumps: Path | None = None, comm: Comm = ALONE, **metadata: Any
+    ) -> Trainer:
+        """A PPO trainer on a fresh environment.
+
+        threads: of the physics; 0 takes this process's share of the machine's cores. comm: the
+        processes that train together; they share the config's environments out evenly.
+        """
+        rank = comm.rank
+        if dumps is not None and rank:
+            dumps = dumps / f"rank{rank}"
+        if not threads and comm.local_size > 1:
+            threads = max(1, len(os.sched_getaffinity(0)) // comm.local_size)
+        own = share_of(self.config.num_envs, comm)
+        env = self.env(own, rank_seed(self.config.seed, rank), threads=threads, dumps=dumps)
         cores = threads or len(os.sched_getaffinity(0))
         return Trainer(
             # An EnvStep has the fields of the learner's Step; neither room knows the other.
@@ -65,5 +78,6 @@ class Imitation:
             self.config.seed,
             self.humanoid.identity,
             metadata=metadata,
-            update_threads=min(cores, 4),
+            update_threads=cores,
+            comm=comm,
         )

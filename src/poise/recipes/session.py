@@ -34,6 +34,7 @@ from poise.learn import (
     run,
     save_checkpoint,
 )
+from poise.learn.parallel import ALONE, Comm, together
 from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.imitation import Imitation
@@ -104,9 +105,11 @@ def train(
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     threads: int = 0,
     tensorboard: bool = True,
+    comm: Comm = ALONE,
 ) -> RunResult:
     """Trains, or goes on training, in `folder`; see `poise.learn.run`."""
-    trainer = imitation.trainer(threads=threads, dumps=folder / "dumps")
+    with together(comm):
+        trainer = imitation.trainer(threads=threads, dumps=folder / "dumps", comm=comm)
     try:
         return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
+from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.sim.backend import Backend
@@ -111,13 +113,19 @@ class NanGuard:
     def _bad_envs(self) -> list[int]:
         qpos, qvel = self.backend.state.qpos, self.backend.state.qvel
         flagged = self.backend.unstable()
-        # One NaN makes the sum or maximum NaN, and every comparison with NaN is false.
-        sane = bool(self._before.sum().isfinite()) and not bool(flagged.any())
-        if sane and bool(qpos.abs().max() < _HUGE) and bool(qvel.abs().max() < self.speed_limit):
+        # One NaN or infinity makes the sum one.
+        sane = math.isfinite(float(self._before.sum())) and not bool(flagged.any())
+        if sane and self._within(qpos, _HUGE) and self._within(qvel, self.speed_limit):
             return []
         good = (qpos.abs() < _HUGE).all(1) & (qvel.abs() < self.speed_limit).all(1)
         good &= self._before.isfinite().all(1)
         return torch.nonzero(flagged | ~good)[:, 0].tolist()
+
+    @staticmethod
+    def _within(values: Tensor, limit: float) -> bool:
+        """Whether all lie within the limit; one NaN makes both ends NaN, which compare as false."""
+        low, high = torch.aminmax(values)
+        return bool(low > -limit) and bool(high < limit)
 
     def _report(self, env: int, nstep: int) -> Failure:
         model, before, after = self.backend.get_model(env), *self._states(env)

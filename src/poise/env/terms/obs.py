@@ -6,11 +6,7 @@ import torch
 from torch import Tensor
 
 from poise.env.frame import Frame, Pose
-from poise.spatial import quat_conj, quat_mul, quat_rotate_inv, quat_to_sixd
-
-
-def _local(pose: Pose, vectors: Tensor) -> Tensor:
-    return quat_rotate_inv(pose.heading[:, None].expand(*vectors.shape[:-1], 4), vectors)
+from poise.spatial import into_heading, quat_conj, quat_mul, quat_rotate_inv, quat_to_sixd
 
 
 def root_height(frame: Frame) -> Tensor:
@@ -30,7 +26,7 @@ def root_tilt(frame: Frame) -> Tensor:
 
 def root_velocity(frame: Frame) -> Tensor:
     """Root linear velocity in the heading frame (m/s) and angular in the root frame (rad/s) `(N, 6)`."""
-    linear = quat_rotate_inv(frame.sim.heading, frame.sim.linvel[:, 0])
+    linear = quat_rotate_inv(frame.sim.heading, frame.sim.qvel[:, :3])
     return torch.cat((linear, frame.sim.qvel[:, 3:6]), -1)
 
 
@@ -51,7 +47,8 @@ def phase(frame: Frame) -> Tensor:
 
 def body_positions(frame: Frame) -> Tensor:
     """Body origins relative to the root in the heading frame, m `(N, 3 (B - 1))`."""
-    return _local(frame.sim, frame.sim.pos[:, 1:] - frame.sim.pos[:, :1]).flatten(1)
+    sim = frame.sim
+    return into_heading(sim.heading, sim.pos[:, 1:] - sim.pos[:, :1]).flatten(1)
 
 
 def target_joints(frame: Frame) -> Tensor:
@@ -66,14 +63,15 @@ def target_root(frame: Frame) -> Tensor:
     Position difference m, orientation difference 6D, reference velocity m/s.
     """
     ahead, sim = _ahead(frame), frame.sim
-    offset = quat_rotate_inv(sim.heading, ahead.pos[:, 0] - sim.pos[:, 0])
+    vectors = torch.stack((ahead.pos[:, 0] - sim.pos[:, 0], ahead.qvel[:, :3]), 1)
+    offset, velocity = into_heading(sim.heading, vectors).unbind(1)
     turn = quat_mul(quat_conj(sim.quat[:, 0]), ahead.quat[:, 0])
-    return torch.cat((offset, quat_to_sixd(turn), quat_rotate_inv(sim.heading, ahead.linvel[:, 0])), -1)
+    return torch.cat((offset, quat_to_sixd(turn), velocity), -1)
 
 
 def target_bodies(frame: Frame) -> Tensor:
     """Next reference body origins minus the present ones, in the present heading frame, m."""
-    return _local(frame.sim, _ahead(frame).pos - frame.sim.pos).flatten(1)
+    return into_heading(frame.sim.heading, _ahead(frame).pos - frame.sim.pos).flatten(1)
 
 
 def _ahead(frame: Frame) -> Pose:

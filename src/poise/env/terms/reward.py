@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.env.frame import Frame, Pose
-from poise.spatial import quat_angle, quat_conj, quat_mul, quat_rotate_inv
+from poise.spatial import into_heading, quat_conj, quat_distance, quat_mul
 
 
 def pose(frame: Frame, alpha: float = 2.0, weights: Tensor | None = None, half: bool = False) -> Tensor:
@@ -17,7 +17,7 @@ def pose(frame: Frame, alpha: float = 2.0, weights: Tensor | None = None, half: 
 
     weights: `(J,)` per joint. half: the authors' code takes arccos|w|, half the angle.
     """
-    angle = quat_angle(quat_mul(frame.sim.local, quat_conj(frame.ref.local)))
+    angle = quat_distance(frame.sim.local, frame.ref.local)
     squared = (0.5 * angle if half else angle).square()
     return torch.exp(-alpha * (squared if weights is None else squared * weights).sum(-1))
 
@@ -31,7 +31,7 @@ def velocity(frame: Frame, alpha: float = 0.005, weights: Tensor | None = None) 
 
 def end_effectors(frame: Frame, bodies: Tensor, alpha: float = 5.0, local: bool = False) -> Tensor:
     """Eq. 10: exp(-alpha sum_e |g_e - g^_e|^2), m, world; `local`: in each one's own heading frame."""
-    ours, theirs = frame.sim.pos[:, bodies], frame.ref.pos[:, bodies]
+    ours, theirs = (p.pos.index_select(1, bodies) for p in (frame.sim, frame.ref))
     if local:
         ours, theirs = _in_heading(frame.sim, ours), _in_heading(frame.ref, theirs)
     return torch.exp(-alpha * (ours - theirs).square().sum((-1, -2)))
@@ -50,20 +50,18 @@ def root_pose(frame: Frame, alpha: float = 300.0, half: bool = False) -> Tensor:
     height = frame.sim.pos[:, 0, 2] - frame.ref.pos[:, 0, 2]
     ours = quat_mul(quat_conj(frame.sim.heading), frame.sim.quat[:, 0])
     theirs = quat_mul(quat_conj(frame.ref.heading), frame.ref.quat[:, 0])
-    angle = quat_angle(quat_mul(ours, quat_conj(theirs)))
+    angle = quat_distance(ours, theirs)
     angle = 0.5 * angle if half else angle
     return torch.exp(-alpha * (height.square() + angle.square()))
 
 
 def root_velocity(frame: Frame, alpha: float = 0.1) -> Tensor:
     """Eq. 14: exp(-|l - l^|^2 - alpha |w - w^|^2), m/s and rad/s, each in its own heading frame."""
-    sim, ref = frame.sim, frame.ref
-    linear = quat_rotate_inv(sim.heading, sim.linvel[:, 0]) - quat_rotate_inv(
-        ref.heading, ref.linvel[:, 0]
+    ours, theirs = (
+        into_heading(p.heading, torch.stack((p.qvel[:, :3], p.angvel[:, 0]), 1))
+        for p in (frame.sim, frame.ref)
     )
-    angular = quat_rotate_inv(sim.heading, sim.angvel[:, 0]) - quat_rotate_inv(
-        ref.heading, ref.angvel[:, 0]
-    )
+    linear, angular = (ours - theirs).unbind(1)
     return torch.exp(-linear.square().sum(-1) - alpha * angular.square().sum(-1))
 
 
@@ -74,6 +72,4 @@ def residual(frame: Frame) -> Tensor:
 
 def _in_heading(pose_: Pose, points: Tensor) -> Tensor:
     """World points `(N, K, 3)` relative to the root in the character's heading frame."""
-    return quat_rotate_inv(
-        pose_.heading[:, None].expand(*points.shape[:-1], 4), points - pose_.pos[:, :1]
-    )
+    return into_heading(pose_.heading, points - pose_.pos[:, :1])

@@ -1,0 +1,166 @@
+"""`poise bench`: how fast the engine is against its limit, and whether its physics is true."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from poise.cli.console import say, say_json, table, tell
+from poise.cli.output import run_folder
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.recipes.imitation import Imitation
+
+What = Literal["all", "engine", "physics", "scaling", "latency"]
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure the engine against MuJoCo's own limit in the same run, its scaling, the latency of one
+    character, or whether a policy keeps its score on finer physics."""
+
+    what: Annotated[Positional[What], arg(metavar="WHAT")] = "all"
+    """engine, scaling, latency, physics (which needs a RUN), or all of the first three."""
+    run: Annotated[Positional[Path | None], arg(metavar="RUN")] = None
+    """For physics: the folder of a result or of a run."""
+    clip: Annotated[Path | None, arg(metavar="CLIP", help_behavior_hint="")] = None
+    """The motion file to measure with; by default the walk that comes with Poise."""
+    skeleton: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """The ASF skeleton of an AMC motion."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write the results as JSON; "-" prints JSON alone."""
+    envs: Annotated[int, arg(metavar="N")] = 512
+    """Characters simulated at once in engine."""
+    threads: Annotated[int, arg(metavar="N")] = 0
+    """Threads of the physics in engine; 0 takes every core."""
+    repeats: Annotated[int, arg(metavar="N")] = 5
+    """Repetitions, of which medians are taken."""
+    stable_pd: bool = False
+    """For physics: also with the paper's explicit stable PD, which takes minutes."""
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Measures, prints tables, saves JSON."""
+    _check(options)
+    folder = None if options.run is None else run_folder(options.run)
+    from poise.bench import machine
+
+    result: Result = {"command": " ".join(["poise bench", *argv]), "machine": machine()}
+    if options.what == "physics":
+        from poise.bench import bench_physics
+
+        assert folder is not None
+        result["physics"] = bench_physics(folder, options.stable_pd, tell=_told)
+    else:
+        imitation = _imitation(options)
+        for name, work in _WORK.items():
+            if options.what in ("all", name):
+                result[name] = work(imitation, options)
+    if options.json is not None and str(options.json) == "-":
+        say_json(result)
+        return 0
+    for name, show in _SHOW.items():
+        if name in result:
+            show(result[name])
+    if options.json is not None:
+        options.json.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        say(str(options.json))
+    return 0
+
+
+def _check(options: Options) -> None:
+    if (options.what == "physics") != (options.run is not None):
+        what = "bench physics needs the folder of a run" if options.run is None else (
+            f"only bench physics takes a run, got '{options.run}' for {options.what}"
+        )  # fmt: skip
+        raise PoiseError(what, hint="Write for example: poise bench physics result")
+    for name, low in (("envs", 1), ("threads", 0), ("repeats", 1)):
+        if getattr(options, name) < low:
+            raise PoiseError(f"--{name} must be at least {low}, got {getattr(options, name)}")
+
+
+def _imitation(options: Options) -> Imitation:
+    import poise
+    from poise.motion.io import read_clip
+    from poise.recipes import ResidualForce, build
+
+    path = options.clip or Path(poise.__file__).parent / "data" / "walk.bvh"
+    return build(read_clip(path, skeleton=options.skeleton), ResidualForce(num_envs=options.envs))
+
+
+def _told(what: str) -> None:
+    tell(what, "dim")
+
+
+def _engine(imitation: Imitation, options: Options) -> Result:
+    from poise.bench import bench_engine
+
+    return bench_engine(imitation, options.threads, options.repeats, tell=_told)
+
+
+def _scaling(imitation: Imitation, options: Options) -> list[Result]:
+    from poise.bench import bench_scaling
+
+    return bench_scaling(imitation, repeats=min(3, options.repeats), tell=_told)
+
+
+def _latency(imitation: Imitation, options: Options) -> Result:
+    from poise.bench import bench_latency
+
+    return bench_latency(imitation)
+
+
+_WORK: dict[str, Callable[[Imitation, Options], Any]] = {
+    "engine": _engine,
+    "scaling": _scaling,
+    "latency": _latency,
+}
+
+
+def _show_engine(r: Result) -> None:
+    title = (
+        f"{r['envs']} characters on {r['threads']} threads, {r['rate_hz']:g} Hz {r['integrator']}, "
+        f"{r['memory_mb']} MB"
+    )
+    rows = [
+        ("MuJoCo's batch alone, state current", f"{r['raw_per_s']:,}", "1"),
+        ("MuJoCo's batch alone, state one step behind", f"{r['raw_without_derived_per_s']:,}", "-"),
+        ("stepping: observations, rewards, resets", f"{r['stepping_per_s']:,}", r["stepping_of_raw"]),
+        ("training: collection and update", f"{r['training_per_s']:,}", r["training_of_raw"]),
+    ]
+    table(title, ("engine", "control steps/s", "of raw"), rows)
+    phases = [(name, f"{100 * share:.0f} %") for name, share in r["training_phases"].items()]
+    table("", ("training", "share of time"), phases)
+
+
+def _show_scaling(rows: list[Result]) -> None:
+    columns = ("envs", "threads", "stepping/s", "raw/s", "of raw", "MB")
+    keys = ("envs", "threads", "stepping_per_s", "raw_per_s", "stepping_of_raw", "memory_mb")
+    table("scaling", columns, [[f"{r[k]:,}" for k in keys] for r in rows], left=0)
+
+
+def _show_latency(r: Result) -> None:
+    rows = [("one control step", f"{r['ms']:.3f}"), ("95 % are below", f"{r['ms_95']:.3f}")]
+    rows += [(f"of it {name}", f"{ms:.3f}") for name, ms in r["phases_ms"].items()]
+    table("one character on one core", ("latency", "ms"), rows)
+
+
+def _show_physics(rows: list[Result]) -> None:
+    columns = ("physics", "Hz", "integrator", "episodes", "succ", "mpjpe, mm", "reward")
+    keys = ("physics", "rate_hz", "integrator", "episodes", "succ", "mpjpe_mm", "reward")
+    table("one policy on coarse and fine physics", columns, [[r[k] for k in keys] for r in rows], left=3)
+
+
+_SHOW: dict[str, Callable[[Any], None]] = {
+    "engine": _show_engine,
+    "scaling": _show_scaling,
+    "latency": _show_latency,
+    "physics": _show_physics,
+}

@@ -1,0 +1,229 @@
+"""`poise fleet`: a policy per clip, or a sweep, on this machine or on a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from poise.cli.console import say, table, tell
+from poise.cli.output import claimed
+from poise.cli.parse import parse
+from poise.cli.progress import clock
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.recipes.fleet import FleetJob, FleetResult, Record
+
+#: Options of `poise imitate` that are not for a sweep, and what is instead.
+_TAKEN = {
+    "seed": "--seeds",
+    "minutes": "--minutes",
+    "threads": "--workers",
+    "out": "-o",
+    "resume": "nothing: a fleet always goes on",
+    "set": "--set NAME=VALUE with a dot in the name, such as --set lfoot.kp=300,400",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Imitate every clip of a library, each with a policy of its own, and collect the results.
+
+    Run it again to go on: what is done is skipped, what was stopped resumes."""
+
+    library: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="LIBRARY ...", help_behavior_hint="(required)")
+    ]
+    """Folders of motion files, or motion files."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+    """The folder of the results: fleet.json, and one folder per job as poise imitate writes it."""
+    minutes: Annotated[float, arg(metavar="M")] = 10.0
+    """Training time of each job in minutes."""
+    seeds: Annotated[str, arg(metavar="S,S,...")] = "0"
+    """Every clip is trained once with each of these seeds."""
+    set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=V,V,...")] = ()
+    """Values of an option of poise imitate (help-limit=0,50) or the body (lfoot.kp=300,400); every
+    combination is a job."""
+    workers: Annotated[int, arg(metavar="N")] = 0
+    """Jobs at the same time, which share the cores evenly; 0 for one on each core."""
+    address: Annotated[str | None, arg(metavar="ADDR", help_behavior_hint="")] = None
+    """Run on a Ray cluster: HOST:PORT, ray://HOST:PORT, auto or local. Its machines must see the
+    same files. By default the jobs run on this machine, without Ray."""
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Exit code 0 if every job is done, 1 if one has failed, 130 after Ctrl-C."""
+    o = options
+    if o.workers < 0:
+        raise PoiseError(f"--workers must be a whole number of at least 0, got {o.workers}")
+    jobs = plan(o)
+    for job in jobs:
+        _check(job)
+    from poise.recipes.fleet import FLEET_FILE, read_table, run_fleet
+    from poise.recipes.workers import make_workers
+
+    with claimed(o.out):
+        read_table(o.out)
+        workers = make_workers(o.address, o.workers, len(jobs), len(os.sched_getaffinity(0)))
+    each = f"{workers.threads} core{'s' if workers.threads > 1 else ''}"
+    say(f"{len(jobs)} job{'s' if len(jobs) > 1 else ''}, {workers.slots} at a time, {each} each")
+    result = run_fleet(jobs, o.out, workers, on_event=_show)
+    print_table(result)
+    for record in result.records:
+        if record.state == "failed":
+            tell(f"{record.name} failed {record.attempts} times: {record.error}")
+    say(str(o.out / FLEET_FILE))
+    if result.interrupted:
+        tell(f"Stopped; {result.count('done')} of {len(jobs)} jobs are done. Go on with:")
+        tell(f"  {shlex.join(('poise', 'fleet', *argv))}")
+        return 130
+    return 1 if result.count("failed") else 0
+
+
+def plan(o: Options) -> list[FleetJob]:
+    """One job for every clip, seed and combination of settings, in this order.
+
+    Raises:
+        PoiseError: no clip, or a seed or setting that cannot be understood.
+    """
+    from poise.recipes.fleet import FleetJob, combinations
+
+    settings = dict(_setting(text) for text in o.set)
+    seeds = _seeds(o.seeds)
+    out, jobs = o.out.absolute(), []
+    for label, path in clips_in(o.library, out):
+        for seed in seeds:
+            for chosen in combinations(settings):
+                swept = [f"-{k}-{v}" for k, v in chosen.items() if len(settings[k]) > 1]
+                name = label + (f"-s{seed}" if len(seeds) > 1 else "") + "".join(swept)
+                name = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in name)
+                command = ["-m", "poise", "imitate", str(path), "-o", str(out / name), "--resume"]
+                command += ["--minutes", f"{o.minutes:g}", "--seed", str(seed)]
+                for key, value in chosen.items():
+                    command += ["--set", f"{key}={value}"] if "." in key else [f"--{key}", value]
+                facts = {"clip": str(path), "seed": seed, "set": chosen}
+                jobs.append(FleetJob(name, tuple(command), out / name / "score.json", facts))
+    return jobs
+
+
+def clips_in(library: Sequence[Path], out: Path) -> list[tuple[str, Path]]:
+    """Every motion file with a name of its own; results below `out` are none."""
+    found: list[tuple[str, Path]] = []
+    for path in library:
+        if not path.exists():
+            raise PoiseError("there is no such file or folder", path, "Give a folder of motion files")
+        root = path.absolute()
+        files = [root] if path.is_file() else sorted(f for f in root.rglob("*") if _is_clip(f))
+        base = root.parent if path.is_file() else root
+        found += [
+            ("-".join(f.relative_to(base).with_suffix("").parts), f)
+            for f in files
+            if not f.is_relative_to(out)
+        ]
+    if not found:
+        where = ", ".join(map(str, library)) or None
+        raise PoiseError("holds no motion file", where, "Give a folder with BVH, AMC or DeepMimic files")
+    seen: dict[str, int] = {}
+    named = []
+    for name, path in found:
+        seen[name] = seen.get(name, 0) + 1
+        named.append((name if seen[name] == 1 else f"{name}-{seen[name]}", path))
+    return named
+
+
+def _is_clip(path: Path) -> bool:
+    """Whether a file of a library is a motion; text files that are none may lie beside."""
+    from poise.motion.io.formats import READERS
+
+    suffix = path.suffix.lower()
+    if suffix in (".bvh", ".amc"):
+        return path.is_file()
+    if not path.is_file() or not any(suffix in r.suffixes for r in READERS if r.name != "ASF"):
+        return False
+    with path.open("rb") as file:
+        head = file.read(4096).lstrip()
+    return any(suffix in r.suffixes and r.looks_like(head) for r in READERS)
+
+
+def _setting(text: str) -> tuple[str, list[str]]:
+    name, equals, values = text.partition("=")
+    name = name.strip().lstrip("-").replace("_", "-") if "." not in name else name.strip()
+    listed = [v.strip() for v in values.split(",") if v.strip()]
+    if not equals or not name or not listed:
+        hint = "Write for example --set help-limit=0,50,100"
+        raise PoiseError(f"--set needs NAME=VALUE or NAME=V,V,..., got '{text}'", hint=hint)
+    if name in _TAKEN:
+        raise PoiseError(f"--set cannot set {name}", hint=f"Use {_TAKEN[name]}")
+    return name, listed
+
+
+def _seeds(text: str) -> list[int]:
+    parts = [p.strip() for p in text.split(",") if p.strip()]
+    if not parts or not all(p.isdecimal() for p in parts) or len(set(parts)) != len(parts):
+        hint = "Write for example --seeds 0,1,2"
+        raise PoiseError(f"--seeds needs different whole numbers, got '{text}'", hint=hint)
+    return [int(p) for p in parts]
+
+
+def _check(job: FleetJob) -> None:
+    """Refuses what `poise imitate` would refuse, before anything runs."""
+    from poise.cli.imitate import Options as Imitate
+
+    # After -m poise imitate.
+    options = parse(Imitate, job.command[3:], "poise imitate")
+    options.training.check()
+    options.body.config()
+
+
+def _show(event: str, record: Record) -> None:
+    words = {
+        "skipped": "was done before",
+        "started": "started" if record.attempts == 1 else f"started again, attempt {record.attempts}",
+        "again": f"failed and will be tried again: {record.error}",
+        "failed": f"failed: {record.error}",
+        "done": f"done in {clock(record.seconds)}",
+    }
+    figures = ""
+    if event == "done" and record.score:
+        figures = f", success {_percent(record)} %, joint error {_number(record, 'mpjpe_mm')} mm"
+    tell(f"{record.name}: {words[event]}{figures}")
+
+
+def print_table(result: FleetResult) -> None:
+    """One row per job."""
+    rows = [
+        (
+            r.name,
+            r.state,
+            _percent(r),
+            _number(r, "mpjpe_mm"),
+            _number(r, "help", "force_mean_n"),
+            clock(r.seconds),
+        )
+        for r in result.records
+    ]
+    columns = ("job", "state", "success %", "joint error mm", "help N", "time")
+    table("", columns, rows, left=2)
+
+
+def _value(record: Record, *keys: str) -> float | None:
+    found: Any = record.score or {}
+    for key in keys:
+        found = found.get(key) if isinstance(found, dict) else None
+    return found if isinstance(found, int | float) else None
+
+
+def _number(record: Record, *keys: str) -> str:
+    value = _value(record, *keys)
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _percent(record: Record) -> str:
+    value = _value(record, "succ")
+    return "-" if value is None else f"{100 * value:.4g}"

@@ -1,0 +1,41 @@
+"""The log of one control step, worked out only where somebody reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from poise.control import Wrench
+
+
+class Means(Mapping[str, float]):
+    """Means over the worlds: "reward/NAME" of every term, "imitation", and the help in N and N m.
+
+    All of them come by one pass and one wait for the numbers, at the first that is read.
+    """
+
+    def __init__(self, terms: Mapping[str, Tensor], imitation: Tensor, wrench: Wrench | None):
+        self._parts = terms, imitation, wrench
+        self._values: dict[str, float] | None = None
+
+    def _read(self) -> dict[str, float]:
+        if self._values is None:
+            terms, imitation, wrench = self._parts
+            rows = {**{f"reward/{name}": value for name, value in terms.items()}, "imitation": imitation}
+            if wrench is not None:
+                rows["help/force_n"] = wrench.force.norm(dim=-1).sum(-1)
+                rows["help/torque_nm"] = wrench.torque.norm(dim=-1).sum(-1)
+            means = torch.stack(list(rows.values())).mean(-1).tolist()
+            self._values = dict(zip(rows, means, strict=True))
+        return self._values
+
+    def __getitem__(self, name: str) -> float:
+        return self._read()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._read())
+
+    def __len__(self) -> int:
+        return len(self._read())

@@ -1,0 +1,137 @@
+"""All terms of a task as one function of tensors, recorded once and replayed without Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.env.frame import DoneTerm, Frame, LazyPose, ObsTerm, Pose, RewardTerm
+from poise.env.record import TensorFunction, record
+from poise.spatial import heading_quat
+
+#: From so many worlds on, two threads evaluate a half each.
+MANY = 256
+
+
+class Seen(NamedTuple):
+    """What the terms of N worlds are worked out from: MuJoCo's own arrays (float64) and the rest.
+
+    ref, ahead: packed reference poses now and one control step later, see `Reference`. phase, low
+    `(N,)`: place in the clip and lowest reference height. residual `(N, k)`: the unscaled action.
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    xpos: Tensor
+    xquat: Tensor
+    cvel: Tensor
+    subtree_com: Tensor
+    ref: Tensor
+    ahead: Tensor
+    phase: Tensor
+    residual: Tensor
+    low: Tensor
+
+
+def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Pose:
+    """The simulated characters; read it before the next step.
+
+    local: the turns of hinged bodies of `qpos`. roots: each body's root, as a body of the model.
+    """
+
+    def linvel() -> Tensor:
+        # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
+        arm = pose.pos - seen.subtree_com.index_select(1, roots).float()
+        return seen.cvel[:, 1:, 3:].float() + torch.linalg.cross(pose.angvel, arm)
+
+    pose = LazyPose(
+        qpos=lambda: seen.qpos.float(),
+        qvel=lambda: seen.qvel.float(),
+        pos=lambda: seen.xpos[:, 1:].float(),
+        quat=lambda: seen.xquat[:, 1:].float(),
+        linvel=linvel,
+        angvel=lambda: seen.cvel[:, 1:, :3].float(),
+        com=lambda: seen.subtree_com[:, 1].float(),
+        local=lambda: local(pose.qpos),
+        heading=lambda: heading_quat(pose.qpos[:, 3:7]),
+    )
+    return pose
+
+
+class Evaluation(NamedTuple):
+    """obs `(N, O)`; values `(K, N)`, one row per reward term; failed `(N,)` bool."""
+
+    obs: Tensor
+    values: Tensor
+    failed: Tensor
+
+
+class Terms:
+    """The terms of a task: evaluated one by one, or replayed from a recording of just that.
+
+    Args:
+        frame: what the terms see, made of `Seen`.
+        fused: replay a recording of the first evaluation, see `record`.
+    """
+
+    def __init__(
+        self,
+        obs: tuple[ObsTerm, ...],
+        rewards: tuple[RewardTerm, ...],
+        dones: tuple[DoneTerm, ...],
+        frame: Callable[[Seen], Frame],
+        fused: bool = True,
+    ):
+        self.obs, self.rewards, self.dones, self.frame = obs, rewards, dones, frame
+        self.fused = fused
+        self._recorded: dict[str, TensorFunction] = {}
+        self._pool: ThreadPoolExecutor | None = None
+
+    def observe(self, seen: Seen) -> Tensor:
+        """The observations `(N, O)`."""
+        return self._run("observe", self._observe, seen)[0]
+
+    def judge(self, seen: Seen) -> Evaluation:
+        """Observations, rewards and failures."""
+        worlds = len(seen.phase)
+        if not self.fused or worlds < MANY:
+            return Evaluation(*self._run("judge", self._judge, seen))
+        # A recording runs without Python's lock, so that the second half really runs beside the first.
+        # Many worlds are always cut, whatever the machine, since it may move the last digit.
+        first, second = (Seen(*half) for half in zip(*(x.tensor_split(2) for x in seen), strict=True))
+        if "judge" not in self._recorded:
+            self._run("judge", self._judge, first)
+        other = self._helper().submit(self._run, "judge", self._judge, second)
+        ours, theirs = self._run("judge", self._judge, first), other.result()
+        obs, values, failed = zip(ours, theirs, strict=True)
+        return Evaluation(torch.cat(obs), torch.cat(values, 1), torch.cat(failed))
+
+    def _helper(self) -> ThreadPoolExecutor:
+        if self._pool is None:
+            # One thread for torch in it; without this it would start as many as there are cores.
+            self._pool = ThreadPoolExecutor(1, "terms", torch.set_num_threads, (1,))
+        return self._pool
+
+    def _observe(self, *seen: Tensor) -> tuple[Tensor, ...]:
+        frame = self.frame(Seen(*seen))
+        return (torch.cat([term.fn(frame, **term.params) for term in self.obs], -1),)
+
+    def _judge(self, *seen: Tensor) -> tuple[Tensor, ...]:
+        frame = self.frame(Seen(*seen))
+        values = [term.fn(frame, **term.params) for term in self.rewards]
+        failed = torch.zeros_like(frame.phase, dtype=torch.bool)
+        for term in self.dones:
+            failed = failed | term.fn(frame, **term.params)
+        obs = torch.cat([term.fn(frame, **term.params) for term in self.obs], -1)
+        return obs, torch.stack(values or [frame.phase])[: len(values)], failed
+
+    def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
+        if not self.fused:
+            return plain(*seen)
+        if name not in self._recorded:
+            self._recorded[name] = record(plain, tuple(seen))
+        return self._recorded[name](*seen)

@@ -1,0 +1,255 @@
+"""Data-parallel training: several processes that learn as one.
+
+Every process has environments of its own and a copy of the networks. Gradients, statistics and
+decisions are shared, so that P processes with N / P environments each do what one process does
+with N, up to the order of summation. `torchrun` starts the processes (`joined` finds them);
+everything here does nothing, at no cost, for a single one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Protocol
+
+import torch
+from safetensors.torch import load as parse_tensors
+from safetensors.torch import save as serialise_tensors
+from torch import Tensor, nn
+
+from poise.errors import PoiseError
+from poise.learn.state import State, under
+from poise.nets import RunningNorm
+
+#: What `torchrun` tells each of its processes.
+LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+# Parts of a trainer's state that each process has for itself; the rest is the same in all.
+_OWN = ("env/", "generator/noise", "trainer/obs", "trainer/episode_")
+
+
+class Comm(Protocol):
+    """What the learner asks of a group of processes. All of them make the same calls in the same
+    order; each call waits for the others."""
+
+    @property
+    def rank(self) -> int:
+        """This process, 0 <= rank < size; 0 alone writes files and prints."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Number of processes."""
+        ...
+
+    @property
+    def local_size(self) -> int:
+        """Number of processes on this machine, which share its cores."""
+        ...
+
+    def sum_(self, x: Tensor) -> Tensor:
+        """Replaces `x`, of one shape everywhere, by its sum over the processes; returns it."""
+        ...
+
+    def gather(self, data: bytes) -> list[bytes]:
+        """On rank 0 the data of every process by rank; elsewhere an empty list."""
+        ...
+
+
+class Alone:
+    """A single process."""
+
+    rank, size, local_size = 0, 1, 1
+
+    def sum_(self, x: Tensor) -> Tensor:
+        return x
+
+    def gather(self, data: bytes) -> list[bytes]:
+        return [data]
+
+
+ALONE = Alone()
+
+
+class Group:
+    """The default group of `torch.distributed`, which must have been initialised."""
+
+    def __init__(self, local_size: int = 1):
+        self.rank, self.size = torch.distributed.get_rank(), torch.distributed.get_world_size()
+        self.local_size = local_size
+
+    def sum_(self, x: Tensor) -> Tensor:
+        torch.distributed.all_reduce(x)
+        return x
+
+    def gather(self, data: bytes) -> list[bytes]:
+        sizes = torch.zeros(self.size, dtype=torch.int64)
+        sizes[self.rank] = len(data)
+        self.sum_(sizes)
+        width = max(1, int(sizes.max()))
+        own = torch.frombuffer(bytearray(data.ljust(width, b"\0")), dtype=torch.uint8)
+        parts = [torch.empty_like(own) for _ in range(self.size)] if self.rank == 0 else None
+        torch.distributed.gather(own, parts, dst=0)
+        return [p[:n].numpy().tobytes() for p, n in zip(parts or (), sizes.tolist(), strict=False)]
+
+
+@contextmanager
+def joined() -> Iterator[Comm]:
+    """The group that `torchrun` started this process in, or a single process.
+
+    Gloo carries what lies on the CPU and NCCL what lies on a GPU; of several GPUs each process
+    takes the one of its local rank.
+    """
+    if any(name not in os.environ for name in LAUNCHED) or os.environ["WORLD_SIZE"] == "1":
+        yield ALONE
+        return
+    dist, cuda = torch.distributed, torch.cuda.is_available()
+    if cuda:
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    try:
+        dist.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
+    except (RuntimeError, ValueError) as problem:
+        where = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+        reason = str(problem).splitlines()[0] if str(problem) else type(problem).__name__
+        hint = "Start all processes with torchrun, and the same --nnodes and --rdzv-endpoint everywhere"
+        raise PoiseError(f"the processes did not find each other ({reason})", where, hint) from None
+    try:
+        yield Group(int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+    finally:
+        dist.destroy_process_group()
+
+
+def rank_seed(seed: int, rank: int) -> int:
+    """A seed for each process, made from one: rank 0 keeps it, so that one process stays as it was."""
+    if rank == 0:
+        return seed
+    digest = hashlib.sha256(f"{seed}:rank {rank}".encode()).digest()
+    return int.from_bytes(digest[:4], "little") >> 1
+
+
+def share_of(total: int, comm: Comm) -> int:
+    """This process's part of `total` environments.
+
+    Raises:
+        PoiseError: the number of processes does not divide them.
+    """
+    if total % comm.size:
+        fits = max(comm.size, total - total % comm.size)
+        raise PoiseError(
+            f"{total} environments cannot be dealt out evenly to {comm.size} processes",
+            hint=f"Use --envs {fits}",
+        )
+    return total // comm.size
+
+
+# --- numbers -----------------------------------------------------------------------------------
+
+
+def any_of(comm: Comm, flag: bool) -> bool:
+    """Whether it is so in any process."""
+    return flag if comm.size == 1 else bool(comm.sum_(torch.tensor(int(flag))))
+
+
+def sums(comm: Comm, values: Sequence[float]) -> list[float]:
+    """Each number summed over the processes."""
+    if comm.size == 1:
+        return list(values)
+    return comm.sum_(torch.tensor(values, dtype=torch.float64)).tolist()
+
+
+def moments(comm: Comm, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and unbiased deviation over all entries of `x` in all processes."""
+    if comm.size == 1:
+        return x.mean(), x.std()
+    wide = x.double()
+    total = comm.sum_(torch.stack([wide.sum(), wide.new_tensor(x.numel())]))
+    mean = total[0] / total[1]
+    square = comm.sum_((wide - mean).square().sum())
+    return mean.to(x.dtype), (square / (total[1] - 1)).sqrt().to(x.dtype)
+
+
+def average_gradients(comm: Comm, params: Iterable[nn.Parameter]) -> None:
+    """Replaces the gradients by their mean over the processes, through one flat buffer."""
+    if comm.size == 1:
+        return
+    grads = [p.grad for p in params if p.grad is not None]
+    flat = comm.sum_(torch.cat([g.reshape(-1) for g in grads])).div_(comm.size)
+    parts = flat.split([g.numel() for g in grads])
+    torch._foreach_copy_(grads, [part.view_as(g) for part, g in zip(parts, grads, strict=True)])
+
+
+@contextmanager
+def shared_statistics(comm: Comm, norm: RunningNorm) -> Iterator[None]:
+    """What `norm` observes inside the block counts in every process; nothing else may change it.
+
+    If the block fails, it must fail in all processes, and the statistics are those from before.
+    """
+    if comm.size == 1:
+        yield
+        return
+    held = (norm.count, norm.mean, norm.m2)
+    before = [x.clone() for x in held]
+    for x in held:
+        x.zero_()
+    try:
+        yield
+        count, mean, m2 = (x.clone() for x in held)
+    finally:
+        for x, old in zip(held, before, strict=True):
+            x.copy_(old)
+    # n = sum n_r;  mean = sum n_r mean_r / n;  M2 = sum M2_r + n_r (mean_r - mean)^2
+    total = comm.sum_(torch.cat([count.view(1), count * mean]))
+    if float(total[0]) == 0:
+        return
+    middle = total[1:] / total[0]
+    norm.merge(float(total[0]), middle, comm.sum_(m2 + count * (mean - middle).square()))
+
+
+# --- decisions and states ----------------------------------------------------------------------
+
+
+@contextmanager
+def together(comm: Comm, error: type[PoiseError] = PoiseError) -> Iterator[None]:
+    """Either every process leaves the block, or each one raises.
+
+    The process that failed raises its own exception, the others `error`; on rank 0 it names the
+    first process that failed and what it said.
+    """
+    if comm.size == 1:
+        yield
+        return
+    problem: Exception | None = None
+    try:
+        yield
+    except Exception as failure:
+        problem = failure
+    if any_of(comm, problem is not None):
+        said = comm.gather(b"" if problem is None else (str(problem) or repr(problem)).encode())
+        if problem is not None:
+            raise problem
+        rank, text = next(((r, t) for r, t in enumerate(said) if t), (None, b""))
+        who = "another process" if rank is None else f"process {rank}"
+        raise error(f"{who} stopped" + (f" ({text.decode()})" if text else ""))
+
+
+def gather_state(comm: Comm, state: State) -> State:
+    """On rank 0 the state with all processes' own parts, as "rank<r>/..."; elsewhere as it was."""
+    if comm.size == 1:
+        return state
+    own = {k: v.detach().cpu().contiguous() for k, v in state.items() if k.startswith(_OWN)}
+    out = dict(state)
+    for rank, data in enumerate(comm.gather(serialise_tensors(own) if comm.rank else b"")):
+        if rank:
+            out |= {f"rank{rank}/{k}": v for k, v in parse_tensors(data).items()}
+    return out
+
+
+def own_state(comm: Comm, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """This process's state out of what `gather_state` gave on rank 0."""
+    return {**state, **under(f"rank{comm.rank}", state)} if comm.rank else state
+
+
+def noise_name(comm: Comm) -> str:
+    """The purpose for which this process's generator of action noise is made."""
+    return f"noise {comm.rank}" if comm.rank else "noise"

@@ -1,0 +1,63 @@
+"""What makes an update fast changes nothing that matters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_point_env import PointEnv
+
+from poise.errors import PoiseError
+from poise.learn import PPOConfig, Trainer
+from poise.nets import RunningNorm
+
+SMALL = PPOConfig(std=0.3, horizon=24, epochs=1, policy_hidden=(8,), value_hidden=(8,), minibatch=256)
+
+
+def test_moments_say_what_observing_says():
+    rng = torch.Generator().manual_seed(0)
+    slow, fast = RunningNorm(6), RunningNorm(6)
+    scale = torch.tensor([1.0, 10.0, 0.01, 1.0, 100.0, 0.0])
+    for k in range(4):
+        x = torch.randn(500, 6, generator=rng) * scale + 3.0 * scale + 1.0
+        slow.observe(x)
+        if k == 0:
+            fast.observe(x)
+            slow.freeze()
+            fast.freeze()
+            continue
+        y, moments = fast.normalise(x)
+        assert torch.equal(y, slow(x))
+        fast.add(len(x), moments)
+    torch.testing.assert_close(fast.mean, slow.mean, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(fast.m2, slow.m2, rtol=1e-5, atol=1e-9)
+    assert fast.count == slow.count
+
+
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_training_policy_and_critic_side_by_side_changes_no_number(products):
+    config = replace(SMALL, epochs=3, critic_warmup=1, products=products)
+    states = []
+    for threads in (1, 2):
+        trainer = Trainer(PointEnv(32, 0), config, seed=1, update_threads=threads)
+        for _ in range(3):
+            trainer.iterate()
+        states.append(trainer.state())
+    first, other = states
+    assert all(torch.equal(first[k], other[k]) for k in first if k != "trainer/counters")
+
+
+def test_bfloat16_products_learn_as_well():
+    rewards = {}
+    for products in ("float32", "bfloat16"):
+        config = replace(SMALL, std=0.4, policy_lr=3e-3, epochs=5, products=products)
+        trainer = Trainer(PointEnv(64, 0), config, seed=1)
+        rewards[products] = [trainer.iterate().reward for _ in range(40)][-5:]
+    low, half = (sum(r) / 5 for r in rewards.values())
+    assert low > 0.5 and half == pytest.approx(low, abs=0.06)
+
+
+def test_unknown_products_are_told():
+    with pytest.raises(PoiseError, match="products cannot be in 'float8'"):
+        PPOConfig(products="float8")  # type: ignore[arg-type]

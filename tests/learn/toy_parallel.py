@@ -1,0 +1,102 @@
+"""Trains points in one process of a group; started by `torch.multiprocessing` or as a program."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from toy_point_env import PointEnv
+
+import poise.learn.rollout
+from poise.errors import PoiseError
+from poise.learn import PPOConfig, Step, Trainer, Until, run
+from poise.learn.parallel import ALONE, Comm, joined, rank_seed
+from poise.nets import GaussianPolicy
+
+torch.set_num_threads(1)
+TOY = PPOConfig(
+    products="float32",
+    std=0.3,
+    horizon=8,
+    epochs=2,
+    policy_hidden=(16,),
+    value_hidden=(16,),
+    # One minibatch: which samples share one differs between one and more processes.
+    minibatch=8 * 32,
+    kl_target=0.01,
+    learn_std=True,
+    norm_warmup=3,
+)
+ENVS = 32
+
+
+class TwinEnv(PointEnv):
+    """What two processes have together: their environments, one after the other."""
+
+    def __init__(self, num_envs: int, seed: int = 0):
+        super().__init__(num_envs, seed)
+        self.parts = [PointEnv(num_envs // 2, rank_seed(seed, r)) for r in range(2)]
+
+    def reset(self) -> Tensor:
+        return torch.cat([part.reset() for part in self.parts])
+
+    def step(self, actions: Tensor) -> Step:
+        a, b = (part.step(x) for part, x in zip(self.parts, actions.chunk(2), strict=True))
+        log = {k: (a.log[k] + b.log[k]) / 2 for k in a.log}
+        return Step(*(torch.cat([x, y]) for x, y in zip(a[:5], b[:5], strict=True)), log)
+
+
+def twin_draws(
+    policy: GaussianPolicy, patch: pytest.MonkeyPatch, noises: tuple[torch.Generator, torch.Generator]
+) -> None:
+    """Makes a trainer draw its noise for each half of the rows as a process of its own would."""
+    sample = policy.sample
+
+    def halves(obs: Tensor, _: object) -> tuple[Tensor, ...]:
+        parts = [sample(x, n) for x, n in zip(obs.chunk(2), noises, strict=True)]
+        return tuple(torch.cat(x) for x in zip(*parts, strict=True))
+
+    def normal(out: Tensor, _: torch.Generator) -> None:
+        for half, n in zip(out.chunk(2, 1), noises, strict=True):
+            half.copy_(torch.randn(half.shape, generator=n))
+
+    patch.setattr(policy, "sample", halves)
+    patch.setattr(poise.learn.rollout, "standard_normal", normal)
+
+
+def trainer(comm: Comm = ALONE, config: PPOConfig = TOY, seed: int = 3, bad_rank: int = -1) -> Trainer:
+    env = PointEnv(ENVS // comm.size, rank_seed(seed, comm.rank))
+    if comm.rank == bad_rank:
+        env.step = lambda actions: Step(  # type: ignore[method-assign]
+            *PointEnv.step(env, actions * torch.nan)
+        )
+    return Trainer(env, config, seed, character="point", comm=comm)
+
+
+def train(folder: Path, iterations: int, bad_rank: int = -1) -> None:
+    """One process's whole run; its last weights go to `weights<rank>.txt` for comparison."""
+    with joined() as comm:
+        one = trainer(comm, bad_rank=bad_rank)
+        try:
+            run(one, Until(iterations=iterations), folder, tensorboard=False)
+        except PoiseError as problem:
+            (folder / f"error{comm.rank}.txt").write_text(str(problem))
+            return
+        state = one.ppo.state()
+        weights = torch.cat([v.double().flatten() for k, v in state.items() if "noise" not in k])
+        (folder / f"weights{comm.rank}.txt").write_text(" ".join(map(float.hex, weights.tolist())))
+
+
+def spawned(rank: int, size: int, port: int, folder: str, iterations: int, bad_rank: int) -> None:
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(size), "LOCAL_WORLD_SIZE": str(size)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    train(Path(folder), iterations, bad_rank)
+
+
+if __name__ == "__main__":
+    train(Path(sys.argv[1]), int(sys.argv[2]))
+    print("finished", flush=True)
