@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from warp_device import WARP_DEVICE, needs_warp
 
 from poise.errors import PoiseError
 from poise.sim import (
@@ -23,6 +22,7 @@ from poise.sim import (
     body_com_velocity_w,
     body_linear_velocity_w,
 )
+from warp_device import WARP_DEVICE, needs_warp
 
 N, STEPS = 6, 2
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from poise.cli.console import say_json
-from poise.cli.options import Rule
+from poise.cli.options import Device, Rule, check_device
 from poise.cli.output import run_folder
 from poise.cli.progress import working
 from poise.cli.results import print_card
@@ -26,17 +26,20 @@ class Options:
     """Print JSON alone: what score.json holds."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
+    device: Device = "cpu"
+    """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
 
 
 def run(options: Options, argv: Sequence[str]) -> int:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
+    check_device(options.device)
     folder = run_folder(options.run)
     from poise.recipes.session import evaluate, reopen, trained_policy
 
     with working("simulating every start frame"):
         imitation = reopen(folder)
         policy, meta = trained_policy(folder, imitation)
-        card = evaluate(imitation, policy, meta, options.rule).card
+        card = evaluate(imitation, policy, meta, options.rule, options.device).card
     if options.json:
         say_json(card.to_dict())
     else:

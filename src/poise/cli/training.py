@@ -92,7 +92,8 @@ class Job:
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
         try:
             with progress.training(until) as show:
-                return train(imitation, self.run, until, show, self.training.threads, comm=comm)
+                t = self.training
+                return train(imitation, self.run, until, show, t.threads, comm=comm, device=t.device)
         except KeyboardInterrupt:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)

@@ -106,10 +106,14 @@ def train(
     threads: int = 0,
     tensorboard: bool = True,
     comm: Comm = ALONE,
+    device: str = "cpu",
 ) -> RunResult:
-    """Trains, or goes on training, in `folder`; see `poise.learn.run`."""
+    """Trains, or goes on training, in `folder`; see `poise.learn.run`.
+
+    device: "cpu" or "cuda". It is no part of the run: a run may go on on another device.
+    """
     with together(comm):
-        trainer = imitation.trainer(threads=threads, dumps=folder / "dumps", comm=comm)
+        trainer = imitation.trainer(threads, folder / "dumps", comm, device)
     try:
         return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
     finally:
@@ -126,14 +130,20 @@ def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, di
 
 
 def evaluate(
-    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], rule: str = "phc"
+    imitation: Imitation,
+    policy: Policy,
+    meta: Mapping[str, Any],
+    rule: str = "phc",
+    device: str = "cpu",
 ) -> Evaluation:
     """Every start frame simulated to the end with the deterministic policy, and its score card."""
+    if isinstance(policy, PolicyBundle):
+        policy = policy.copy().to(device)
     config = imitation.config
     limit = 0.0 if config.method == "deepmimic" else config.help_limit
     clip, start = start_frames(imitation.reference)
     rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False), policy, clip, start, limit, limit
+        lambda n: imitation.env(n, auto_reset=False, device=device), policy, clip, start, limit, limit
     )
     card = score_rollouts(
         rollouts,

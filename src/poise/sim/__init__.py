@@ -13,6 +13,7 @@ from poise.sim.contacts import add_contact_sensors, contact_columns
 from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
 from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
+from poise.sim.make import check_device, make_backend
 from poise.sim.warp import WarpBackend
 
 __all__ = [
@@ -34,7 +35,9 @@ __all__ = [
     "body_angular_velocity_w",
     "body_com_velocity_w",
     "body_linear_velocity_w",
+    "check_device",
     "contact_columns",
     "diagnose",
+    "make_backend",
     "replay_dump",
 ]

@@ -159,7 +159,9 @@ class WarpBackend:
         self._forward(self._rows(rows))
 
     def snapshot(self, derived: bool = True, out: Tensor | None = None) -> Tensor:
-        return torch.cat([v.reshape(self._num_envs, -1).float() for v in self._kept(derived)], 1, out=out)
+        return torch.cat(
+            [v.reshape(self._num_envs, -1).float() for v in self._kept(derived)], 1, out=out
+        )
 
     def restore(self, snapshot: Tensor, rows: Tensor | None = None) -> None:
         to = self._rows(rows)

@@ -19,7 +19,7 @@ _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 class WarpModel:
-    """A model on the current Warp device; `m` is mujoco_warp's, whose fields may have a row per world."""
+    """A model on the current Warp device; `m` is mujoco_warp's, whose fields may differ by world."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, deterministic: bool) -> None:
         self._wp, mjw = load_warp()

@@ -119,9 +119,7 @@ class Capacity:
     convex: int
 
 
-def capacity(
-    model: mujoco.MjModel, contacts: int | None = None, rows: int | None = None
-) -> Capacity:
+def capacity(model: mujoco.MjModel, contacts: int | None = None, rows: int | None = None) -> Capacity:
     """Room for every moving geom flat on the ground and touching one other, unless given.
 
     rows = limits + frictions + equalities + contacts * (rows per contact), where a pyramidal
