@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.control import Drive, PDTargets, Residual, Wrench
-from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm
+from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm, placed
 from poise.env.means import Means
 from poise.env.record import TensorFunction, record
 from poise.env.reference import Reference
@@ -109,7 +109,8 @@ class ImitationEnv:
         self._helped: tuple[int, ...] = ()
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        self._terms = Terms(task.obs, task.rewards, task.dones, self._frame_of, fused)
+        obs, rewards, dones = (placed(t, here) for t in (task.obs, task.rewards, task.dones))
+        self._terms = Terms(obs, rewards, dones, self._frame_of, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
         self._obs = torch.empty(n, self.num_obs, device=here)
@@ -281,7 +282,7 @@ class ImitationEnv:
 
     def _observe(self) -> Tensor:
         frame = self._frame()
-        return torch.cat([term.fn(frame, **term.params) for term in self.task.obs], -1)
+        return torch.cat([term.fn(frame, **term.params) for term in self._terms.obs], -1)
 
     # --- persistence --------------------------------------------------------------------------
 
