@@ -13,7 +13,7 @@ from poise.control import Drive, PDTargets, Residual, Wrench
 from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm, placed
 from poise.env.means import Means
 from poise.env.record import TensorFunction, record
-from poise.env.reference import Reference
+from poise.env.reference import FIELDS, Reference
 from poise.env.terms.evaluate import Seen, Terms, sim_pose
 from poise.errors import PoiseError
 from poise.sim import Backend, NanGuard
@@ -232,8 +232,9 @@ class ImitationEnv:
     # --- views --------------------------------------------------------------------------------
 
     def pose(self) -> Pose:
-        """The simulated characters now; read it before the next step."""
-        return sim_pose(self._seen(self._goal, self._goal), self.reference.local, self._roots)
+        """The simulated characters now."""
+        lazy = sim_pose(self._seen(self._goal, self._goal), self.reference.local, self._roots)
+        return Pose(*(getattr(lazy, name) for name in FIELDS))
 
     def where(self, env: int) -> str:
         """Which frame of which clip world `env` is at, for messages."""
