@@ -109,8 +109,8 @@ class ImitationEnv:
         self._helped: tuple[int, ...] = ()
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        obs, rewards, dones = (placed(t, here) for t in (task.obs, task.rewards, task.dones))
-        self._terms = Terms(obs, rewards, dones, self._frame_of, fused)
+        terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
+        self._terms = Terms(*terms, self._frame_of, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
         self._obs = torch.empty(n, self.num_obs, device=here)

@@ -44,7 +44,7 @@ _DERIVED = (
     "qfrc_gravcomp", "qfrc_fluid", "qfrc_passive",
 )  # fmt: skip
 _RNE = ("cacc", "cfrc_int", "cfrc_ext")
-_BINDABLE = frozenset((*STANDARD_FIELDS, *_STATE, *_FORCES, *_DERIVED))
+_BINDABLE: frozenset[str] = frozenset((*STANDARD_FIELDS, *_STATE, *_FORCES, *_DERIVED))
 _HUGE = 1e10  # MuJoCo's mjMAXVAL, above which it calls a value bad.
 
 
@@ -77,8 +77,8 @@ class WarpBackend:
         if num_envs < 1:
             raise PoiseError(f"num_envs must be above 0, got {num_envs}")
         self._model, self._num_envs = compile_model(spec_or_model), num_envs
-        self._wp, self._mjw = load_warp()
         self._device = resolve_device(device)
+        self._wp, self._mjw = load_warp()
         self._room = capacity(self._model, contacts_per_world, constraints_per_world)
         self._check_room()
         with self._stream():
@@ -129,7 +129,7 @@ class WarpBackend:
 
     def write(self, rows: Tensor | None, qpos: Tensor, qvel: Tensor) -> None:
         to = self._rows(rows)
-        n = self._num_envs if rows is None else len(to)
+        n = len(to) if isinstance(to, Tensor) else self._num_envs
         check_state(self._model, n, qpos, qvel)
         if n == 0:
             return
@@ -165,7 +165,7 @@ class WarpBackend:
 
     def restore(self, snapshot: Tensor, rows: Tensor | None = None) -> None:
         to = self._rows(rows)
-        n = self._num_envs if rows is None else len(to)
+        n = len(to) if isinstance(to, Tensor) else self._num_envs
         widths = [[v[0].numel() for v in self._kept(derived)] for derived in (False, True)]
         short, full = (sum(w) for w in widths)
         if snapshot.shape not in ((n, full), (n, short)):
@@ -221,14 +221,14 @@ class WarpBackend:
         return self._shared.get_model(env)
 
     def get_data(self, env: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
-        data = mujoco.MjData(self._model) if data is None else data
+        out: Any = mujoco.MjData(self._model) if data is None else data
         for name, view in self._states.items():
             value = view[env].cpu().numpy()
             if name == "time":
-                data.time = float(value)
+                out.time = float(value)
             else:
-                getattr(data, name)[:] = value.reshape(getattr(data, name).shape)
-        return data
+                getattr(out, name)[:] = value.reshape(getattr(out, name).shape)
+        return out
 
     def close(self) -> None:
         self._d = None
@@ -343,6 +343,10 @@ class WarpBackend:
         outputs = [self._outputs[name] for name in sorted(self._outputs)] if derived else []
         return [*self._states.values(), *outputs]
 
+    def raw(self, name: str) -> Tensor:
+        """mujoco_warp's own array of that name, of any field, for diagnosis and benchmarks."""
+        return self._tensor(name)
+
     def _tensor(self, name: str) -> Tensor:
         return self._wp.to_torch(getattr(self._live, name))
 
@@ -354,7 +358,7 @@ class WarpBackend:
 
     def _view(self, name: str) -> Tensor:
         if name not in _BINDABLE:
-            known = sorted(_BINDABLE)
+            known: list[str] = sorted(_BINDABLE)
             raise PoiseError(
                 f"'{name}' is not a MuJoCo data field that can be bound", hint=did_you_mean(name, known)
             )

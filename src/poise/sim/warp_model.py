@@ -51,7 +51,7 @@ class WarpModel:
                 f"'{field}' is not a model field that can differ between worlds",
                 hint=did_you_mean(field, known),
             )
-        old = self._shared_array(field)
+        old: Any = self._shared_array(field)
         new = self._wp.empty((self._num_envs, *old.shape[1:]), dtype=old.dtype, device=old.device)
         view = self._wp.to_torch(new)
         view.copy_(self._wp.to_torch(old).expand_as(view))
@@ -94,7 +94,7 @@ class WarpModel:
 
     def _shared_array(self, field: str) -> Any | None:
         """Warp's array of a field whose first axis is the world, or None."""
-        array = getattr(*self._place(field), None)
+        array: Any = getattr(*self._place(field), None)
         if not isinstance(array, self._wp.array) or not array.ndim:
             return None
         if getattr(array.dtype, "_wp_scalar_type_", array.dtype) is not self._wp.float32:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from importlib import metadata
+from importlib import import_module, metadata
 from types import ModuleType
 
 import mujoco
@@ -29,8 +29,7 @@ _GIB = 2**30
 def load_warp() -> tuple[ModuleType, ModuleType]:
     """The modules `warp` and `mujoco_warp`, imported when first needed; they must be 4.0 or newer."""
     try:
-        import mujoco_warp
-        import warp
+        warp, mujoco_warp = import_module("warp"), import_module("mujoco_warp")
     except ImportError as error:
         raise PoiseError(
             f"the GPU backend needs mujoco-warp, which cannot be imported ({error})",
