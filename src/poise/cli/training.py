@@ -90,6 +90,8 @@ class Job:
         from poise.recipes.session import train
 
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
+        if self.training.device != "cpu":
+            tell("The first steps on a new GPU compile its kernels, which takes minutes once.", "dim")
         try:
             with progress.training(until) as show:
                 t = self.training

@@ -30,7 +30,7 @@ class WarpModel:
             )
         try:
             self.m: Any = mjw.put_model(model)
-        except (NotImplementedError, ValueError) as error:
+        except (RuntimeError, ValueError) as error:
             raise PoiseError(f"mujoco-warp cannot run this model: {error}") from error
         self.m.opt.warn_overflow = 0  # The backend raises instead of printing.
         self.m.opt.deterministic = deterministic
