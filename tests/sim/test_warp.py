@@ -85,20 +85,24 @@ def test_a_missing_package_names_the_extra(monkeypatch, make_spec):
 
 
 @needs_warp
-def test_standing_settles_as_on_the_cpu(make_spec):
-    """The same contact forces and height after two seconds at rest, and the same per world."""
-    warp, cpu = (
-        WarpBackend(make_spec(sensors=True), 2, WARP_DEVICE),
-        CpuBackend(make_spec(sensors=True), 2),
-    )
-    for backend in (warp, cpu):
-        for _ in range(60):
-            backend.step(2)
-    # Friction at rest depends a little on the way there: within a thousandth of the weight.
+def test_landing_and_standing_are_those_of_the_cpu(make_spec):
+    """A fall from 15 cm, the impact and two seconds of rest: the same places and contact forces.
+
+    With a round friction cone; the pyramid's edges differ for steep capsules, see docs/gpu.md.
+    """
+    config = SimConfig(cone="elliptic")
+    warp = WarpBackend(make_spec(sensors=True, config=config), 2, WARP_DEVICE)
+    cpu = CpuBackend(make_spec(sensors=True, config=config), 2)
     weight = 9.81 * float(cpu.model.body_mass.sum())
-    found = warp.contacts().cpu().double()
-    torch.testing.assert_close(found, cpu.contacts(), rtol=0, atol=1e-3 * weight)
-    torch.testing.assert_close(warp.state.xpos.cpu().double(), cpu.state.xpos, rtol=0, atol=1e-3)
+    most = 0.0
+    for _ in range(60):
+        warp.step(2)
+        cpu.step(2)
+        found, wanted = warp.contacts().cpu().double(), cpu.contacts()
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3 * weight)
+        torch.testing.assert_close(warp.state.xpos.cpu().double(), cpu.state.xpos, rtol=0, atol=2e-5)
+        most = max(most, float(wanted.sum(1)[:, 2].max()))
+    assert most > 1.3 * weight
     assert torch.equal(warp.state.qpos[0], warp.state.qpos[1])
 
 

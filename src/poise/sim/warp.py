@@ -348,7 +348,11 @@ class WarpBackend:
         return self._tensor(name)
 
     def _tensor(self, name: str) -> Tensor:
-        return self._wp.to_torch(getattr(self._live, name))
+        array = getattr(self._live, name)
+        if not array.size:
+            # An empty array has no address on a GPU, which torch may refuse.
+            return torch.empty(self._num_envs, 0, device=self._device)
+        return self._wp.to_torch(array)
 
     def _views(self, names: list[str]) -> dict[str, Tensor]:
         views = {name: self._view(name) for name in names}
