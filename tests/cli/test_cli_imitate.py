@@ -35,7 +35,8 @@ def test_imitate_writes_everything(trained: Path, capsys: pytest.CaptureFixture[
     score = json.loads((trained / "score.json").read_text())
     assert set(score) >= SCORE and score["episodes"] == 15 and score["samples"] == 2 * 16 * 16
     assert 0 <= score["succ"] <= 1 and score["method"] == "rfc-implicit"
-    assert score["help"]["limit_n"] == 100
+    # Taken away as episodes succeed, from 100 N.
+    assert 0 < score["help"]["limit_n"] <= 100
     assert iterations(trained / "run") == [1, 2]
     assert main(["info", "--json", str(trained / "simulated.bvh")]) == 0
     facts = json.loads(capsys.readouterr().out)

@@ -104,13 +104,14 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     assert (RECIPE["name"],) == RECIPES
     plain = ResidualForce()
     mine = options.Training()
-    assert (plain.method, plain.help_limit, plain.reward, plain.seed, plain.num_envs) == (
+    assert (plain.method, plain.reward, plain.seed, plain.num_envs) == (
         mine.method,
-        mine.help_limit,
         mine.reward,
         mine.seed,
         512,
     )
+    # The paper keeps its help, a user's result should end without.
+    assert (plain.help_limit, mine.help_start, mine.help_limit) == (100.0, 100.0, 0.0)
 
 
 def test_info_json_holds_exactly_the_keys(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:

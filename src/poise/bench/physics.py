@@ -17,7 +17,7 @@ from poise.eval import run_episodes, score_rollouts, start_frames
 from poise.learn import PolicyBundle
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import build
-from poise.recipes.session import reopen, trained_policy
+from poise.recipes.session import help_left, reopen, trained_policy
 from poise.sim import SimConfig
 
 FINE = SimConfig(rate_hz=450.0, integrator="implicitfast")
@@ -34,7 +34,8 @@ def bench_physics(
     (`control.stable_pd_torque`), which takes a linear solve per physics step.
     """
     own = reopen(folder)
-    policy, _ = trained_policy(folder, own)
+    policy, meta = trained_policy(folder, own)
+    limit, scale = help_left(own, meta)
     clip, frame = start_frames(own.reference)
     pick = torch.linspace(0, len(clip) - 1, min(starts, len(clip))).round().long()
     kinds: list[tuple[str, SimConfig]] = [("trained", own.config.sim), ("fine", FINE)]
@@ -46,22 +47,24 @@ def bench_physics(
         if tell is not None:
             tell(f"physics, {name}: {sim.rate_hz:g} Hz {sim.integrator}")
         imitation = build(own.library, replace(own.config, sim=sim))
-        make = _stable(imitation) if name == "stable PD" else _servos(imitation)
+        make = (_stable if name == "stable PD" else _servos)(imitation, scale)
         rows.append({"physics": name, "rate_hz": sim.rate_hz, "integrator": sim.integrator}
-                    | _score(imitation, policy, make, clip[pick], frame[pick]))  # fmt: skip
+                    | _score(imitation, policy, make, clip[pick], frame[pick], limit))  # fmt: skip
     return rows
 
 
-def _servos(imitation: Imitation) -> Callable[[int], ImitationEnv]:
-    return lambda n: imitation.env(n, auto_reset=False)
+def _servos(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]:
+    return lambda n: imitation.env(n, auto_reset=False, help_scale=scale)
 
 
-def _stable(imitation: Imitation) -> Callable[[int], ImitationEnv]:
+def _stable(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]:
     task = replace(imitation.task, auto_reset=False)
 
     def make(n: int) -> ImitationEnv:
         backend = StablePDBackend(imitation.humanoid.model, n)
-        return ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
+        env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
+        env.help.set(scale)
+        return env
 
     return make
 
@@ -72,9 +75,9 @@ def _score(
     make: Callable[[int], ImitationEnv],
     clip: Tensor,
     frame: Tensor,
+    limit: float,
 ) -> dict[str, Any]:
     config = imitation.config
-    limit = 0.0 if config.method == "deepmimic" else config.help_limit
     rollouts, _ = run_episodes(make, policy, clip, frame, limit, limit)
     card = score_rollouts(rollouts, method=config.method, seed=config.seed)
     return {

@@ -26,6 +26,8 @@ class Options:
     """Print JSON alone: what score.json holds."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
+    help_limit: Annotated[float | None, arg(metavar="NEWTONS", help_behavior_hint="")] = None
+    """The help dial: the most residual force, from 0; by default what training has left of it."""
     device: Device = "cpu"
     """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
 
@@ -39,7 +41,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     with working("simulating every start frame"):
         imitation = reopen(folder)
         policy, meta = trained_policy(folder, imitation)
-        card = evaluate(imitation, policy, meta, options.rule, options.device).card
+        o = options
+        card = evaluate(imitation, policy, meta, o.rule, o.help_limit, device=o.device).card
     if options.json:
         say_json(card.to_dict())
     else:

@@ -1,4 +1,4 @@
-"""`poise info`: what motion files hold, and what had to be guessed."""
+"""`poise info`: what motion files hold, what had to be guessed, and what will be repaired."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from poise.cli.options import Reading
 from poise.errors import PoiseError
 
 #: The keys of `--json`, which programs rely on.
-KEYS = ("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "height_m", "warnings")
+KEYS = (
+    *("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "height_m", "warnings"),
+    "repairs",
+)
 
 
 @dataclass(frozen=True)
@@ -34,18 +37,25 @@ def run(options: Options, argv: Sequence[str]) -> int:
     """Reads every file before the first line is printed."""
     if not options.clips:
         raise PoiseError("no clip was given", hint="Write poise info CLIP")
+    from poise.kin import find_faults
     from poise.motion.info import describe
 
-    facts = [describe(options.reading.read(path)) for path in options.clips]
+    clips = [options.reading.read(path) for path in options.clips]
+    facts, faults = [describe(clip) for clip in clips], [find_faults(clip) for clip in clips]
+    for fact, fault in zip(facts, faults, strict=True):
+        fact["repairs"] = None if fault is None else fault.numbers
     if options.json:
         plain = [{key: fact[key] for key in KEYS} for fact in facts]
         say_json(plain[0] if len(plain) == 1 else plain)
         return 0
-    for path, fact in zip(options.clips, facts, strict=True):
+    for path, fact, fault in zip(options.clips, facts, faults, strict=True):
         table(str(path), ("", ""), _rows(fact), left=2)
         if fact["warnings"]:
             say("Guessed or repaired:")
             notes(fact["warnings"], 40)
+        if fault is not None and fault.sentences:
+            say("Will be repaired or should be checked:")
+            notes(fault.sentences, 40)
     return 0
 
 

@@ -87,8 +87,10 @@ class Training:
     """Training time in minutes, counted over all resumed runs."""
     method: Annotated[Method, arg(metavar="NAME")] = "rfc-implicit"
     """rfc-implicit and rfc-explicit help with a residual force, deepmimic does without."""
-    help_limit: Annotated[float, arg(metavar="NEWTONS")] = 100.0
-    """The most residual force; the same number in N m limits its torque."""
+    help_limit: Annotated[float, arg(metavar="NEWTONS")] = 0.0
+    """The most residual force that may be left at the end, and in N m its torque."""
+    help_start: Annotated[float, arg(metavar="NEWTONS")] = 100.0
+    """The most at the beginning; while episodes succeed it comes down to --help-limit."""
     reward: Annotated[Reward, arg(metavar="NAME")] = "world"
     """world asks for the place in the world, local only for the pose and the root's motion."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -108,11 +110,9 @@ class Training:
         """Refuses numbers that make no sense, before anything is read or made."""
         if not (self.minutes > 0 and math.isfinite(self.minutes)):
             raise PoiseError(f"--minutes must be above 0, got {self.minutes:g}")
-        if not (self.help_limit >= 0 and math.isfinite(self.help_limit)):
-            raise PoiseError(
-                f"--help-limit must be a number of at least 0 newtons, got {self.help_limit:g}",
-                hint="Use --method deepmimic to train without help" if self.help_limit < 0 else None,
-            )
+        for name, value in (("limit", self.help_limit), ("start", self.help_start)):
+            if not (value >= 0 and math.isfinite(value)):
+                raise PoiseError(f"--help-{name} must be a number of at least 0 newtons, got {value:g}")
         least = {"envs": 1, "threads": 0, "iterations": 1, "seed": 0}
         for name, low in least.items():
             value = getattr(self, name)
@@ -127,6 +127,7 @@ class Training:
         config = ResidualForce(
             method=self.method,
             help_limit=self.help_limit,
+            help_start=self.help_start,
             reward=self.reward,
             seed=self.seed,
             body=body.config(),

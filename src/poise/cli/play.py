@@ -81,12 +81,12 @@ def _episode(
     import torch
 
     from poise.eval import run_episodes, score_rollouts
-    from poise.recipes.session import Evaluation
+    from poise.recipes.session import Evaluation, help_left
 
     config = imitation.config
-    limit = 0.0 if config.method == "deepmimic" else config.help_limit
+    limit, scale = help_left(imitation, meta)
     rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False),
+        lambda n: imitation.env(n, auto_reset=False, help_scale=scale),
         policy,
         torch.tensor([clip]),
         torch.tensor([frame]),

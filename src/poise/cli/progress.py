@@ -46,7 +46,9 @@ def figures(stats: IterationStats) -> str:
         if math.isnan(stats.episode_length)
         else (f"  episode {stats.episode_length:.0f} steps  failures {100 * stats.failure_rate:.0f} %")
     )
-    return f"{stats.samples_per_s:,.0f} samples/s  imitation {reward:.3f}{ended}"
+    limit = stats.terms.get("help/limit_n")
+    helped = "" if limit is None else f"  help at most {limit:.0f} N" if limit else "  no help"
+    return f"{stats.samples_per_s:,.0f} samples/s  imitation {reward:.3f}{ended}{helped}"
 
 
 def times(stats: IterationStats, until: Until) -> str:

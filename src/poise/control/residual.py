@@ -49,8 +49,19 @@ class Residual(Protocol):
         """Length of the residual action."""
         ...
 
-    def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
-        """Add the residual forces of `action (N, dims)` to `drive`; body arrays are MuJoCo's."""
+    def apply(
+        self,
+        action: Tensor,
+        xpos: Tensor,
+        xquat: Tensor,
+        xipos: Tensor,
+        drive: Drive,
+        scale: Tensor | float = 1.0,
+    ) -> Wrench:
+        """Add the residual forces of `action (N, dims)` to `drive`; body arrays are MuJoCo's.
+
+        scale: 0-dimensional, multiplies the limits (what a `HelpSchedule` has left of them).
+        """
         ...
 
     def regularizer(self, action: Tensor) -> Tensor:
@@ -91,13 +102,21 @@ class ImplicitResidual:
         """Six numbers: force, torque."""
         return 6
 
-    def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
+    def apply(
+        self,
+        action: Tensor,
+        xpos: Tensor,
+        xquat: Tensor,
+        xipos: Tensor,
+        drive: Drive,
+        scale: Tensor | float = 1.0,
+    ) -> Wrench:
         """Adds the root's generalized force eta_r; body row 0 is the root (MuJoCo body 1)."""
         root = xquat[:, 1].to(action.dtype)
         # Force and torque are one vector each, so that both are capped and turned together.
         unit = action.reshape(-1, 2, 3)
         local = unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
-        local = local * local.new_tensor([[self.limit_n], [self.limit_nm]])
+        local = local * local.new_tensor([[self.limit_n], [self.limit_nm]]) * scale
         force, torque = quat_rotate(torch.stack((heading_quat(root), root), 1), local).unbind(1)
         drive.qfrc_applied[:, 0:3].add_(force)
         drive.qfrc_applied[:, 3:6].add_(local[:, 1])
@@ -133,7 +152,15 @@ class ExplicitResidual:
         """Nine numbers per body: point, force, torque."""
         return 9 * len(self.bodies)
 
-    def apply(self, action: Tensor, xpos: Tensor, xquat: Tensor, xipos: Tensor, drive: Drive) -> Wrench:
+    def apply(
+        self,
+        action: Tensor,
+        xpos: Tensor,
+        xquat: Tensor,
+        xipos: Tensor,
+        drive: Drive,
+        scale: Tensor | float = 1.0,
+    ) -> Wrench:
         """Adds sum_j J_ej^T xi_j, through MuJoCo's Cartesian applied forces."""
         index = [b + 1 for b in self.bodies]
         parts = action.reshape(-1, len(index), 3, 3)
@@ -141,8 +168,8 @@ class ExplicitResidual:
         reach = reach * (self.reach_m / reach.norm(dim=-1, keepdim=True).clamp_min(self.reach_m))
         quat = xquat[:, index].to(action.dtype)
         point = xpos[:, index].to(action.dtype) + quat_rotate(quat, reach)
-        force = quat_rotate(quat, _capped(parts[:, :, 1]) * self.limit_n)
-        torque = quat_rotate(quat, _capped(parts[:, :, 2]) * self.limit_nm)
+        force = quat_rotate(quat, _capped(parts[:, :, 1]) * (self.limit_n * scale))
+        torque = quat_rotate(quat, _capped(parts[:, :, 2]) * (self.limit_nm * scale))
         drive.add_wrench_at(index, point, force, torque, xipos=xipos)
         return Wrench(force, torque, point, self.bodies)
 

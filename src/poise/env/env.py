@@ -9,7 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.control import Drive, PDTargets, Residual, Wrench
+from poise.control import Drive, HelpSchedule, PDTargets, Residual, Wrench
+from poise.env.budget import HelpBudget
 from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm, placed
 from poise.env.means import Means
 from poise.env.record import TensorFunction, record
@@ -41,8 +42,9 @@ class TaskConfig:
     """Imitation as terms.
 
     obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
-    of residual force, None for plain DeepMimic. horizon: control steps until an episode times out.
-    auto_reset: start a new episode where one ended (off while evaluating).
+    of residual force, None for plain DeepMimic. help: how its limits change while episodes are
+    counted, which is with auto_reset alone; None leaves them. horizon: control steps until an episode
+    times out. auto_reset: start a new episode where one ended (off while evaluating).
     """
 
     obs: tuple[ObsTerm, ...]
@@ -50,6 +52,7 @@ class TaskConfig:
     dones: tuple[DoneTerm, ...]
     pd: PDTargets
     residual: Residual | None = None
+    help: HelpSchedule | None = None
     horizon: int = 300
     auto_reset: bool = True
 
@@ -84,6 +87,7 @@ class ImitationEnv:
                 f"the model has {backend.model.nu} actuators, the body {self.hinges} hinges"
             )
         self._extra = task.residual.dims if task.residual else 0
+        self._limit_n = task.residual.limit_n if task.residual else 0.0
         self.num_actions = self.hinges + self._extra
         self._guard = guard
         # Starts are drawn on the CPU, so that a seed means the same ones on every device.
@@ -97,6 +101,7 @@ class ImitationEnv:
         self.age = torch.zeros(n, dtype=torch.long, device=here)
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
+        self.help = HelpBudget(task.help if task.auto_reset and task.residual else None, here)
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
@@ -187,9 +192,10 @@ class ImitationEnv:
         terminated = failed | (last & ~self.reference.cyclic[self.clip])
         truncated = (self.age >= self.task.horizon) & ~terminated
         obs = final
-        log = Means(self.terms, self.imitation, self.wrench)
+        log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
+            self.help.count(len(ids), int(failed.sum()) if len(ids) else 0)
             if len(ids):
                 self._restart(ids)
                 ref = self.reference.gather_packed(self.clip[ids], self.frame[ids])
@@ -209,6 +215,7 @@ class ImitationEnv:
             drive.ctrl,
             drive.qfrc_applied,
             drive.xfrc_applied,
+            self.help.scale,
         )
         if self._control is None:
             self._control = record(self._controlled, given) if self._terms.fused else self._controlled
@@ -218,15 +225,17 @@ class ImitationEnv:
             self.wrench = Wrench(force, torque, point, self._helped)
 
     def _controlled(self, action: Tensor, targets: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Fills the drive (the last three of `state`) anew; the wrench's force, torque and point."""
-        xpos, xquat, xipos, *applied = state
+        """Fills the drive, which `state` holds, anew; the wrench's force, torque and point."""
+        xpos, xquat, xipos, *applied, scale = state
         drive = Drive(*applied)
         drive.clear()
         joints, extra = action[:, : self.hinges], action[:, self.hinges :]
         self.task.pd.apply(joints, targets, drive)
         if self.task.residual is None:
             return (joints,)
-        force, torque, point, self._helped = self.task.residual.apply(extra, xpos, xquat, xipos, drive)
+        force, torque, point, self._helped = self.task.residual.apply(
+            extra, xpos, xquat, xipos, drive, scale
+        )
         return force, torque, point
 
     # --- views --------------------------------------------------------------------------------
@@ -297,6 +306,7 @@ class ImitationEnv:
             "frame": self.frame.clone(),
             "age": self.age.clone(),
             "action": self.action.clone(),
+            "help": self.help.state(),
             "rng": self._rng.get_state(),
         }
 
@@ -309,6 +319,7 @@ class ImitationEnv:
             self.backend.write(None, state["qpos"], state["qvel"])
         for name in ("clip", "frame", "age", "action"):
             getattr(self, name).copy_(state[name])
+        self.help.load_state(state["help"])
         self._aim()
         self._rng.set_state(state["rng"])
 

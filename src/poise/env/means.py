@@ -11,24 +11,29 @@ from poise.control import Wrench
 
 
 class Means(Mapping[str, float]):
-    """Means over the worlds: "reward/NAME" of every term, "imitation", and the help in N and N m.
+    """Means over the worlds: "reward/NAME" of every term, "imitation", the help in N and N m,
+    and the limit of its force in N.
 
     All of them come by one pass and one wait for the numbers, at the first that is read.
     """
 
-    def __init__(self, terms: Mapping[str, Tensor], imitation: Tensor, wrench: Wrench | None):
-        self._parts = terms, imitation, wrench
+    def __init__(
+        self, terms: Mapping[str, Tensor], imitation: Tensor, wrench: Wrench | None, limit_n: float
+    ):
+        self._parts = terms, imitation, wrench, limit_n
         self._values: dict[str, float] | None = None
 
     def _read(self) -> dict[str, float]:
         if self._values is None:
-            terms, imitation, wrench = self._parts
+            terms, imitation, wrench, limit_n = self._parts
             rows = {**{f"reward/{name}": value for name, value in terms.items()}, "imitation": imitation}
             if wrench is not None:
                 rows["help/force_n"] = wrench.force.norm(dim=-1).sum(-1)
                 rows["help/torque_nm"] = wrench.torque.norm(dim=-1).sum(-1)
             means = torch.stack(list(rows.values())).mean(-1).tolist()
             self._values = dict(zip(rows, means, strict=True))
+            if wrench is not None:
+                self._values["help/limit_n"] = limit_n
         return self._values
 
     def __getitem__(self, name: str) -> float:

@@ -1,5 +1,6 @@
-"""Kinematics of a humanoid: clips to generalized coordinates and back, cycles, ground."""
+"""Kinematics of a humanoid: clips cleaned, to generalized coordinates and back, cycles, ground."""
 
+from poise.kin.clean import CleanReport, Faults, clean_clip, find_faults
 from poise.kin.contacts import contact_labels
 from poise.kin.coords import clip_to_qpos, qpos_to_clip
 from poise.kin.cycle import Cycle, close_cycle, cycle_step, cycle_velocity
@@ -10,17 +11,21 @@ from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
+    "CleanReport",
     "Cycle",
+    "Faults",
     "FitReport",
     "GroundFit",
     "Kinematics",
     "chain_angles",
     "chain_quat",
+    "clean_clip",
     "clip_to_qpos",
     "close_cycle",
     "contact_labels",
     "cycle_step",
     "cycle_velocity",
+    "find_faults",
     "fit_ground",
     "fit_humanoid",
     "lowest_height",

@@ -24,10 +24,18 @@ class Cycle:
 
     gap_deg: the largest angle, of a hinge or of the root's tilt, by which it did not close.
     open_hinge: a hinge that ends more than `OPEN` from where it began; such a clip is played once.
+    sunk_m: how far closing it would have pushed the body into the floor, where that was too much; such a
+    clip is played once as well.
     """
 
     gap_deg: float
     open_hinge: str | None = None
+    sunk_m: float = 0.0
+
+    @property
+    def closed(self) -> bool:
+        """Whether the motion goes on from its end to its start."""
+        return self.open_hinge is None and self.sunk_m == 0.0
 
     def sentence(self) -> str:
         """The cycle in words."""
@@ -35,6 +43,11 @@ class Cycle:
             return (
                 f"Not repeated, though its file calls it cyclic: {self.open_hinge} ends "
                 f"{self.gap_deg:.0f} degrees from where it began."
+            )
+        if self.sunk_m:
+            return (
+                f"Not repeated, though its file calls it cyclic: closing a gap of {self.gap_deg:.0f} "
+                f"degrees would push it {self.sunk_m * 100:.0f} cm into the floor."
             )
         return f"The cycle did not close by {self.gap_deg:.1f} degrees; the gap was spread over it."
 

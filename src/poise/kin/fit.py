@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,16 +13,19 @@ import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
+from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.cycle import Cycle, join_cycle
 from poise.kin.fk import Kinematics
-from poise.kin.ground import GroundFit, fit_ground
+from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
+from poise.kin.ground import GroundFit, clip_flights, fit_ground, lowest_height
 from poise.motion import Clip, ClipLibrary, resample
-from poise.motion.repair import Spike, remove_spikes, spike_sentence
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 
 #: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
 OVERLAP_M = 0.01
+#: How much deeper (m) than the clip its closed cycle may go; beyond, closing it made another motion.
+CYCLE_SINK_M = 0.1
 #: Middle Euler angle (rad) beyond which another hinge order is looked for.
 GIMBAL = 1.2
 
@@ -30,15 +34,18 @@ GIMBAL = 1.2
 class FitReport:
     """What was measured and changed so that one body can do the motion.
 
-    names: the clips. spikes: impossible turns that were interpolated, per clip. cycles: how the ends of
-    cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance per clip
-    between its joints and the humanoid's after conversion (turns that a chain cannot make), before a
-    cycle was closed. widened: hinges whose range had to grow, with the growth in degrees. excluded:
-    body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
+    names: the clips. fps: their own frame rates. flights: where they fall freely, in their own frames.
+    clean: flips and impossible speeds that were repaired, per clip. cycles: how the
+    ends of cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance
+    per clip between its joints and the humanoid's after conversion (turns that a chain cannot make),
+    before a cycle was closed. widened: hinges whose range had to grow, with the growth in degrees.
+    excluded: body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
     """
 
     names: tuple[str, ...]
-    spikes: tuple[tuple[Spike, ...], ...]
+    fps: tuple[float, ...]
+    flights: tuple[tuple[Flight, ...], ...]
+    clean: tuple[CleanReport, ...]
     cycles: tuple[Cycle | None, ...]
     ground: tuple[GroundFit, ...]
     joint_error_mm: tuple[float, ...]
@@ -49,15 +56,32 @@ class FitReport:
     @property
     def cyclic(self) -> tuple[bool, ...]:
         """Which clips can go on from their end to their start, closed to do so."""
-        return tuple(c is not None and c.open_hinge is None for c in self.cycles)
+        return tuple(c is not None and c.closed for c in self.cycles)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as plain numbers and lists, ready for JSON."""
+        columns = (self.names, self.clean, self.ground, self.cycles, self.flights, self.fps)
+        clips = {
+            name: {
+                **clean.to_dict(),
+                "ground": ground.to_dict(),
+                "cycle": None if cycle is None else asdict(cycle),
+                "fall": clear_fall(flights),
+                "likely_fps": likely_rate(flights, fps),
+            }
+            for name, clean, ground, cycle, flights, fps in zip(*columns, strict=True)
+        }
+        return {"clips": clips, "widened_deg": dict(self.widened), "excluded": list(self.excluded)}
 
     def sentences(self) -> list[str]:
         """The report in words, one line each."""
         out = []
-        columns = (self.names, self.spikes, self.cycles, self.ground, self.joint_error_mm)
-        for name, spikes, cycle, ground, error in zip(*columns, strict=True):
-            if spikes:
-                out.append(f"{name}: {spike_sentence(spikes)}")
+        for name, flights, fps in zip(self.names, self.flights, self.fps, strict=True):
+            doubt = rate_sentence(flights, fps)
+            out += [f"{name}: {doubt}"] if doubt else []
+        columns = (self.names, self.clean, self.cycles, self.ground, self.joint_error_mm)
+        for name, clean, cycle, ground, error in zip(*columns, strict=True):
+            out += [f"{name}: {sentence}" for sentence in clean.sentences()]
             if cycle is not None:
                 out.append(f"{name}: {cycle.sentence()}")
             out.append(f"{name}: {ground.sentence()}")
@@ -90,7 +114,7 @@ def fit_humanoid(
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
-    repaired = [remove_spikes(c) for c in library]
+    repaired = [clean_clip(c) for c in library]
     clips = [resample(c, rate_hz) for c, _ in repaired]
     table = generate_table(clips[0].skeleton, config, clips)
     table = _choose_orders(table, clips)
@@ -101,11 +125,11 @@ def fit_humanoid(
     error = [_joint_error(c, q, table) for c, q in zip(clips, motions, strict=True)]
     hinges = [name for row in table.rows for name in row.hinge_names()]
     joined = [
-        join_cycle(q, hinges) if c.cyclic else (q, None) for c, q in zip(clips, motions, strict=True)
+        _join(q, hinges, table) if c.cyclic else (q, None) for c, q in zip(clips, motions, strict=True)
     ]
     motions, cycles = [q for q, _ in joined], tuple(c for _, c in joined)
     table, widened = _widen(table, motions, config.margin)
-    closed = [c is not None and c.open_hinge is None for c in cycles]
+    closed = [c is not None and c.closed for c in cycles]
     fits = [fit_ground(q, table, rate_hz, c) for q, c in zip(motions, closed, strict=True)]
     motions = [q for q, _ in fits]
     humanoid = make_humanoid(clips[0].skeleton, table)
@@ -115,7 +139,9 @@ def fit_humanoid(
         humanoid = make_humanoid(clips[0].skeleton, table)
     report = FitReport(
         library.names,
-        tuple(spikes for _, spikes in repaired),
+        tuple(c.fps for c in library),
+        tuple(clip_flights(c, table) for c, _ in repaired),
+        tuple(found for _, found in repaired),
         cycles,
         tuple(f for _, f in fits),
         tuple(error),
@@ -124,6 +150,18 @@ def fit_humanoid(
         _fastest(humanoid, motions, rate_hz),
     )
     return humanoid, motions, report
+
+
+def _join(qpos: np.ndarray, hinges: list[str], table: BodyTable) -> tuple[np.ndarray, Cycle]:
+    """`join_cycle`, unless closing the gap would bend the motion into the floor."""
+    joined, cycle = join_cycle(qpos, hinges)
+    depths = []
+    for q in (qpos, joined):
+        state = Kinematics(table)(torch.tensor(q))
+        low = lowest_height(table, state.pos, state.quat).min(-1).values
+        depths.append(float(low.quantile(0.1)))
+    sunk = depths[0] - depths[1]
+    return (qpos, replace(cycle, sunk_m=sunk)) if sunk > CYCLE_SINK_M else (joined, cycle)
 
 
 def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
@@ -144,7 +182,10 @@ def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
         orders = [row.order, *("".join(p) for p in itertools.permutations("XYZ"))]
         reach = [float(quat_to_euler(turns, o)[:, 1].abs().max()) for o in orders]
         if reach[0] > GIMBAL:
-            rows[i] = replace(row, order=orders[int(np.argmin(np.round(reach, 2)))])
+            order = orders[int(np.argmin(np.round(reach, 2)))]
+            # An axis keeps its limits when its place in the chain changes.
+            ranges = tuple(row.ranges[row.order.index(letter)] for letter in order)
+            rows[i] = replace(row, order=order, ranges=ranges)
     return replace(table, rows=tuple(rows))
 
 

@@ -10,10 +10,16 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kin.fk import Kinematics
+from poise.kin.flight import Flight, centre_of_mass, find_flights
+from poise.kin.flips import spells
+from poise.motion import Clip
 from poise.spatial import quat_rotate
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
 SINK_M = 0.02
+#: Height (m) up to which a supported body may hover, since soles are rigid and heels lift; and the
+#: height above which it stands on something or is in the air, and is no error of the capture.
+HOVER_M, ALOFT_M = 0.03, 0.15
 
 
 @dataclass(frozen=True)
@@ -21,22 +27,46 @@ class GroundFit:
     """How a motion was set on the floor.
 
     lift_m: constant lift of the whole clip. clear_m: `(T,)` further lift per frame that lets no shape
-    sink deeper than `SINK_M` (smooth; zero where nothing did). before_m: height of the lowest point
-    before. after_m: the same after, zero where nothing is under the floor.
+    sink deeper than `SINK_M` (smooth; zero where nothing did). settle_m: `(T,)` lowering where the body
+    hovered for longer than 0.2 s without falling (smooth). flights: where it falls freely.
+    before_m: height of the lowest point before. after_m: the same after, zero where nothing is under
+    the floor.
     """
 
     lift_m: float
     clear_m: np.ndarray
+    settle_m: np.ndarray
+    flights: tuple[Flight, ...]
     before_m: float
     after_m: float
 
     def sentence(self) -> str:
         """The fit in words."""
-        return (
+        settled = ""
+        if self.settle_m.max() > 0.0005:
+            frames = int((self.settle_m > 0.0005).sum())
+            settled = (
+                f"It hovered without falling and was lowered by up to "
+                f"{self.settle_m.max() * 1000:.0f} mm in {frames} frames. "
+            )
+        return settled + (
             f"Lifted by {round(self.lift_m * 1000):+d} mm to stand on the floor, and by up to "
             f"{self.clear_m.max() * 1000:.0f} mm more where a part sank in too deep "
             f"(deepest point {round(-self.before_m * 1000)} mm, now {abs(self.after_m) * 1000:.1f} mm)."
         )
+
+    def to_dict(self) -> dict[str, float | int]:
+        """The fit as numbers: metres and counts of frames."""
+        return {
+            "lift_m": self.lift_m,
+            "clear_max_m": float(self.clear_m.max()),
+            "clear_frames": int((self.clear_m > 0.0005).sum()),
+            "settle_max_m": float(self.settle_m.max()),
+            "settle_frames": int((self.settle_m > 0.0005).sum()),
+            "flight_frames": sum(f.stop - f.start + 1 for f in self.flights),
+            "lowest_before_m": self.before_m,
+            "lowest_after_m": self.after_m,
+        }
 
 
 def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
@@ -46,6 +76,14 @@ def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
         heights = [_lowest(g, pos[..., i, :], quat[..., i, :]) for g in row.geoms]
         out.append(torch.stack(heights, -1).min(-1).values)
     return torch.stack(out, -1)
+
+
+def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
+    """The flights of a clip at its own frame rate."""
+    joints = [r.joint for r in table.rows]
+    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
+    low = lowest_height(table, pos, quat).min(-1).values.numpy()
+    return find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), clip.fps)
 
 
 def _lowest(geom, pos: Tensor, quat: Tensor) -> Tensor:
@@ -69,39 +107,65 @@ def fit_ground(
 ) -> tuple[np.ndarray, GroundFit]:
     """The motion set on the floor z = 0, and by how much it was moved.
 
-    The constant lift sets the soles of standing feet (flat and slow, see `stance_heights`) on the
-    floor, but never so low that the tenth percentile of the lowest points sinks by twice `SINK_M`; a
-    clip in which no foot stands has that percentile set on the floor.
-    Parts that still sink in by more than `SINK_M`, such as the toes of a rigid foot at push-off, are
-    lifted out frame by frame, by the running maximum of the excess over 0.1 s smoothed over 0.2 s; in a
-    closed cycle also across the seam, so that it stays closed.
+    Flight is told from support by the fall of the centre of mass (`find_flights`). The constant lift
+    sets the soles of standing feet (flat and slow, see `stance_heights`) on the floor, but never so low
+    that the tenth percentile of the lowest points sinks by twice `SINK_M`; a clip in which no foot
+    stands has that percentile set on the floor.
+    A body that still hovers higher than `HOVER_M` for more than 0.2 s, neither in flight nor `ALOFT_M`
+    high, is lowered there. Parts that sink in by more than `SINK_M`, such as the toes of a rigid foot at
+    push-off, are lifted out frame by frame. Both follow the running extreme of the excess over 0.1 s
+    smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed.
     """
     state = Kinematics(table)(torch.tensor(qpos))
     low = lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
+    flights = find_flights(low, centre_of_mass(table, state.pos, state.quat)[:, 2].numpy(), fps)
     stance = stance_heights(table, state.pos, state.quat, fps)
     lift = -float(np.quantile(low, 0.1))
     if len(stance) >= 3:
         # Badly solved feet point their toes down while they stand; they may not drag the rest along.
         lift = max(-float(np.median(stance)), lift - 2 * SINK_M)
-    clear = _clearance(np.maximum(-(low + lift) - SINK_M, 0.0), max(1, round(0.1 * fps)), cyclic)
+    reach = max(1, round(0.1 * fps))
+    # The mirror image of a clearance: a running minimum, so that no frame is lowered beyond its excess.
+    settle = np.maximum(-_smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
+    low_now = low + lift - settle
+    clear = _clearance(np.maximum(-low_now - SINK_M, 0.0), reach, cyclic)
     out = np.array(qpos)
-    out[:, 2] += lift + clear
-    after = low + lift + clear
-    return out, GroundFit(lift, clear, float(low.min()), float(min(after.min(), 0.0)))
+    out[:, 2] += lift - settle + clear
+    after = low_now + clear
+    return out, GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
+
+
+def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
+    """How far `(T,)` m a supported body is above `HOVER_M`; through the air from its ends."""
+    excess = np.maximum(height - HOVER_M, 0.0)
+    air = np.zeros(len(height), dtype=bool)
+    for first, last in spells(excess > 0.0, 0):
+        if height[first : last + 1].max() > ALOFT_M:
+            air[first : last + 1] = True
+    for flight in flights:
+        air[flight.start : flight.stop + 1] = True
+    if air.all():
+        return np.zeros_like(height)
+    at = np.arange(len(height))
+    return np.minimum(np.interp(at, at[~air], excess[~air]), excess)
 
 
 def _clearance(depth: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
     """The smooth lift `(T,)` that covers `depth (T,)`, both in m."""
+    return np.maximum(_smooth_hull(depth, reach, cyclic), 0.0) * float(depth.max() > 1e-4)
+
+
+def _smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
+    """The running maximum of `values (T,)` over +-reach frames, averaged over as many."""
     if cyclic:
         # The last frame is the first one again, so it counts once.
-        depth = np.maximum(depth[:-1], np.append(depth[-1], depth[1:-1]))
+        values = np.maximum(values[:-1], np.append(values[-1], values[1:-1]))
     mode = "wrap" if cyclic else "edge"
-    padded = np.pad(depth, reach, mode=mode)
+    padded = np.pad(values, reach, mode=mode)
     hull = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(-1)
     window = np.hanning(2 * reach + 3)[1:-1]
-    clear = np.convolve(np.pad(hull, reach, mode=mode), window / window.sum(), "valid")
-    clear = np.maximum(clear, 0.0) * float(depth.max() > 1e-4)
-    return np.append(clear, clear[0]) if cyclic else clear
+    smooth = np.convolve(np.pad(hull, reach, mode=mode), window / window.sum(), "valid")
+    return np.append(smooth, smooth[0]) if cyclic else smooth
 
 
 def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> np.ndarray:

@@ -37,11 +37,13 @@ class Imitation:
         auto_reset: bool = True,
         threads: int = 0,
         dumps: Path | None = None,
+        help_scale: float = 1.0,
         device: str = "cpu",
     ) -> ImitationEnv:
         """An environment of this task; without `auto_reset` for evaluation from given frames.
 
-        threads: of the physics on the CPU. device: "cpu", or "cuda" for the physics on a GPU.
+        threads: of the physics on the CPU. help_scale: what is left of the residual force's limits.
+        device: "cpu", or "cuda" for the physics on a GPU.
         """
         backend = make_backend(
             self.humanoid.model, num_envs or self.config.num_envs, device, threads=threads
@@ -51,6 +53,7 @@ class Imitation:
         task = replace(self.task, auto_reset=auto_reset)
         env = ImitationEnv(self.reference, backend, task, self.config.sim.substeps, seed, guard=guard)
         guard.where = env.where
+        env.help.set(help_scale)
         return env
 
     def ppo(self) -> PPOConfig:

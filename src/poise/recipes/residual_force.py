@@ -22,7 +22,15 @@ from typing import Literal
 import torch
 
 from poise.body import BodyConfig, Humanoid
-from poise.control import ExplicitResidual, ImplicitResidual, PDTargets, Residual
+from poise.control import (
+    ExplicitResidual,
+    HelpSchedule,
+    ImplicitResidual,
+    LinearHelp,
+    PDTargets,
+    Residual,
+    SuccessHelp,
+)
 from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
 from poise.env.terms import done, obs, reward
 from poise.kin import fit_humanoid
@@ -37,7 +45,10 @@ class ResidualForce:
     """Settings of one run.
 
     method: rfc-implicit, rfc-explicit, or deepmimic (no residual force).
-    help_limit: N, the most residual force; the torque limit is the same number in N m.
+    help_limit: N, the most residual force that is left at the end; the torque limit is the same
+    number in N m. help_start: N, the limit at the beginning; None (or a lower number) keeps it constant.
+    help_schedule: from start to end by success (`control.SuccessHelp`) or linear in time over
+    `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
     reward: world (App. B.1) or local (App. B.2). observation: reference (state and next reference
     frame) or phase (the paper's). action: additive or absolute. faithful: where the paper and its
     authors' code disagree, whose value holds (rotation angle or half of it; reward weights).
@@ -48,6 +59,9 @@ class ResidualForce:
 
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
     help_limit: float = 100.0
+    help_start: float | None = None
+    help_schedule: Literal["success", "linear"] = "success"
+    help_steps: tuple[int, int] = (1600, 16000)
     reward: Literal["world", "local"] = "world"
     observation: Literal["reference", "phase"] = "reference"
     action: Literal["additive", "absolute"] = "additive"
@@ -62,9 +76,25 @@ class ResidualForce:
     ppo: PPOConfig = PPOConfig(std=0.055, policy_lr=3e-4)
 
 
+def most_help(config: ResidualForce) -> float:
+    """The highest limit that holds at any time, N and N m."""
+    return max(config.help_limit, config.help_start or 0.0)
+
+
+def schedule(config: ResidualForce) -> HelpSchedule | None:
+    """How the limit comes down; None where it is constant."""
+    most = most_help(config)
+    if config.method == "deepmimic" or config.help_limit >= most:
+        return None
+    final = config.help_limit / most
+    if config.help_schedule == "linear":
+        return LinearHelp(*config.help_steps, final=final)
+    return SuccessHelp(final=final)
+
+
 def residual(config: ResidualForce, humanoid: Humanoid) -> Residual | None:
     """The kind of help: none, a root wrench, or wrenches on pelvis and feet."""
-    limits = {"limit_n": config.help_limit, "limit_nm": config.help_limit}
+    limits = {"limit_n": most_help(config), "limit_nm": most_help(config)}
     if config.method == "rfc-implicit":
         return ImplicitResidual(**limits)
     if config.method == "rfc-explicit":
@@ -119,6 +149,7 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
         dones=(fail,),
         pd=PDTargets(config.action),
         residual=help_,
+        help=schedule(config),
         horizon=config.horizon,
     )
 

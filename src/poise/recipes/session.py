@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from poise.body import BodyConfig
+from poise.env.budget import scale_in
 from poise.errors import PoiseError
 from poise.eval import Recording, RolloutSet, ScoreCard, run_episodes, score_rollouts, start_frames
 from poise.learn import (
@@ -38,7 +40,7 @@ from poise.learn.parallel import ALONE, Comm, together
 from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.residual_force import ResidualForce, build, most_help
 from poise.sim import SimConfig
 
 #: The file that says what a run is.
@@ -126,7 +128,25 @@ def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, di
     if not path.exists():
         raise PoiseError("nothing has been trained in it yet", folder, "Train it with --resume first")
     policy = load_policy(path, character=imitation.humanoid.identity)
-    return policy, policy.meta
+    left = scale_in(load_checkpoint(path)[0]) * most_help(imitation.config)
+    return policy, {**policy.meta, "help_limit": left}
+
+
+def help_left(
+    imitation: Imitation, meta: Mapping[str, Any], asked: float | None = None
+) -> tuple[float, float]:
+    """The limit of the help in N and N m, and its share of the task's own limit.
+
+    asked: N; by default what training has left of it (`meta["help_limit"]`).
+    """
+    most = 0.0 if imitation.config.method == "deepmimic" else most_help(imitation.config)
+    limit = min(most, float(meta.get("help_limit", most))) if asked is None else asked
+    if not 0 <= limit <= most:
+        raise PoiseError(
+            f"the policy was trained with help of at most {most:g} N, so it cannot have {limit:g} N",
+            hint=f"Give a limit from 0 to {most:g}",
+        )
+    return limit, limit / most if most else 0.0
 
 
 def evaluate(
@@ -134,16 +154,31 @@ def evaluate(
     policy: Policy,
     meta: Mapping[str, Any],
     rule: str = "phc",
+    help_limit: float | None = None,
+    starts: int | None = None,
     device: str = "cpu",
 ) -> Evaluation:
-    """Every start frame simulated to the end with the deterministic policy, and its score card."""
+    """Simulates every start frame to the end with the deterministic policy, and scores it.
+
+    Args:
+        help_limit: N and N m; by default what training has left of it (`meta["help_limit"]`).
+        starts: no more than so many start frames, evenly spread; None takes all.
+        device: "cpu" or "cuda".
+    """
     if isinstance(policy, PolicyBundle):
         policy = policy.copy().to(device)
-    config = imitation.config
-    limit = 0.0 if config.method == "deepmimic" else config.help_limit
+    config, (limit, scale) = imitation.config, help_left(imitation, meta, help_limit)
     clip, start = start_frames(imitation.reference)
+    if starts is not None and starts < len(clip):
+        some = torch.linspace(0, len(clip) - 1, starts).long()
+        clip, start = clip[some], start[some]
     rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False, device=device), policy, clip, start, limit, limit
+        lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device),
+        policy,
+        clip,
+        start,
+        limit,
+        limit,
     )
     card = score_rollouts(
         rollouts,
@@ -180,6 +215,7 @@ def _from_json(data: Mapping[str, Any]) -> ResidualForce:
         learner: dict[str, Any] = values.pop("ppo")
         ppo: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in learner.items()}
         sim = SimConfig(**values.pop("sim"))
+        values["help_steps"] = tuple(values["help_steps"])
         return ResidualForce(**values, body=BodyConfig(**body), sim=sim, ppo=PPOConfig(**ppo))
     except (TypeError, KeyError) as problem:
         raise PoiseError(
