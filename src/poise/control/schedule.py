@@ -62,13 +62,14 @@ class LinearHelp:
 class SuccessHelp:
     """Less help while episodes succeed, more when they fail.
 
-    lower_at: success from which the scale is multiplied by `factor`. raise_at: success under which it
+    lower_at: success from which the scale is multiplied by `factor`; exploration fails some episodes that
+    the policy itself would not, so that about 0.8 is the most that training shows. raise_at: success under which it
     is divided by it. smallest: under this scale the help ends (it becomes `final`); a policy that then
     fails gets this much back. final: never less than this.
     """
 
-    lower_at: float = 0.8
-    raise_at: float = 0.5
+    lower_at: float = 0.65
+    raise_at: float = 0.4
     factor: float = 0.98
     smallest: float = 0.05
     final: float = 0.0
