@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from poise.bench import bench_engine, bench_latency, bench_physics, bench_scaling, machine
+from poise.bench import bench_engine, bench_gpu, bench_latency, bench_physics, bench_scaling, machine
 from poise.bench.engine import Raw, exploring, record
 from poise.bench.machine import Clock
 from poise.bench.stable_pd import StablePDBackend
@@ -22,6 +22,7 @@ from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from poise.recipes.session import begin, train
 from toy_human import swing
+from warp_device import WARP_DEVICE, needs_warp
 
 SMALL = PPOConfig(
     horizon=4, minibatch=64, epochs=2, norm_warmup=2, policy_hidden=(16,), value_hidden=(16,), std=0.05
@@ -57,6 +58,15 @@ def test_engine_splits_the_time_into_phases(imitation):
     for name in ("raw", "raw_without_derived", "stepping", "training"):
         assert result[f"{name}_per_s"] > 0
     assert 0 < result["stepping_of_raw"] < 1.5
+    json.dumps(result, allow_nan=False)
+
+
+@needs_warp
+def test_gpu_measures_against_mujoco_warps_own_step(imitation):
+    result = bench_gpu(imitation, 4, WARP_DEVICE, repeats=1, steps=2)
+    assert result["envs"] == 4 and result["constraints_per_world"] > 100
+    for name in ("raw", "stepping", "training"):
+        assert result[f"{name}_per_s"] > 0
     json.dumps(result, allow_nan=False)
 
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from tiny_clips import ASF, BVH, ROW, amc, bvh, put
 
 from poise.learn.checkpoint import LATEST, load_checkpoint, save_checkpoint
@@ -183,3 +184,13 @@ def test_frames_and_clips_that_are_not_there(trained: Path, tmp_path: Path, refu
     refused("play", trained, "-o", page, "--start", "-1", words=("0 to 15",))
     refused("play", trained, "-o", page, "--clip", "stnd", words=("'stand'",))
     refused("eval", trained, "--rule", "mine", words=("phc",))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("verb", ["imitate", "eval", "bench"])
+def test_a_gpu_that_is_not_there(verb: str, tmp_path: Path, refused) -> None:
+    path = put(tmp_path, "a.bvh", BVH)
+    more = {"imitate": [path, "-o", tmp_path / "out"], "eval": [tmp_path], "bench": []}[verb]
+    refused(verb, *more, "--device", "cuda", words=("'cuda'", "CUDA", "--device cpu"))
+    refused(verb, *more, "--device", "gpu", words=("'gpu'", "'cuda:0'"))
+    assert not (tmp_path / "out").exists()

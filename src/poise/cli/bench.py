@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from poise.cli.console import say, say_json, table, tell
+from poise.cli.options import Device, check_device
 from poise.cli.output import run_folder
 from poise.errors import PoiseError
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from poise.recipes.imitation import Imitation
 
 What = Literal["all", "engine", "physics", "scaling", "latency"]
+_ENVS, _GPU_ENVS = 512, 4096
 Result = dict[str, Any]
 
 
@@ -36,8 +38,10 @@ class Options:
     """The ASF skeleton of an AMC motion."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the results as JSON; "-" prints JSON alone."""
-    envs: Annotated[int, arg(metavar="N")] = 512
-    """Characters simulated at once in engine."""
+    device: Device = "cpu"
+    """cuda measures engine on an NVIDIA GPU, against mujoco_warp's own step."""
+    envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Characters simulated at once in engine; by default 512, and 4096 on a GPU."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Threads of the physics in engine; 0 takes every core."""
     repeats: Annotated[int, arg(metavar="N")] = 5
@@ -60,8 +64,9 @@ def run(options: Options, argv: Sequence[str]) -> int:
         result["physics"] = bench_physics(folder, options.stable_pd, tell=_told)
     else:
         imitation = _imitation(options)
-        for name, work in _WORK.items():
-            if options.what in ("all", name):
+        chosen = {"gpu": _gpu} if options.device != "cpu" else _WORK
+        for name, work in chosen.items():
+            if options.what in ("all", name) or name == "gpu":
                 result[name] = work(imitation, options)
     if options.json is not None and str(options.json) == "-":
         say_json(result)
@@ -82,8 +87,12 @@ def _check(options: Options) -> None:
         )  # fmt: skip
         raise PoiseError(what, hint="Write for example: poise bench physics result")
     for name, low in (("envs", 1), ("threads", 0), ("repeats", 1)):
-        if getattr(options, name) < low:
-            raise PoiseError(f"--{name} must be at least {low}, got {getattr(options, name)}")
+        value = getattr(options, name)
+        if value is not None and value < low:
+            raise PoiseError(f"--{name} must be at least {low}, got {value}")
+    if options.device != "cpu" and options.what not in ("all", "engine"):
+        raise PoiseError(f"bench {options.what} runs on the CPU alone", hint="Leave --device out")
+    check_device(options.device)
 
 
 def _imitation(options: Options) -> Imitation:
@@ -92,7 +101,8 @@ def _imitation(options: Options) -> Imitation:
     from poise.recipes import ResidualForce, build
 
     path = options.clip or Path(poise.__file__).parent / "data" / "walk.bvh"
-    return build(read_clip(path, skeleton=options.skeleton), ResidualForce(num_envs=options.envs))
+    envs = options.envs or (_ENVS if options.device == "cpu" else _GPU_ENVS)
+    return build(read_clip(path, skeleton=options.skeleton), ResidualForce(num_envs=envs))
 
 
 def _told(what: str) -> None:
@@ -103,6 +113,13 @@ def _engine(imitation: Imitation, options: Options) -> Result:
     from poise.bench import bench_engine
 
     return bench_engine(imitation, options.threads, options.repeats, tell=_told)
+
+
+def _gpu(imitation: Imitation, options: Options) -> Result:
+    from poise.bench import bench_gpu
+
+    envs = imitation.config.num_envs
+    return bench_gpu(imitation, envs, options.device, options.repeats, tell=_told)
 
 
 def _scaling(imitation: Imitation, options: Options) -> list[Result]:
@@ -140,6 +157,16 @@ def _show_engine(r: Result) -> None:
     table("", ("training", "share of time"), phases)
 
 
+def _show_gpu(r: Result) -> None:
+    title = f"{r['envs']} characters on {r['device']}, {r['rate_hz']:g} Hz {r['integrator']}"
+    rows = [
+        ("mujoco_warp's step alone", f"{r['raw_per_s']:,.0f}", "1"),
+        ("stepping: observations, rewards, resets", f"{r['stepping_per_s']:,.0f}", r["stepping_of_raw"]),
+        ("training: collection and update", f"{r['training_per_s']:,.0f}", r["training_of_raw"]),
+    ]
+    table(title, ("gpu", "control steps/s", "of raw"), rows)
+
+
 def _show_scaling(rows: list[Result]) -> None:
     columns = ("envs", "threads", "stepping/s", "raw/s", "of raw", "MB")
     keys = ("envs", "threads", "stepping_per_s", "raw_per_s", "stepping_of_raw", "memory_mb")
@@ -160,6 +187,7 @@ def _show_physics(rows: list[Result]) -> None:
 
 _SHOW: dict[str, Callable[[Any], None]] = {
     "engine": _show_engine,
+    "gpu": _show_gpu,
     "scaling": _show_scaling,
     "latency": _show_latency,
     "physics": _show_physics,

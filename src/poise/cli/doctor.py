@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module, metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -106,7 +107,11 @@ def cuda() -> Check:
     except ImportError:
         return Check("cuda", "optional", "torch is missing", "install torch first")
     if torch.cuda.is_available():
-        return Check("cuda", "ok", torch.cuda.get_device_name(0))
+        name = torch.cuda.get_device_name(0)
+        if find_spec("mujoco_warp") is None:
+            fix = "pip install 'poise-motion[gpu]' for --device cuda"
+            return Check("cuda", "optional", f"{name}, but no mujoco-warp", fix)
+        return Check("cuda", "ok", name)
     return Check("cuda", "optional", "no GPU", "everything runs on the CPU as well")
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from poise.cli.console import say_json
-from poise.cli.options import Rule
+from poise.cli.options import Device, Rule, check_device
 from poise.cli.output import run_folder
 from poise.cli.progress import working
 from poise.cli.results import print_card
@@ -28,17 +28,21 @@ class Options:
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
     help_limit: Annotated[float | None, arg(metavar="NEWTONS", help_behavior_hint="")] = None
     """The help dial: the most residual force, from 0; by default what training has left of it."""
+    device: Device = "cpu"
+    """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
 
 
 def run(options: Options, argv: Sequence[str]) -> int:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
+    check_device(options.device)
     folder = run_folder(options.run)
     from poise.recipes.session import evaluate, reopen, trained_policy
 
     with working("simulating every start frame"):
         imitation = reopen(folder)
         policy, meta = trained_policy(folder, imitation)
-        card = evaluate(imitation, policy, meta, options.rule, options.help_limit).card
+        o = options
+        card = evaluate(imitation, policy, meta, o.rule, o.help_limit, device=o.device).card
     if options.json:
         say_json(card.to_dict())
     else:

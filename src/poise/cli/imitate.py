@@ -50,7 +50,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
 
     try:
         with working("simulating every start frame"):
-            evaluation = evaluate(imitation, *trained_policy(job.run, imitation))
+            trained, device = trained_policy(job.run, imitation), o.training.device
+            evaluation = evaluate(imitation, *trained, device=device)
             paths = deliver(imitation, evaluation, o.out, learning_curve(job.run))
     except KeyboardInterrupt:
         return job.stopped("Stopped in the evaluation; the training is saved.")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from poise.motion import Clip
     from poise.recipes import ResidualForce
 
+Device = Annotated[str, arg(metavar="cpu|cuda")]
 Method = Literal["rfc-implicit", "rfc-explicit", "deepmimic"]
 Reward = Literal["world", "local"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
@@ -57,6 +58,14 @@ class Body:
         return BodyConfig(mass_kg=self.mass, overrides=tuple(map(override, self.set)))
 
 
+def check_device(name: str) -> None:
+    """Refuses a device on which nothing could run, before anything is read or made."""
+    if name != "cpu":
+        from poise.sim import check_device
+
+        check_device(name)
+
+
 def override(text: str) -> tuple[str, float]:
     """("lfoot.kp", 400.0) from "lfoot.kp=400"."""
     name, equals, value = text.partition("=")
@@ -90,6 +99,8 @@ class Training:
     """Characters simulated at once; by default the recipe's 512."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Threads of the physics; 0 takes every core."""
+    device: Device = "cpu"
+    """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
     iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Stop after so many iterations as well; for tests."""
     expert: bool = True
@@ -109,6 +120,7 @@ class Training:
             value = getattr(self, name)
             if value is not None and not low <= value < 2**31:
                 raise PoiseError(f"--{name} must be a whole number of at least {low}, got {value}")
+        check_device(self.device)
 
     def config(self, body: Body) -> ResidualForce:
         """The recipe's settings."""

@@ -91,10 +91,15 @@ class Job:
         from poise.recipes.session import train
 
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
+        if self.training.device != "cpu":
+            tell("The first steps on a new GPU compile its kernels, which takes minutes once.", "dim")
         try:
             with progress.training(until) as show:
-                threads, begins = self.training.threads, beginning(first)
-                return train(imitation, self.run, until, show, threads, comm=comm, beginning=begins)
+                t, begins = self.training, beginning(first)
+                return train(
+                    imitation, self.run, until, show, t.threads,
+                    comm=comm, beginning=begins, device=t.device,
+                )  # fmt: skip
         except KeyboardInterrupt:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)

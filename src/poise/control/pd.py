@@ -32,7 +32,7 @@ class PDTargets:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""
         base = q_ref_next if self.mode == "additive" else self.offset
         target = action * self.scale
-        drive.ctrl.add_(target if base is None else target + base)
+        drive.ctrl.add_(target if base is None else target + base.to(target.device))
 
 
 def stable_pd_torque(

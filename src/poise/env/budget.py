@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,17 +17,19 @@ KEPT = 0.8
 class HelpBudget:
     """Scales the residual force's limits by what a schedule decides from the episodes' outcomes.
 
-    scale: 0-dimensional float32, multiplied with the limits. Without a schedule it stays as it is set.
+    scale: 0-dimensional float32, multiplied with the limits, where the worlds are; `now` is the same
+        number for Python, which need not wait for a GPU. Without a schedule it stays as it is set.
     """
 
     def __init__(self, schedule: HelpSchedule | None = None, device: torch.device | str = "cpu"):
         self.schedule = schedule
-        self.scale = torch.ones((), device=device)
+        self.scale, self.now = torch.ones((), device=device), 1.0
         self.steps, self._ended, self._failed = 0, 0.0, 0.0
 
     def set(self, scale: float) -> None:
         """Takes a scale into use, in [0, 1]."""
-        self.scale.fill_(scale)
+        self.now = float(np.float32(scale))
+        self.scale.fill_(self.now)
 
     @property
     def success(self) -> float:
@@ -41,13 +44,13 @@ class HelpBudget:
         self._ended += ended
         self._failed += failed
         if self.steps % self.schedule.every == 0:
-            self.set(self.schedule.scale(float(self.scale), self.steps, self.success))
+            self.set(self.schedule.scale(self.now, self.steps, self.success))
             self._ended *= KEPT
             self._failed *= KEPT
 
     def state(self) -> Tensor:
         """What `load_state` takes: float64 `(4)`."""
-        counts = (float(self.scale), self.steps, self._ended, self._failed)
+        counts = (self.now, self.steps, self._ended, self._failed)
         return torch.tensor(counts, dtype=torch.float64)
 
     def load_state(self, state: Tensor) -> None:

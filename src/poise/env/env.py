@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.control import Drive, HelpSchedule, PDTargets, Residual, Wrench
 from poise.env.budget import HelpBudget
-from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm
+from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm, placed
 from poise.env.means import Means
 from poise.env.record import TensorFunction, record
 from poise.env.reference import FIELDS, Reference
@@ -77,8 +77,10 @@ class ImitationEnv:
         guard: NanGuard | None = None,
         fused: bool = True,
     ):
-        self.reference, self.backend, self.task, self.substeps = reference, backend, task, substeps
-        self.num_envs, self.device = backend.num_envs, torch.device("cpu")
+        self.num_envs, self.device = backend.num_envs, backend.device
+        length = reference.length.cpu()
+        self.reference = reference = reference.to(self.device)
+        self.backend, self.task, self.substeps = backend, task, substeps
         self.hinges = len(reference.humanoid.hinges)
         if backend.model.nu != self.hinges:
             raise PoiseError(
@@ -88,36 +90,41 @@ class ImitationEnv:
         self._limit_n = task.residual.limit_n if task.residual else 0.0
         self.num_actions = self.hinges + self._extra
         self._guard = guard
+        # Starts are drawn on the CPU, so that a seed means the same ones on every device.
         self._rng = torch.Generator().manual_seed(seed)
-        seconds = (reference.length - 1).double()
-        self._weights = seconds if weights is None else weights.double()
-        n = self.num_envs
-        self.clip = torch.zeros(n, dtype=torch.long)
-        self.frame = torch.zeros(n, dtype=torch.long)
-        self.age = torch.zeros(n, dtype=torch.long)
-        self.action = torch.zeros(n, self.num_actions)
+        self._length = length
+        seconds = (length - 1).double()
+        self._weights = seconds if weights is None else weights.double().cpu()
+        n, here = self.num_envs, self.device
+        self.clip = torch.zeros(n, dtype=torch.long, device=here)
+        self.frame = torch.zeros(n, dtype=torch.long, device=here)
+        self.age = torch.zeros(n, dtype=torch.long, device=here)
+        self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
-        self.help = HelpBudget(task.help if task.auto_reset and task.residual else None)
+        self.help = HelpBudget(task.help if task.auto_reset and task.residual else None, here)
         self.terms: dict[str, Tensor] = {}
-        self.imitation = torch.zeros(n)
+        self.imitation = torch.zeros(n, device=here)
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
         shares = [[t.weight, t.weight * t.imitation] for t in task.rewards]
-        self._reward_weights = torch.tensor(shares).reshape(-1, 2).T.contiguous()
+        self._reward_weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(here)
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
         self._goal, self._goal_rows = torch.empty(0), torch.empty(0, dtype=torch.long)
-        self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long)
+        self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long).to(here)
         self._control: TensorFunction | None = None
         self._helped: tuple[int, ...] = ()
-        self._terms = Terms(task.obs, task.rewards, task.dones, self._frame_of, fused)
+        # Recordings are for the CPU, where Python's share of a step is felt.
+        fused = fused and here.type == "cpu"
+        terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
+        self._terms = Terms(*terms, self._frame_of, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
-        self._obs = torch.empty(n, self.num_obs)
+        self._obs = torch.empty(n, self.num_obs, device=here)
 
     # --- episodes -----------------------------------------------------------------------------
 
     def reset(self) -> Tensor:
         """New episodes everywhere at random frames (reference state initialisation)."""
-        self._restart(torch.arange(self.num_envs))
+        self._restart(torch.arange(self.num_envs, device=self.device))
         return self._observe()
 
     def reseed(self, seed: int) -> None:
@@ -140,9 +147,10 @@ class ImitationEnv:
     def _restart(self, ids: Tensor) -> None:
         pick = torch.multinomial(self._weights, len(ids), replacement=True, generator=self._rng)
         # Uniform over the frames from which at least one step can be made.
-        span = (self.reference.length[pick] - 1).double()
+        span = (self._length[pick] - 1).double()
         u = torch.rand(len(ids), dtype=torch.float64, generator=self._rng)
-        frame = torch.minimum((u * span).long(), self.reference.length[pick] - 2)
+        frame = torch.minimum((u * span).long(), self._length[pick] - 2)
+        pick, frame = pick.to(self.device), frame.to(self.device)
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
@@ -184,7 +192,7 @@ class ImitationEnv:
         terminated = failed | (last & ~self.reference.cyclic[self.clip])
         truncated = (self.age >= self.task.horizon) & ~terminated
         obs = final
-        log = Means(self.terms, self.imitation, self.wrench, float(self.help.scale) * self._limit_n)
+        log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
             self.help.count(len(ids), int(failed.sum()) if len(ids) else 0)
@@ -284,14 +292,16 @@ class ImitationEnv:
 
     def _observe(self) -> Tensor:
         frame = self._frame()
-        return torch.cat([term.fn(frame, **term.params) for term in self.task.obs], -1)
+        return torch.cat([term.fn(frame, **term.params) for term in self._terms.obs], -1)
 
     # --- persistence --------------------------------------------------------------------------
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a bit-exact continuation needs."""
+        """Everything that a bit-exact continuation needs; what another kind of backend needs, too."""
         return {
             "sim": self.backend.snapshot(),
+            "qpos": self.backend.state.qpos.clone(),
+            "qvel": self.backend.state.qvel.clone(),
             "clip": self.clip.clone(),
             "frame": self.frame.clone(),
             "age": self.age.clone(),
@@ -301,11 +311,14 @@ class ImitationEnv:
         }
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continues from `state()`."""
-        self.backend.restore(state["sim"])
-        for name in ("clip", "frame", "age"):
+        """Continues from `state()`: exactly, or from the same positions and velocities where the state
+        is that of another kind of backend (another number format), such as the GPU's."""
+        if state["sim"].dtype == self.backend.state.qpos.dtype:
+            self.backend.restore(state["sim"])
+        else:
+            self.backend.write(None, state["qpos"], state["qvel"])
+        for name in ("clip", "frame", "age", "action"):
             getattr(self, name).copy_(state[name])
-        self.action = state["action"].clone()
         self.help.load_state(state["help"])
         self._aim()
         self._rng.set_state(state["rng"])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
+import torch
 from torch import Tensor
 
 
@@ -100,3 +101,15 @@ class DoneTerm:
     name: str
     fn: TermFunction
     params: Mapping[str, Any] = field(default_factory=dict)
+
+
+T = TypeVar("T", ObsTerm, RewardTerm, DoneTerm)
+
+
+def placed(terms: tuple[T, ...], device: torch.device) -> tuple[T, ...]:
+    """The same terms with the tensors among their parameters on `device`."""
+
+    def there(value: Any) -> Any:
+        return value.to(device) if isinstance(value, Tensor) else value
+
+    return tuple(replace(t, params={k: there(v) for k, v in t.params.items()}) for t in terms)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import fields
@@ -68,6 +69,17 @@ class Reference:
         steps = [cycle_step(q) for q in motions]
         self.cycle_turn = torch.stack([turn for turn, _ in steps])
         self.cycle_travel = torch.stack([travel for _, travel in steps])
+
+    def to(self, device: torch.device) -> Reference:
+        """The same motions with what environments read on `device`; `kinematics` stays on the CPU."""
+        if self.qpos.device == device:
+            return self
+        there = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(there, name, value.to(device))
+        there._fast = Kinematics(self.humanoid.table, torch.float32, device)
+        return there
 
     def _pose(self, qpos: Tensor, qvel: Tensor) -> Pose:
         body = self.kinematics(qpos, qvel)

@@ -76,7 +76,8 @@ def run_episodes(
             f"{tuple(start.shape)}"
         )
     env = make_env(len(clip))
-    ref = env.reference
+    # The score card works on the CPU, wherever the worlds are.
+    ref = env.reference.to(torch.device("cpu"))
     rounds = torch.where(ref.cyclic[clip], cycles, 1)
     lengths = (ref.length[clip] - 1) * rounds - start + 1
     total = int(lengths.max())
@@ -91,7 +92,7 @@ def run_episodes(
         obs = step.final_obs
         store.add(t, env)
         kept.append(env.backend.state.qpos[list(first.values())].clone())
-    qpos = torch.stack(kept, 1).numpy()
+    qpos = torch.stack(kept, 1).double().cpu().numpy()
     recordings = [
         Recording(c, int(start[row]), qpos[k, : int(lengths[row])], row)
         for k, (c, row) in enumerate(first.items())
@@ -172,7 +173,7 @@ class _Store:
             bodies = list(wrench.body)
             out["force"][:, t], out["torque"][:, t] = wrench.force, wrench.torque
             # The wrench was applied at the poses before this step: its arm is zero for a root wrench.
-            arm = wrench.point - out["pos"][:, t - 1, bodies]
-            ang = sim.angvel[:, bodies]
-            out["point_vel"][:, t] = sim.linvel[:, bodies] + torch.linalg.cross(ang, arm)
+            arm = wrench.point.cpu() - out["pos"][:, t - 1, bodies]
+            ang, vel = sim.angvel[:, bodies].cpu(), sim.linvel[:, bodies].cpu()
+            out["point_vel"][:, t] = vel + torch.linalg.cross(ang, arm)
             out["ang_vel"][:, t] = ang

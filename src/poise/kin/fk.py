@@ -27,7 +27,12 @@ class BodyState(NamedTuple):
 class Kinematics:
     """Forward kinematics of one `BodyTable` for any batch of coordinates."""
 
-    def __init__(self, table: BodyTable, dtype: torch.dtype = torch.float64):
+    def __init__(
+        self,
+        table: BodyTable,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ):
         self.table, self.dtype = table, dtype
         self._rows = []
         at = 0
@@ -38,6 +43,7 @@ class Kinematics:
                 for letter in row.order
             ]
             pos, quat = torch.tensor(row.pos, dtype=dtype), torch.tensor(row.quat, dtype=dtype)
+            pos, quat, frame, *axes = (x.to(device) for x in (pos, quat, frame, *axes))
             self._rows.append((row.parent, pos, quat, frame, row.order, axes, at))
             at += len(row.order)
         self.hinges = at
@@ -50,15 +56,15 @@ class Kinematics:
             places = [k for k, i in enumerate(self.hinged) if self._rows[i][4] == order]
             starts = [self._rows[self.hinged[k]][6] for k in places]
             columns = [s + d for d in range(len(order)) for s in starts]
-            self._groups.append((order, places, torch.tensor(columns)))
+            self._groups.append((order, places, torch.tensor(columns).to(device)))
         placed = [k for _, places, _ in self._groups for k in places]
-        self._order = torch.tensor(placed).argsort()
+        self._order = torch.tensor(placed).argsort().to(device)
 
     def __call__(self, qpos: Tensor, qvel: Tensor | None = None) -> BodyState:
         """World body states of `qpos (..., 7 + n)` and, where given, `qvel (..., 6 + n)`."""
         qpos = qpos.to(self.dtype)
         batch = qpos.shape[:-1]
-        zero = torch.zeros(*batch, 3, dtype=self.dtype)
+        zero = qpos.new_zeros(*batch, 3)
         vel = None if qvel is None else qvel.to(self.dtype)
         pos, quat, lin, ang = [], [], [], []
         for parent, offset, rest, _frame, _order, axes, at in self._rows:

@@ -67,6 +67,12 @@ class PolicyBundle:
         """An action `(N, A)` drawn as in training."""
         return self.policy.sample(self.norm(obs), generator)[0]
 
+    def to(self, device: torch.device | str) -> PolicyBundle:
+        """Moves it to where it shall act; returns itself."""
+        self.norm.to(device)
+        self.policy.to(device)
+        return self
+
     def copy(self) -> PolicyBundle:
         """An independent copy, which later training does not change."""
         return copy.deepcopy(self)

@@ -24,6 +24,7 @@ from poise.learn.state import (
     make_generator,
     optimizer_state,
     prefixed,
+    set_generator,
     take,
     under,
 )
@@ -385,8 +386,8 @@ class PPO:
             self.optimizer.param_groups[0]["lr"] = self.config.policy_lr
         if not self.config.learn_std:
             self.actor.policy.log_std.data.copy_(fixed_log_std)
-        self.noise.set_state(take(state, "generator/noise").cpu())
-        self.shuffle.set_state(take(state, "generator/shuffle").cpu())
+        set_generator(self.noise, take(state, "generator/noise"))
+        set_generator(self.shuffle, take(state, "generator/shuffle"))
 
 
 def _explained_variance(comm: Comm, returns: Tensor, value: Tensor) -> float:

@@ -76,3 +76,16 @@ def make_generator(seed: int, purpose: str, device: torch.device | str = "cpu") 
     """A generator of its own for each purpose, so that one draw more here moves nothing there."""
     digest = hashlib.sha256(f"{seed}:{purpose}".encode()).digest()
     return torch.Generator(device=device).manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
+def set_generator(generator: torch.Generator, state: Tensor) -> None:
+    """Goes on from a generator's state.
+
+    The state of another kind of device cannot be taken over; it becomes a seed, so that the same
+    run resumed there twice is the same.
+    """
+    if generator.get_state().shape == state.shape:
+        generator.set_state(state.cpu())
+        return
+    digest = hashlib.sha256(state.cpu().numpy().tobytes()).digest()
+    generator.manual_seed(int.from_bytes(digest[:8], "little") >> 1)

@@ -35,6 +35,8 @@ from poise.sim import UnstableError
 
 #: Start frames of a first look; the final evaluation takes every one.
 FIRST_STARTS = 64
+#: The expert acts in no more worlds than these; more of them teach little more.
+CLONE_WORLDS = 512
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,15 @@ def begin_training(
     threads: int = 0,
     tell: Beginning | None = None,
     comm: Comm = ALONE,
+    device: str = "cpu",
 ) -> Trainer:
     """The run's trainer: fresh, from a cloned expert, or set up as the checkpoint in `folder` was.
 
-    Of several processes the first clones, and the others take over what it learned.
+    Of several processes the first clones, and the others take over what it learned. The expert acts on
+    the CPU, whatever the `device` that PPO then uses.
     """
     tell = tell or Beginning()
-    make = partial(_trainer, imitation, threads, folder / "dumps", comm)
+    make = partial(_trainer, imitation, threads, folder / "dumps", comm, device)
     if (folder / LATEST).exists():
         warm = load_checkpoint(folder / LATEST)[1].get("metadata", {}).get("start") == "expert"
         return make(None, warm)
@@ -99,7 +103,8 @@ def clone_expert(
     tell, plan = tell or Beginning(), make_plan(imitation.reference)
     if tell.expert is not None:
         tell.expert(score_expert(imitation, plan))
-    env = imitation.env(threads=threads, dumps=dumps)
+    worlds = min(imitation.config.num_envs, CLONE_WORLDS)
+    env = imitation.env(worlds, threads=threads, dumps=dumps)
     # The expert plans with the whole limit, which no success takes away while it is watched.
     env.help.schedule = None
     try:
@@ -138,11 +143,17 @@ def finetuning(ppo: PPOConfig) -> PPOConfig:
 
 
 def _trainer(
-    imitation: Imitation, threads: int, dumps: Path, comm: Comm, start: WarmStart | None, warm: bool
+    imitation: Imitation,
+    threads: int,
+    dumps: Path,
+    comm: Comm,
+    device: str,
+    start: WarmStart | None,
+    warm: bool,
 ) -> Trainer:
     ppo = finetuning(imitation.ppo()) if warm else None
     how = {"start": "expert"} if warm else {}
-    return imitation.trainer(threads, dumps, comm, start, ppo, **how)
+    return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)
 
 
 class _Acts:

@@ -13,7 +13,7 @@ from poise.kin import FitReport
 from poise.learn import PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.motion import ClipLibrary
-from poise.sim import CpuBackend, NanGuard
+from poise.sim import NanGuard, make_backend
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +38,16 @@ class Imitation:
         threads: int = 0,
         dumps: Path | None = None,
         help_scale: float = 1.0,
+        device: str = "cpu",
     ) -> ImitationEnv:
         """An environment of this task; without `auto_reset` for evaluation from given frames.
 
-        help_scale: what is left of the residual force's limits.
+        threads: of the physics on the CPU. help_scale: what is left of the residual force's limits.
+        device: "cpu", or "cuda" for the physics on a GPU.
         """
-        backend = CpuBackend(self.humanoid.model, num_envs or self.config.num_envs, threads)
+        backend = make_backend(
+            self.humanoid.model, num_envs or self.config.num_envs, device, threads=threads
+        )
         seed = int(self.config.seed if seed is None else seed)
         guard = NanGuard(backend, dumps, seed=seed)
         task = replace(self.task, auto_reset=auto_reset)
@@ -67,6 +71,7 @@ class Imitation:
         comm: Comm = ALONE,
         warm_start: WarmStart | None = None,
         ppo: PPOConfig | None = None,
+        device: str = "cpu",
         **metadata: Any,
     ) -> Trainer:
         """A PPO trainer on a fresh environment; `ppo` in place of this task's own settings.
@@ -80,8 +85,10 @@ class Imitation:
         if not threads and comm.local_size > 1:
             threads = max(1, len(os.sched_getaffinity(0)) // comm.local_size)
         own = share_of(self.config.num_envs, comm)
-        env = self.env(own, rank_seed(self.config.seed, rank), threads=threads, dumps=dumps)
-        cores = threads or len(os.sched_getaffinity(0))
+        seed = rank_seed(self.config.seed, rank)
+        env = self.env(own, seed, threads=threads, dumps=dumps, device=device)
+        # A GPU is fed by one thread.
+        cores = 1 if env.device.type == "cuda" else threads or len(os.sched_getaffinity(0))
         return Trainer(
             # An EnvStep has the fields of the learner's Step; neither room knows the other.
             cast(VecEnv, env),

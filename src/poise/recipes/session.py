@@ -109,9 +109,13 @@ def train(
     tensorboard: bool = True,
     comm: Comm = ALONE,
     beginning: Beginning | None = None,
+    device: str = "cpu",
 ) -> RunResult:
-    """Trains, or goes on training, in `folder`; see `poise.learn.run` and `recipes.expert`."""
-    trainer = begin_training(imitation, folder, threads, beginning, comm)
+    """Trains, or goes on training, in `folder`; see `poise.learn.run` and `recipes.expert`.
+
+    device: "cpu" or "cuda". It is no part of the run: a run may go on on another device.
+    """
+    trainer = begin_training(imitation, folder, threads, beginning, comm, device)
     try:
         return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
     finally:
@@ -152,16 +156,26 @@ def evaluate(
     rule: str = "phc",
     help_limit: float | None = None,
     most: int | None = None,
+    device: str = "cpu",
 ) -> Evaluation:
     """Start frames simulated to the end with the deterministic policy, and the score card.
 
-    Every start frame, or at most `most`, evenly spread.
-    help_limit: N and N m; by default what training has left of it (`meta["help_limit"]`).
+    Args:
+        help_limit: N and N m; by default what training has left of it (`meta["help_limit"]`).
+        most: no more than so many start frames, evenly spread; None takes all.
+        device: "cpu" or "cuda".
     """
+    if isinstance(policy, PolicyBundle):
+        policy = policy.copy().to(device)
     config, (limit, scale) = imitation.config, help_left(imitation, meta, help_limit)
     clip, start = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
     rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False, help_scale=scale), policy, clip, start, limit, limit
+        lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device),
+        policy,
+        clip,
+        start,
+        limit,
+        limit,
     )
     card = score_rollouts(
         rollouts,

@@ -13,6 +13,8 @@ from poise.sim.contacts import add_contact_sensors, contact_columns
 from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
 from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
+from poise.sim.make import check_device, make_backend
+from poise.sim.warp import WarpBackend
 
 __all__ = [
     "CONES",
@@ -28,11 +30,14 @@ __all__ = [
     "SimConfig",
     "SimState",
     "UnstableError",
+    "WarpBackend",
     "add_contact_sensors",
     "body_angular_velocity_w",
     "body_com_velocity_w",
     "body_linear_velocity_w",
+    "check_device",
     "contact_columns",
     "diagnose",
+    "make_backend",
     "replay_dump",
 ]

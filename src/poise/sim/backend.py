@@ -98,6 +98,11 @@ class Backend(Protocol):
         ...
 
     @property
+    def device(self) -> torch.device:
+        """Where its tensors live."""
+        ...
+
+    @property
     def state(self) -> SimState:
         """Live views of the state."""
         ...

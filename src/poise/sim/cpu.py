@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import mujoco
 import numpy as np
 import torch
@@ -13,6 +11,7 @@ from torch import Tensor
 from poise.control.drive import Drive
 from poise.errors import PoiseError, did_you_mean
 from poise.sim.backend import SimState
+from poise.sim.checks import check_state, compile_model
 from poise.sim.contacts import contact_columns
 
 _NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -40,7 +39,7 @@ class CpuBackend:
             raise PoiseError(
                 f"num_envs must be above 0 and threads not below, got {num_envs}, {threads}"
             )
-        self._model = _compiled(spec_or_model)
+        self._model = compile_model(spec_or_model)
         self._batch: Batch | None = Batch(self._model, num_envs, min(threads, num_envs))
         self._num_envs = num_envs
         self._rows = torch.from_numpy(self._live.state)
@@ -61,6 +60,10 @@ class CpuBackend:
         return self._num_envs
 
     @property
+    def device(self) -> torch.device:
+        return torch.device("cpu")
+
+    @property
     def state(self) -> SimState:
         return self._state
 
@@ -71,16 +74,7 @@ class CpuBackend:
     def write(self, rows: Tensor | None, qpos: Tensor, qvel: Tensor) -> None:
         ids, order = self._ids(rows)
         n = self._num_envs if ids is None else len(ids)
-        if qpos.shape != (n, self._model.nq) or qvel.shape != (n, self._model.nv):
-            raise PoiseError(
-                f"write needs qpos ({n}, {self._model.nq}) and qvel ({n}, {self._model.nv}), "
-                f"got {tuple(qpos.shape)} and {tuple(qvel.shape)}"
-            )
-        for name, value in (("qpos", qpos), ("qvel", qvel)):
-            # A sum that is finite costs less than a mask and vouches for every number.
-            if not math.isfinite(float(value.sum())) and not bool(value.isfinite().all()):
-                row, column = torch.nonzero(~value.isfinite())[0].tolist()
-                raise PoiseError(f"{name} is not finite in row {row}, column {column}", "write")
+        check_state(self._model, n, qpos, qvel)
         if n == 0:
             return
         self._run("reset", ids, stage=_NONE)
@@ -223,12 +217,3 @@ class CpuBackend:
                 f"MuJoCo failed in {call}: {error}", f"worlds {error.ids.tolist()[:8]}",
                 "These worlds kept their state from before the call.",
             ) from error  # fmt: skip
-
-
-def _compiled(spec_or_model: mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
-    if isinstance(spec_or_model, mujoco.MjModel):
-        return spec_or_model
-    try:
-        return spec_or_model.compile()
-    except ValueError as error:
-        raise PoiseError(f"MuJoCo cannot compile the model: {error}") from error

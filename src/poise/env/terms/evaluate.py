@@ -75,7 +75,7 @@ class Terms:
 
     Args:
         frame: what the terms see, made of `Seen`.
-        fused: replay a recording of the first evaluation, see `record`.
+        fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
 
     def __init__(
