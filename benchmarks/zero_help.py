@@ -1,7 +1,7 @@
 """How long until a clip is tracked with help, with the authors' reward, with their help, and with none.
 
     python benchmarks/zero_help.py --data FOLDER --clip NAME [--minutes M] [--seed S] [--threads N]
-        [--work FOLDER] [--out FILE.json]
+        [--work FOLDER] [--out FILE.json] [--scratch]
 
 FOLDER holds the clips as listed in CLIPS. One run per call, from reading the file; all seconds are wall
 seconds and count the checks. Every `--check` seconds the deterministic policy is simulated to the end
@@ -127,6 +127,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=45.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--scratch", action="store_true", help="without the cloned expert")
     parser.add_argument("--check", type=float, default=30.0)
     parser.add_argument("--work", type=Path, default=Path("runs/zero_help"))
     parser.add_argument("--out", type=Path)
@@ -139,7 +140,8 @@ def main() -> None:
     skeleton = folder / asf if asf else None
     clip = read_clip(args.data / path, skeleton=skeleton, fps=fps)
     out = args.work / f"{args.clip}-s{args.seed}"
-    config = ResidualForce(help_start=100.0, help_limit=0.0, seed=args.seed)
+    start = not args.scratch
+    config = ResidualForce(help_start=100.0, help_limit=0.0, seed=args.seed, expert=start)
     imitation = begin(out / "run", ClipLibrary.of(clip), config)
     print("\n".join(imitation.report.sentences()), flush=True)
     watch = Watch(imitation, out / "run", begun, args.check, goal)
@@ -151,6 +153,7 @@ def main() -> None:
     report = {
         "clip": args.clip,
         "seed": args.seed,
+        "expert": start,
         "seconds_to": watch.marks,
         "final": final,
         "help": asdict(result.card.help),
