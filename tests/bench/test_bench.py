@@ -155,3 +155,15 @@ def test_the_command_prints_tables_and_saves_json(tmp_path, capsys):
 def test_mistakes_are_told(argv, words, capsys):
     assert main(["bench", *argv]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_figures_are_set_beside_earlier_ones(tmp_path, capsys):
+    before = tmp_path / "before.json"
+    before.write_text(json.dumps({"latency": {"ms": 1e6}}))
+    main(["bench", "latency", "--against", str(before)])
+    out = capsys.readouterr().out
+    assert "compared with before" in out and "-100 %" in out
+    for text, said in (("{}", "holds no figures of poise bench"), ("", "cannot be compared with")):
+        before.write_text(text)
+        assert main(["bench", "latency", "--against", str(before)]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())

@@ -40,6 +40,8 @@ class Options:
     """Write the results as JSON; "-" prints JSON alone."""
     device: Device = "cpu"
     """cuda measures engine on an NVIDIA GPU, against mujoco_warp's own step."""
+    against: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """An earlier JSON to compare shares and times with; nothing is judged by them."""
     envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Characters simulated at once in engine; by default 512, and 4096 on a GPU."""
     threads: Annotated[int, arg(metavar="N")] = 0
@@ -53,6 +55,7 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> int:
     """Measures, prints tables, saves JSON."""
     _check(options)
+    before = None if options.against is None else _earlier(options.against)
     folder = None if options.run is None else run_folder(options.run)
     from poise.bench import machine
 
@@ -74,6 +77,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     for name, show in _SHOW.items():
         if name in result:
             show(result[name])
+    if before is not None:
+        _show_change(before, result)
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         say(str(options.json))
@@ -93,6 +98,39 @@ def _check(options: Options) -> None:
     if options.device != "cpu" and options.what not in ("all", "engine"):
         raise PoiseError(f"bench {options.what} runs on the CPU alone", hint="Leave --device out")
     check_device(options.device)
+
+
+def _earlier(path: Path) -> Result:
+    """What an earlier `--json` wrote."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as problem:
+        raise PoiseError(f"cannot be compared with ({problem})", path) from None
+    if not isinstance(found, dict) or not any(name in found for name in _COMPARED):
+        raise PoiseError("holds no figures of poise bench", path, "Make it with poise bench --json")
+    return found
+
+
+#: What is compared: shares of one run and times, which differ less between machines than rates do.
+_COMPARED: dict[str, tuple[tuple[str, str], ...]] = {
+    "engine": (
+        ("stepping_of_raw", "stepping, share of raw"),
+        ("training_of_raw", "training, share of raw"),
+        ("raw_per_s", "raw control steps/s"),
+        ("training_per_s", "training control steps/s"),
+    ),
+    "latency": (("ms", "one character, ms a control step"),),
+}
+
+
+def _show_change(before: Result, now: Result) -> None:
+    rows = []
+    for part, figures in _COMPARED.items():
+        for key, name in figures:
+            was, got = before.get(part, {}).get(key), now.get(part, {}).get(key)
+            if was and got is not None:
+                rows.append((name, f"{was:g}", f"{got:g}", f"{100 * (got / was - 1):+.0f} %"))
+    table("compared with before", ("figure", "before", "now", "change"), rows)
 
 
 def _imitation(options: Options) -> Imitation:

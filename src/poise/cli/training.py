@@ -66,7 +66,7 @@ class Job:
         say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
         notes([n for clip in library for n in clip.skeleton.source.notes])
         with claimed(self.out), claimed(self.run), progress.working("making the body"):
-            imitation = begin(self.run, library, config)
+            imitation = begin(self.run, library, config, self.training.device)
         if self.training.resume and not held:
             tell(f"There was no run in {self.run}; a new one starts.")
         notes(imitation.report.sentences())

@@ -13,6 +13,7 @@ from poise.kin import FitReport
 from poise.learn import PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.motion import ClipLibrary
+from poise.recipes.room import FEW, check_room, free_bytes, learner_bytes
 from poise.sim import NanGuard, make_backend
 
 
@@ -64,6 +65,24 @@ class Imitation:
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
         return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
 
+    def check_room(self, num_envs: int, device: str = "cpu") -> None:
+        """Raises a PoiseError that says how many characters fit, if `num_envs` do not.
+
+        A GPU's memory is checked where its worlds are made.
+        """
+        if num_envs <= FEW or device != "cpu":
+            return
+        few = 64
+        env = self.env(few, threads=1)
+        try:
+            fields = env.backend.state
+            state = env.state()["sim"].nbytes + sum(fields[name].nbytes for name in fields.names)
+            learner = learner_bytes(self.ppo().horizon, env.num_obs, env.num_actions)
+        finally:
+            env.close()
+        # A step gathers the reference and evaluates the terms in a few copies of the observations.
+        check_room(num_envs, state // few + learner + 40 * env.num_obs, free_bytes())
+
     def trainer(
         self,
         threads: int = 0,
@@ -85,6 +104,7 @@ class Imitation:
         if not threads and comm.local_size > 1:
             threads = max(1, len(os.sched_getaffinity(0)) // comm.local_size)
         own = share_of(self.config.num_envs, comm)
+        self.check_room(own, device)
         seed = rank_seed(self.config.seed, rank)
         env = self.env(own, seed, threads=threads, dumps=dumps, device=device)
         # A GPU is fed by one thread.

@@ -56,9 +56,11 @@ class Evaluation:
     recordings: list[Recording]
 
 
-def begin(folder: Path, library: ClipLibrary, config: ResidualForce) -> Imitation:
-    """Builds the task and writes the run file; a folder that holds another run is refused."""
+def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str = "cpu") -> Imitation:
+    """Builds the task and writes the run file; a folder that holds another run is refused, and so are
+    more characters than fit into the memory of the `device` that will train it."""
     imitation = build(library, config)
+    imitation.check_room(config.num_envs, device)
     path = folder / RUN_FILE
     tensors, notes = pack_clips(library.clips)
     meta = {"kind": "run", "recipe": "residual-force", "config": _as_json(config), "clips": notes}
