@@ -69,3 +69,16 @@ def test_the_state_goes_on_where_it_was(make_env):
 def test_evaluation_does_not_change_it(make_env):
     env = make_env(2, auto_reset=False, help_start=100.0, help_limit=0.0)
     assert env.help.schedule is None
+
+
+def test_a_finished_clip_is_worth_as_many_last_steps_as_stated(make_env):
+    """With discount 0.95 the last reward counts 1 + 19 times; a failed or running episode's once."""
+    env, plain = make_env(3, expert=False), make_env(3, finish=False)
+    assert env.task.finish == pytest.approx(19.0) and plain.task.finish == 0.0
+    last = int(env.reference.length[0]) - 2
+    for e in (env, plain):
+        e.reset_to(torch.zeros(3, dtype=torch.long), torch.tensor([last, last - 1, last]))
+    a, b = (e.step(torch.zeros(3, env.num_actions)) for e in (env, plain))
+    assert a.terminated.tolist() == [True, False, True] and not a.failed.any()
+    torch.testing.assert_close(a.reward / b.reward, torch.tensor([20.0, 1.0, 20.0]))
+    torch.testing.assert_close(env.imitation, plain.imitation)

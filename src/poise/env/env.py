@@ -44,7 +44,9 @@ class TaskConfig:
     obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
     of residual force, None for plain DeepMimic. help: how its limits change while episodes are
     counted, which is with auto_reset alone; None leaves them. horizon: control steps until an episode
-    times out. auto_reset: start a new episode where one ended (off while evaluating).
+    times out. finish: what a clip done to its end is worth, in rewards of its last step; a discount g
+    makes g / (1 - g) of a character that goes on as it ended. auto_reset: start a new episode where
+    one ended (off while evaluating).
     """
 
     obs: tuple[ObsTerm, ...]
@@ -54,6 +56,7 @@ class TaskConfig:
     residual: Residual | None = None
     help: HelpSchedule | None = None
     horizon: int = 300
+    finish: float = 0.0
     auto_reset: bool = True
 
 
@@ -185,11 +188,14 @@ class ImitationEnv:
         final, values, failed = self._terms.judge(self._seen(ref, self._goal))
         self.terms = {t.name: values[k] for k, t in enumerate(self.task.rewards)}
         reward, self.imitation = (self._reward_weights @ values).unbind(0)
-        # A clip that is done to its end is a finished task, whose remaining return is known to be
-        # zero; the phase in the observation tells the critic when. To bootstrap there would rest on
-        # a state whose value is never learned, and the policy comes to exploit it.
+        # A clip that is done to its end is a finished task, whose remaining return is stated: as many
+        # steps like the last as `finish` says, since with nothing to come the last moments would not
+        # matter and characters would fall in them. To bootstrap there would rest on a state whose
+        # value is never learned, and the policy comes to exploit it.
         last = self.frame >= self.reference.length[self.clip] - 1
-        terminated = failed | (last & ~self.reference.cyclic[self.clip])
+        finished = last & ~self.reference.cyclic[self.clip]
+        terminated = failed | finished
+        reward = torch.where(finished & ~failed, reward * (1.0 + self.task.finish), reward)
         truncated = (self.age >= self.task.horizon) & ~terminated
         obs = final
         log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)

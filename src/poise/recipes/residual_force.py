@@ -55,6 +55,8 @@ class ResidualForce:
     done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
     residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
     that of the joints. 0.3 is the paper's; with the joints' 0.055 the help is hardly tried.
+    finish: a clip done to its end is worth what holding on as in its last step would be; without it the
+    last moments matter little and characters fall in them.
     expert: start from a cloned expert (`recipes.expert`); without it PPO starts from nothing.
     """
 
@@ -69,6 +71,7 @@ class ResidualForce:
     faithful: Literal["paper", "code"] = "paper"
     done: Literal["bodies", "height"] = "bodies"
     residual_std: float = 0.3
+    finish: bool = True
     expert: bool = True
     num_envs: int = 512
     horizon: int = 300
@@ -128,6 +131,12 @@ def local_rewards(humanoid: Humanoid, faithful: str = "paper") -> tuple[RewardTe
     )
 
 
+def finish_worth(config: ResidualForce) -> float:
+    """Rewards of the last step that a finished clip is worth: g + g^2 + ... = g / (1 - g)."""
+    gamma = config.ppo.gamma
+    return gamma / max(1.0 - gamma, 1.0 / config.horizon) if config.finish else 0.0
+
+
 def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
     """Imitation as terms."""
     help_ = residual(config, humanoid)
@@ -153,6 +162,7 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
         residual=help_,
         help=schedule(config),
         horizon=config.horizon,
+        finish=finish_worth(config),
     )
 
 
@@ -176,7 +186,7 @@ def paper(config: ResidualForce) -> ResidualForce:
         "sim": slow,
         "expert": False,
     }
-    return replace(config, ppo=PPOConfig.paper(), **faithful)
+    return replace(config, ppo=PPOConfig.paper(), finish=False, **faithful)
 
 
 #: What to expect of the default settings (see `benchmarks/first_light.json`).
