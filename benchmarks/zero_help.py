@@ -1,7 +1,8 @@
 """How long until a clip is tracked with help, with the authors' reward, with their help, and with none.
 
     python benchmarks/zero_help.py --data FOLDER --clip NAME [--minutes M] [--seed S] [--threads N]
-        [--work FOLDER] [--out FILE.json] [--scratch]
+        [--work FOLDER] [--scratch]
+    python benchmarks/zero_help.py --collect [--work FOLDER]
 
 FOLDER holds the clips as listed in CLIPS. One run per call, from reading the file; all seconds are wall
 seconds and count the checks. Every `--check` seconds the deterministic policy is simulated to the end
@@ -22,6 +23,7 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from poise.eval import RolloutSet
@@ -32,6 +34,7 @@ from poise.recipes.deliver import deliver
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, task
 from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
+from poise.view import line_plot
 
 RFC, CMU, MIMIC = "cmu_amc/rfc", "cmu_amc/02", "deepmimic_txt"
 #: Path, skeleton, frames per second where the file's default is wrong, and for the clips of the paper
@@ -119,19 +122,42 @@ class Watch:
                 self.marks.setdefault(name, row["seconds"])
 
 
+def collect(work: Path) -> None:
+    """All finished runs in one JSON, in the order of CLIPS, and the limit of the help over time."""
+    order = list(CLIPS)
+    runs = [json.loads(path.read_text()) for path in work.glob("*/zero_help.json")]
+    runs.sort(key=lambda r: (order.index(r["clip"]), r["seed"]))
+    out = Path(__file__).with_suffix(".json")
+    command = "python benchmarks/zero_help.py --data FOLDER --clip CLIP --seed SEED"
+    lines = ",\n".join(f"  {json.dumps(run)}" for run in runs)
+    head = json.dumps({"command": command}, indent=1).rstrip("}").rstrip()
+    out.write_text(f'{head},\n "runs": [\n{lines}\n ]\n}}\n')
+    series = []
+    for run in runs:
+        if run["seed"] == 0:
+            x, y = (np.array([c[key] for c in run["checks"]]) for key in ("seconds", "help_limit"))
+            series.append((run["clip"], x / 60.0, y))
+    line_plot(series, "Help that is left while training", "minutes", "limit, N", out.with_suffix(".svg"))
+    print(out)
+
+
 def main() -> None:
     """One run, one JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--clip", choices=list(CLIPS), required=True)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--clip", choices=list(CLIPS))
+    parser.add_argument("--collect", action="store_true", help="gather finished runs into one JSON")
     parser.add_argument("--minutes", type=float, default=45.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--scratch", action="store_true", help="without the cloned expert")
     parser.add_argument("--check", type=float, default=30.0)
     parser.add_argument("--work", type=Path, default=Path("runs/zero_help"))
-    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
+    if args.collect:
+        return collect(args.work)
+    if args.data is None or args.clip is None:
+        parser.error("--data and --clip are needed")
     begun = time.perf_counter()
     if args.threads:
         torch.set_num_threads(args.threads)
@@ -163,8 +189,7 @@ def main() -> None:
         "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores",
         "checks": watch.rows,
     }
-    target = args.out or out / "zero_help.json"
-    target.parent.mkdir(parents=True, exist_ok=True)
+    target = out / "zero_help.json"
     target.write_text(json.dumps(report, indent=1) + "\n")
     print(target)
 

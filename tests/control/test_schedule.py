@@ -42,7 +42,7 @@ def test_final_bounds_it_from_below():
     [
         lambda: LinearHelp(5, 5),
         lambda: LinearHelp(0, 5, final=1.5),
-        lambda: SuccessHelp(lower_at=0.4),
+        lambda: SuccessHelp(lower_at=0.2),
         lambda: SuccessHelp(factor=1.0),
         lambda: SuccessHelp(final=-0.1),
     ],
