@@ -97,16 +97,14 @@ class ImitationEnv:
         self._weights = seconds if weights is None else weights.double().cpu()
         n, here = self.num_envs, self.device
         self.clip = torch.zeros(n, dtype=torch.long, device=here)
-        self.frame = torch.zeros(n, dtype=torch.long, device=here)
-        self.age = torch.zeros(n, dtype=torch.long, device=here)
+        # Views of one tensor, since every step adds one to both.
+        self._counts = torch.zeros(2, n, dtype=torch.long, device=here)
+        self.frame, self.age = self._counts.unbind(0)
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
         self.help = HelpBudget(task.help if task.auto_reset and task.residual else None, here)
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
-        # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
-        shares = [[t.weight, t.weight * t.imitation] for t in task.rewards]
-        self._reward_weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(here)
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
         self._goal, self._goal_rows = torch.empty(0), torch.empty(0, dtype=torch.long)
         self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long).to(here)
@@ -115,7 +113,7 @@ class ImitationEnv:
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
-        self._terms = Terms(*terms, self._frame_of, fused)
+        self._terms = Terms(*terms, self._frame_of, here, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
         self._obs = torch.empty(n, self.num_obs, device=here)
@@ -178,18 +176,16 @@ class ImitationEnv:
             self._guard.step(self.substeps)
         else:
             self.backend.step(self.substeps)
-        self.frame += 1
-        self.age += 1
+        self._counts += 1
         ref = self._goal
-        self._aim()
-        final, values, failed = self._terms.judge(self._seen(ref, self._goal))
+        self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame)
+        final, values, sums, failed = self._terms.judge(self._seen(ref, self._goal))
         self.terms = {t.name: values[k] for k, t in enumerate(self.task.rewards)}
-        reward, self.imitation = (self._reward_weights @ values).unbind(0)
+        reward, self.imitation = sums.unbind(0)
         # A clip that is done to its end is a finished task, whose remaining return is known to be
         # zero; the phase in the observation tells the critic when. To bootstrap there would rest on
         # a state whose value is never learned, and the policy comes to exploit it.
-        last = self.frame >= self.reference.length[self.clip] - 1
-        terminated = failed | (last & ~self.reference.cyclic[self.clip])
+        terminated = failed | (self.reference.place(ref).end > 0)
         truncated = (self.age >= self.task.horizon) & ~terminated
         obs = final
         log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
@@ -251,38 +247,23 @@ class ImitationEnv:
 
     def _seen(self, ref: Tensor, ahead: Tensor, ids: Tensor | None = None) -> Seen:
         """What the terms are worked out from, of all worlds or of the worlds `ids`."""
-        state = self.backend.state
-        clip, frame, action = self.clip, self.frame, self.action
+        s, action = self.backend.state, self.action
+        fields = s.qpos, s.qvel, s.xpos, s.xquat, s.cvel, s.subtree_com
         if ids is not None:
-            clip, frame, action = clip[ids], frame[ids], action[ids]
-
-        def of(field: Tensor) -> Tensor:
-            return field if ids is None else field[ids]
-
-        return Seen(
-            of(state.qpos),
-            of(state.qvel),
-            of(state.xpos),
-            of(state.xquat),
-            of(state.cvel),
-            of(state.subtree_com),
-            ref,
-            ahead,
-            self.reference.phase(clip, frame),
-            action[:, self.hinges :],
-            self.reference.min_height[clip],
-        )
+            fields, action = tuple(field[ids] for field in fields), action[ids]
+        return Seen(*fields, ref, ahead, action)
 
     def _frame_of(self, seen: Seen) -> Frame:
         residual, reference = self.task.residual, self.reference
+        place, extra = reference.place(seen.ref), seen.action[:, self.hinges :]
         return Frame(
             sim_pose(seen, reference.local, self._roots),
             reference.unpacked(seen.ref),
             reference.unpacked(seen.ahead),
-            seen.phase,
-            seen.residual,
-            residual.regularizer(seen.residual) if residual else torch.ones_like(seen.phase),
-            seen.low,
+            place.phase,
+            extra,
+            residual.regularizer(extra) if residual else torch.ones_like(place.phase),
+            place.low,
         )
 
     def _frame(self) -> Frame:

@@ -11,6 +11,9 @@ from torch import Tensor
 
 TensorFunction = Callable[..., tuple[Tensor, ...]]
 
+#: Where a slice without an end ends.
+_END = torch.iinfo(torch.int64).max
+
 
 def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
     """What `plain(*given)` does, as one call for any number of worlds (TorchScript).
@@ -26,5 +29,16 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
         except RuntimeError:
             return plain
     # What a recording would freeze, such as a value that was asked for, torch only warns of.
-    frozen = any(issubclass(w.category, torch.jit.TracerWarning) for w in told)
-    return plain if frozen else cast(TensorFunction, recorded)
+    if any(issubclass(w.category, torch.jit.TracerWarning) for w in told):
+        return plain
+    _drop_whole_slices(recorded.graph)
+    return cast(TensorFunction, recorded)
+
+
+def _drop_whole_slices(graph: torch.Graph) -> None:
+    """Takes out the `[:]` of every `x[:, 2:]`, which a recording would run as a step of its own."""
+    for node in graph.findAllNodes("aten::slice"):
+        source, _, *bounds = node.inputs()
+        if [b.toIValue() for b in bounds] == [0, _END, 1]:
+            node.output().replaceAllUsesWith(source)
+            node.destroy()

@@ -41,6 +41,16 @@ _SIXD = (
     (0, 0, -1, 0, 0, 0), (0, 1, 0, 1, 0, 0), (-1, 0, 0, 0, 1, 0), (0, 0, 0, 0, 0, 1),
     (0, 1, 0, -1, 0, 0), (0, 0, 1, 0, 0, 0), (0, 0, 0, 0, 0, 1), (-1, 0, 0, 0, -1, 0),
 )  # fmt: skip
+#: Row 4 i + j holds what q_i q_j of a turn about +Z adds to (cos, cos, 1) and (sin, -sin, 0).
+_ABOUT_UP = tuple(
+    {
+        0: (1, 1, 1, 0, 0, 0),
+        3: (0, 0, 0, 1, -1, 0),
+        12: (0, 0, 0, 1, -1, 0),
+        15: (-1, -1, 1, 0, 0, 0),
+    }.get(k, (0,) * 6)
+    for k in range(16)
+)
 
 
 def normalize(q: Tensor) -> Tensor:
@@ -214,10 +224,10 @@ def heading_quat(q: Tensor) -> Tensor:
 
 def into_heading(heading: Tensor, v: Tensor) -> Tensor:
     """Vectors `v (..., K, 3)` of the world in the frames of turns about +Z `heading (..., 4)`."""
-    w, z = heading[..., :1], heading[..., 3:]
-    cos, sin = 1.0 - 2.0 * z * z, 2.0 * w * z
-    x, y, up = v.unbind(-1)
-    return torch.stack((cos * x + sin * y, cos * y - sin * x, up), -1)
+    # (c x + s y, c y - s x, up) = (c, c, 1) * (x, y, up) + (s, -s, 0) * (y, x, up)
+    own, other = _bilinear(heading, heading, _ABOUT_UP).unsqueeze(-2).split(3, -1)
+    swapped = v.index_select(-1, _table(((1, 0, 2),), torch.long, v.device)[0])
+    return torch.addcmul(v * own, swapped, other)
 
 
 def quat_to_sixd(q: Tensor) -> Tensor:

@@ -20,8 +20,8 @@ MANY = 256
 class Seen(NamedTuple):
     """What the terms of N worlds are worked out from: MuJoCo's own arrays (float64) and the rest.
 
-    ref, ahead: packed reference poses now and one control step later, see `Reference`. phase, low
-    `(N,)`: place in the clip and lowest reference height. residual `(N, k)`: the unscaled action.
+    ref, ahead: packed reference poses now and one control step later, see `Reference`. action
+    `(N, A)`: the last one.
     """
 
     qpos: Tensor
@@ -32,9 +32,7 @@ class Seen(NamedTuple):
     subtree_com: Tensor
     ref: Tensor
     ahead: Tensor
-    phase: Tensor
-    residual: Tensor
-    low: Tensor
+    action: Tensor
 
 
 def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Pose:
@@ -63,10 +61,12 @@ def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Po
 
 
 class Evaluation(NamedTuple):
-    """obs `(N, O)`; values `(K, N)`, one row per reward term; failed `(N,)` bool."""
+    """obs `(N, O)`; values `(K, N)`, one row per reward term, and their weighted sums `(2, N)`: the
+    reward, and the part of it that is imitation; failed `(N,)` bool."""
 
     obs: Tensor
     values: Tensor
+    sums: Tensor
     failed: Tensor
 
 
@@ -84,10 +84,14 @@ class Terms:
         rewards: tuple[RewardTerm, ...],
         dones: tuple[DoneTerm, ...],
         frame: Callable[[Seen], Frame],
+        device: torch.device,
         fused: bool = True,
     ):
         self.obs, self.rewards, self.dones, self.frame = obs, rewards, dones, frame
         self.fused = fused
+        # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
+        shares = [[t.weight, t.weight * t.imitation] for t in rewards]
+        self._weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(device)
         self._recorded: dict[str, TensorFunction] = {}
         self._pool: ThreadPoolExecutor | None = None
 
@@ -97,7 +101,7 @@ class Terms:
 
     def judge(self, seen: Seen) -> Evaluation:
         """Observations, rewards and failures."""
-        worlds = len(seen.phase)
+        worlds = len(seen.ref)
         if not self.fused or worlds < MANY:
             return Evaluation(*self._run("judge", self._judge, seen))
         # A recording runs without Python's lock, so that the second half really runs beside the first.
@@ -107,8 +111,8 @@ class Terms:
             self._run("judge", self._judge, first)
         other = self._helper().submit(self._run, "judge", self._judge, second)
         ours, theirs = self._run("judge", self._judge, first), other.result()
-        obs, values, failed = zip(ours, theirs, strict=True)
-        return Evaluation(torch.cat(obs), torch.cat(values, 1), torch.cat(failed))
+        obs, values, sums, failed = zip(ours, theirs, strict=True)
+        return Evaluation(torch.cat(obs), torch.cat(values, 1), torch.cat(sums, 1), torch.cat(failed))
 
     def _helper(self) -> ThreadPoolExecutor:
         if self._pool is None:
@@ -122,12 +126,13 @@ class Terms:
 
     def _judge(self, *seen: Tensor) -> tuple[Tensor, ...]:
         frame = self.frame(Seen(*seen))
-        values = [term.fn(frame, **term.params) for term in self.rewards]
+        rewards = [term.fn(frame, **term.params) for term in self.rewards]
+        values = torch.stack(rewards or [frame.phase])[: len(rewards)]
         failed = torch.zeros_like(frame.phase, dtype=torch.bool)
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         obs = torch.cat([term.fn(frame, **term.params) for term in self.obs], -1)
-        return obs, torch.stack(values or [frame.phase])[: len(values)], failed
+        return obs, values, self._weights @ values, failed
 
     def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
         if not self.fused:

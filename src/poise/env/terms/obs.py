@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from poise.env.frame import Frame, Pose
-from poise.spatial import into_heading, quat_conj, quat_mul, quat_rotate_inv, quat_to_sixd
+from poise.spatial import into_heading, quat_conj, quat_mul, quat_to_sixd
 
 
 def root_height(frame: Frame) -> Tensor:
@@ -21,13 +21,14 @@ def root_quat(frame: Frame) -> Tensor:
 
 def root_tilt(frame: Frame) -> Tensor:
     """Root orientation without heading, first two matrix columns `(N, 6)`."""
-    return quat_to_sixd(quat_mul(quat_conj(frame.sim.heading), frame.sim.quat[:, 0]))
+    columns = quat_to_sixd(frame.sim.quat[:, 0]).unflatten(-1, (2, 3))
+    return into_heading(frame.sim.heading, columns).flatten(1)
 
 
 def root_velocity(frame: Frame) -> Tensor:
     """Root linear velocity in the heading frame (m/s) and angular in the root frame (rad/s) `(N, 6)`."""
-    linear = quat_rotate_inv(frame.sim.heading, frame.sim.qvel[:, :3])
-    return torch.cat((linear, frame.sim.qvel[:, 3:6]), -1)
+    linear = into_heading(frame.sim.heading, frame.sim.qvel[:, None, :3])
+    return torch.cat((linear.squeeze(1), frame.sim.qvel[:, 3:6]), -1)
 
 
 def joint_angles(frame: Frame) -> Tensor:
