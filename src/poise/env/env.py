@@ -113,7 +113,7 @@ class ImitationEnv:
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
-        self._terms = Terms(*terms, self._frame_of, here, fused)
+        self._terms = Terms(*terms, self._frame_of, self._ends, here, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
         self._obs = torch.empty(n, self.num_obs, device=here)
@@ -179,14 +179,10 @@ class ImitationEnv:
         self._counts += 1
         ref = self._goal
         self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame)
-        final, values, sums, failed = self._terms.judge(self._seen(ref, self._goal))
+        judged = self._terms.judge(self._seen(ref, self._goal))
+        final, values, sums, failed, terminated, truncated = judged
         self.terms = {t.name: values[k] for k, t in enumerate(self.task.rewards)}
         reward, self.imitation = sums.unbind(0)
-        # A clip that is done to its end is a finished task, whose remaining return is known to be
-        # zero; the phase in the observation tells the critic when. To bootstrap there would rest on
-        # a state whose value is never learned, and the policy comes to exploit it.
-        terminated = failed | (self.reference.place(ref).end > 0)
-        truncated = (self.age >= self.task.horizon) & ~terminated
         obs = final
         log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
         if self.task.auto_reset:
@@ -198,6 +194,14 @@ class ImitationEnv:
                 obs = self._obs.copy_(final)
                 obs[ids] = self._terms.observe(self._seen(ref, self._goal[ids], ids))
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
+
+    def _ends(self, seen: Seen, failed: Tensor) -> tuple[Tensor, Tensor]:
+        """Which episodes are terminated and which are truncated."""
+        # A clip that is done to its end is a finished task, whose remaining return is known to be
+        # zero; the phase in the observation tells the critic when. To bootstrap there would rest on
+        # a state whose value is never learned, and the policy comes to exploit it.
+        terminated = failed | (self.reference.place(seen.ref).end > 0)
+        return terminated, (seen.age >= self.task.horizon) & ~terminated
 
     def _apply(self) -> None:
         """Turns the action into what drives the characters, held over the control step."""
@@ -247,11 +251,11 @@ class ImitationEnv:
 
     def _seen(self, ref: Tensor, ahead: Tensor, ids: Tensor | None = None) -> Seen:
         """What the terms are worked out from, of all worlds or of the worlds `ids`."""
-        s, action = self.backend.state, self.action
+        s, action, age = self.backend.state, self.action, self.age
         fields = s.qpos, s.qvel, s.xpos, s.xquat, s.cvel, s.subtree_com
         if ids is not None:
-            fields, action = tuple(field[ids] for field in fields), action[ids]
-        return Seen(*fields, ref, ahead, action)
+            fields, action, age = tuple(field[ids] for field in fields), action[ids], age[ids]
+        return Seen(*fields, ref, ahead, action, age)
 
     def _frame_of(self, seen: Seen) -> Frame:
         residual, reference = self.task.residual, self.reference

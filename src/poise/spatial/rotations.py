@@ -34,6 +34,8 @@ _PRODUCT = (
     (0, 0, 1, 0), (0, 0, 0, -1), (-1, 0, 0, 0), (0, 1, 0, 0),
     (0, 0, 0, 1), (0, 0, 1, 0), (0, -1, 0, 0), (-1, 0, 0, 0),
 )  # fmt: skip
+#: The same for the product with a's conjugate, whose x, y and z are the other way round.
+_BETWEEN = _PRODUCT[:4] + tuple(tuple(-x for x in row) for row in _PRODUCT[4:])
 #: Row 4 i + j holds what q_i q_j adds to the first two columns of the rotation matrix.
 _SIXD = (
     (1, 0, 0, 0, 1, 0), (0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0), (0, 1, 0, -1, 0, 0),
@@ -66,6 +68,11 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
 def quat_conj(q: Tensor) -> Tensor:
     """The inverse of unit quaternions `(..., 4)`."""
     return torch.cat((q[..., :1], -q[..., 1:]), -1)
+
+
+def quat_between(a: Tensor, b: Tensor) -> Tensor:
+    """What turns `a` into `b`, in the frame of `a`: a^-1 b `(..., 4)` of unit quaternions."""
+    return _bilinear(a, b, _BETWEEN)
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
@@ -216,10 +223,10 @@ def slerp(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
 
 def heading_quat(q: Tensor) -> Tensor:
     """The turn about +Z that best matches `q`: its twist about Z (swing removed)."""
-    twist = q * _table(((1, 0, 0, 1),), q.dtype, q.device)[0]
-    n = twist.norm(dim=-1, keepdim=True)
-    identity = _table(((1, 0, 0, 0),), q.dtype, q.device)[0]
-    return torch.where(n < 1e-8, identity, twist / n.clamp_min(1e-8))
+    # The tiny number is lost beside any twist, and alone where there is none, for the identity.
+    tiny, about_up = _table(((1e-18, 0, 0, 0), (1, 0, 0, 1)), q.dtype, q.device).unbind(0)
+    twist = torch.addcmul(tiny, q, about_up)
+    return twist / twist.norm(dim=-1, keepdim=True)
 
 
 def into_heading(heading: Tensor, v: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ class Seen(NamedTuple):
     """What the terms of N worlds are worked out from: MuJoCo's own arrays (float64) and the rest.
 
     ref, ahead: packed reference poses now and one control step later, see `Reference`. action
-    `(N, A)`: the last one.
+    `(N, A)`: the last one. age `(N)`: control steps since the episode began.
     """
 
     qpos: Tensor
@@ -33,6 +33,7 @@ class Seen(NamedTuple):
     ref: Tensor
     ahead: Tensor
     action: Tensor
+    age: Tensor
 
 
 def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Pose:
@@ -62,12 +63,15 @@ def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Po
 
 class Evaluation(NamedTuple):
     """obs `(N, O)`; values `(K, N)`, one row per reward term, and their weighted sums `(2, N)`: the
-    reward, and the part of it that is imitation; failed `(N,)` bool."""
+    reward, and the part of it that is imitation; failed, and what `ends` makes of it: terminated and
+    truncated, `(N,)` bool."""
 
     obs: Tensor
     values: Tensor
     sums: Tensor
     failed: Tensor
+    terminated: Tensor
+    truncated: Tensor
 
 
 class Terms:
@@ -75,6 +79,7 @@ class Terms:
 
     Args:
         frame: what the terms see, made of `Seen`.
+        ends: which episodes are terminated and which are truncated, by what was seen and what failed.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
 
@@ -84,10 +89,12 @@ class Terms:
         rewards: tuple[RewardTerm, ...],
         dones: tuple[DoneTerm, ...],
         frame: Callable[[Seen], Frame],
+        ends: Callable[[Seen, Tensor], tuple[Tensor, Tensor]],
         device: torch.device,
         fused: bool = True,
     ):
-        self.obs, self.rewards, self.dones, self.frame = obs, rewards, dones, frame
+        self.obs, self.rewards, self.dones = obs, rewards, dones
+        self.frame, self.ends = frame, ends
         self.fused = fused
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
         shares = [[t.weight, t.weight * t.imitation] for t in rewards]
@@ -111,8 +118,8 @@ class Terms:
             self._run("judge", self._judge, first)
         other = self._helper().submit(self._run, "judge", self._judge, second)
         ours, theirs = self._run("judge", self._judge, first), other.result()
-        obs, values, sums, failed = zip(ours, theirs, strict=True)
-        return Evaluation(torch.cat(obs), torch.cat(values, 1), torch.cat(sums, 1), torch.cat(failed))
+        obs, *rest = zip(ours, theirs, strict=True)
+        return Evaluation(torch.cat(obs), *(torch.cat(halves, -1) for halves in rest))
 
     def _helper(self) -> ThreadPoolExecutor:
         if self._pool is None:
@@ -125,14 +132,15 @@ class Terms:
         return (torch.cat([term.fn(frame, **term.params) for term in self.obs], -1),)
 
     def _judge(self, *seen: Tensor) -> tuple[Tensor, ...]:
-        frame = self.frame(Seen(*seen))
+        all_seen = Seen(*seen)
+        frame = self.frame(all_seen)
         rewards = [term.fn(frame, **term.params) for term in self.rewards]
         values = torch.stack(rewards or [frame.phase])[: len(rewards)]
         failed = torch.zeros_like(frame.phase, dtype=torch.bool)
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         obs = torch.cat([term.fn(frame, **term.params) for term in self.obs], -1)
-        return obs, values, self._weights @ values, failed
+        return obs, values, self._weights @ values, failed, *self.ends(all_seen, failed)
 
     def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
         if not self.fused:
