@@ -179,10 +179,10 @@ class ImitationEnv:
         self._counts += 1
         ref = self._goal
         self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame)
-        judged = self._terms.judge(self._seen(ref, self._goal))
-        final, values, sums, failed, terminated, truncated = judged
-        self.terms = {t.name: values[k] for k, t in enumerate(self.task.rewards)}
-        reward, self.imitation = sums.unbind(0)
+        final, scores, ends = self._terms.judge(self._seen(ref, self._goal))
+        reward, self.imitation, *values = scores.unbind(0)
+        self.terms = {t.name: v for t, v in zip(self.task.rewards, values, strict=True)}
+        failed, terminated, truncated = ends.unbind(0)
         obs = final
         log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
         if self.task.auto_reset:

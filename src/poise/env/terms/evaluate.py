@@ -62,16 +62,12 @@ def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Po
 
 
 class Evaluation(NamedTuple):
-    """obs `(N, O)`; values `(K, N)`, one row per reward term, and their weighted sums `(2, N)`: the
-    reward, and the part of it that is imitation; failed, and what `ends` makes of it: terminated and
-    truncated, `(N,)` bool."""
+    """obs `(N, O)`. scores `(2 + K, N)`: the reward, the part of it that is imitation, and the value of
+    each of K reward terms. ends `(3, N)` bool: failed, terminated, truncated."""
 
     obs: Tensor
-    values: Tensor
-    sums: Tensor
-    failed: Tensor
-    terminated: Tensor
-    truncated: Tensor
+    scores: Tensor
+    ends: Tensor
 
 
 class Terms:
@@ -110,7 +106,7 @@ class Terms:
         """Observations, rewards and failures."""
         worlds = len(seen.ref)
         if not self.fused or worlds < MANY:
-            return Evaluation(*self._run("judge", self._judge, seen))
+            return Evaluation(*(x.clone() for x in self._run("judge", self._judge, seen)))
         # A recording runs without Python's lock, so that the second half really runs beside the first.
         # Many worlds are always cut, whatever the machine, since it may move the last digit.
         first, second = (Seen(*half) for half in zip(*(x.tensor_split(2) for x in seen), strict=True))
@@ -118,8 +114,8 @@ class Terms:
             self._run("judge", self._judge, first)
         other = self._helper().submit(self._run, "judge", self._judge, second)
         ours, theirs = self._run("judge", self._judge, first), other.result()
-        obs, *rest = zip(ours, theirs, strict=True)
-        return Evaluation(torch.cat(obs), *(torch.cat(halves, -1) for halves in rest))
+        obs, scores, ends = zip(ours, theirs, strict=True)
+        return Evaluation(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1))
 
     def _helper(self) -> ThreadPoolExecutor:
         if self._pool is None:
@@ -140,7 +136,8 @@ class Terms:
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         obs = torch.cat([term.fn(frame, **term.params) for term in self.obs], -1)
-        return obs, values, self._weights @ values, failed, *self.ends(all_seen, failed)
+        scores = torch.cat((self._weights @ values, values))
+        return obs, scores, torch.stack((failed, *self.ends(all_seen, failed)))
 
     def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
         if not self.fused:
