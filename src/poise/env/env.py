@@ -208,7 +208,8 @@ class ImitationEnv:
         state, drive, residual = self.backend.state, self.backend.drive, self.task.residual
         given = (
             self.action,
-            self.reference.hinges.index_select(0, self._goal_rows),
+            self.reference.hinges,
+            self._goal_rows,
             state.xpos,
             state.xquat,
             state.xipos,
@@ -224,13 +225,18 @@ class ImitationEnv:
             force, torque, point = done
             self.wrench = Wrench(force, torque, point, self._helped)
 
-    def _controlled(self, action: Tensor, targets: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Fills the drive, which `state` holds, anew; the wrench's force, torque and point."""
+    def _controlled(
+        self, action: Tensor, hinges: Tensor, goal: Tensor, *state: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Fills the drive, which `state` holds, anew; the wrench's force, torque and point.
+
+        hinges: the reference's angles, of which the rows `goal` are aimed at.
+        """
         xpos, xquat, xipos, *applied, scale = state
         drive = Drive(*applied)
         drive.clear()
         joints, extra = action[:, : self.hinges], action[:, self.hinges :]
-        self.task.pd.apply(joints, targets, drive)
+        self.task.pd.apply(joints, hinges.index_select(0, goal), drive)
         if self.task.residual is None:
             return (joints,)
         force, torque, point, self._helped = self.task.residual.apply(

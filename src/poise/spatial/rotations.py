@@ -43,16 +43,10 @@ _SIXD = (
     (0, 0, -1, 0, 0, 0), (0, 1, 0, 1, 0, 0), (-1, 0, 0, 0, 1, 0), (0, 0, 0, 0, 0, 1),
     (0, 1, 0, -1, 0, 0), (0, 0, 1, 0, 0, 0), (0, 0, 0, 0, 0, 1), (-1, 0, 0, 0, -1, 0),
 )  # fmt: skip
-#: Row 4 i + j holds what q_i q_j of a turn about +Z adds to (cos, cos, 1) and (sin, -sin, 0).
-_ABOUT_UP = tuple(
-    {
-        0: (1, 1, 1, 0, 0, 0),
-        3: (0, 0, 0, 1, -1, 0),
-        12: (0, 0, 0, 1, -1, 0),
-        15: (-1, -1, 1, 0, 0, 0),
-    }.get(k, (0,) * 6)
-    for k in range(16)
-)
+_NONE = (0,) * 9
+_WW, _WZ, _ZZ = (1, 0, 0, 0, 1, 0, 0, 0, 1), (0, -1, 0, 1, 0, 0, 0, 0, 0), (-1, 0, 0, 0, -1, 0, 0, 0, 1)
+#: Row 4 i + j holds what q_i q_j of a turn about +Z adds to its rotation matrix, row by row.
+_ABOUT_UP = (_WW, _NONE, _NONE, _WZ, *(_NONE,) * 8, _WZ, _NONE, _NONE, _ZZ)
 
 
 def normalize(q: Tensor) -> Tensor:
@@ -230,11 +224,9 @@ def heading_quat(q: Tensor) -> Tensor:
 
 
 def into_heading(heading: Tensor, v: Tensor) -> Tensor:
-    """Vectors `v (..., K, 3)` of the world in the frames of turns about +Z `heading (..., 4)`."""
-    # (c x + s y, c y - s x, up) = (c, c, 1) * (x, y, up) + (s, -s, 0) * (y, x, up)
-    own, other = _bilinear(heading, heading, _ABOUT_UP).unsqueeze(-2).split(3, -1)
-    swapped = v.index_select(-1, _table(((1, 0, 2),), torch.long, v.device)[0])
-    return torch.addcmul(v * own, swapped, other)
+    """Vectors `v (N, K, 3)` of the world in the frames of turns about +Z `heading (N, 4)`."""
+    # R^T v, written v R for rows v
+    return torch.bmm(v, _bilinear(heading, heading, _ABOUT_UP).unflatten(-1, (3, 3)))
 
 
 def quat_to_sixd(q: Tensor) -> Tensor:
