@@ -257,11 +257,13 @@ class ImitationEnv:
 
     def _seen(self, ref: Tensor, ahead: Tensor, ids: Tensor | None = None) -> Seen:
         """What the terms are worked out from, of all worlds or of the worlds `ids`."""
-        s, action, age = self.backend.state, self.action, self.age
+        s = self.backend.state
         fields = s.qpos, s.qvel, s.xpos, s.xquat, s.cvel, s.subtree_com
-        if ids is not None:
-            fields, action, age = tuple(field[ids] for field in fields), action[ids], age[ids]
-        return Seen(*fields, ref, ahead, action, age)
+        seen = Seen(*fields, ref, ahead, self.action, self.age)
+        if ids is None:
+            return seen
+        # The reference is that of the worlds `ids` already.
+        return Seen(*(x if x is ref or x is ahead else x[ids] for x in seen))
 
     def _frame_of(self, seen: Seen) -> Frame:
         residual, reference = self.task.residual, self.reference

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
-            recorded = torch.jit.trace(plain, given, check_trace=False)
+            recorded = cast(Any, torch.jit.trace(plain, given, check_trace=False))
         except RuntimeError:
             return plain
     # What a recording would freeze, such as a value that was asked for, torch only warns of.
@@ -37,12 +37,12 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
     def replay(*given: Tensor) -> tuple[Tensor, ...]:
         # What every operation otherwise notes for gradients is a sixth of the time of one world.
         with torch.inference_mode():
-            return cast(TensorFunction, recorded)(*given)
+            return recorded(*given)
 
     return replay
 
 
-def _drop_whole_slices(graph: torch.Graph) -> None:
+def _drop_whole_slices(graph: Any) -> None:
     """Takes out the `[:]` of every `x[:, 2:]`, which a recording would run as a step of its own."""
     for node in graph.findAllNodes("aten::slice"):
         source, _, *bounds = node.inputs()
