@@ -10,6 +10,8 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, RewardTerm
 from poise.env.frame import Frame, LazyPose
+from poise.env.record import record
+from poise.env.terms.evaluate import MANY
 from poise.sim import CpuBackend, body_linear_velocity_w
 from poise.spatial import (
     euler_to_quat,
@@ -160,7 +162,7 @@ def test_recorded_terms_give_what_the_plain_ones_give(make_task):
     assert torch.equal(fused.backend.state.qpos, plain.backend.state.qpos)
     recorded = fused._terms._recorded
     assert sorted(recorded) == ["judge", "observe"] and not plain._terms._recorded
-    assert all(isinstance(r, torch.jit.ScriptFunction) for r in recorded.values())
+    assert recorded["judge"] != fused._terms._judge and recorded["observe"] != fused._terms._observe
 
 
 def test_a_task_may_have_observations_alone(make_task):
@@ -170,8 +172,32 @@ def test_a_task_may_have_observations_alone(make_task):
     env.reset()
     step = env.step(actions(env, 0))
     assert step.obs.shape == (3, env.num_obs) and not step.reward.any() and not step.terminated.any()
-    assert isinstance(env._terms._recorded["judge"], torch.jit.ScriptFunction)
+    assert env._terms._recorded["judge"] != env._terms._judge
     env.close()
+
+
+@pytest.mark.parametrize("worlds", [3, MANY])
+def test_what_a_step_gives_may_be_learned_from_with_gradients(make_task, worlds):
+    task = make_task(num_envs=worlds)
+    env = ImitationEnv(task.reference, CpuBackend(task.humanoid.model, worlds, 1), task.task, 2)
+    env.reset()
+    for t in range(2):
+        step = env.step(actions(env, t))
+        given = [x for x in step if isinstance(x, Tensor)] + [*env.terms.values(), env.imitation]
+        assert len(given) > 6 and not any(x.is_inference() for x in given)
+    env.close()
+
+
+def test_whole_slices_are_left_out_of_recordings_and_others_are_not():
+    def plain(x: Tensor) -> tuple[Tensor, ...]:
+        return x[:, 2:] + 1.0, x[1:, :, None], x[:, ::2]
+
+    x = torch.arange(20.0).reshape(4, 5)
+    recorded = record(plain, (x,))
+    assert recorded != plain
+    for given in (x, torch.cat((x, -x))):
+        for a, b in zip(recorded(given), plain(given), strict=True):
+            assert torch.equal(a, b)
 
 
 def test_a_term_that_looks_at_values_is_never_frozen(make_task):

@@ -38,6 +38,22 @@ def test_rows_of_several_clips_end_to_end():
     assert all(not getattr(pose, f).requires_grad for f in FIELDS)
 
 
+def test_following_a_frame_equals_looking_up_the_next():
+    ref = reference_of(swing(0.5, speed=1.2, bend=0.7, cyclic=True), swing(0.4, name="short"))
+    clip, frame = at(0, 1, 0, 1), at(3, 0, 13, 10)
+    rows = ref.rows(clip, frame)
+    for _ in range(20):
+        rows, packed = ref.follow(rows, clip, frame)
+        frame = frame + 1
+        assert torch.equal(rows, ref.rows(clip, frame))
+        assert torch.equal(packed, ref.gather_packed(clip, frame))
+        place = ref.place(packed)
+        assert torch.equal(place.phase, ref.phase(clip, frame))
+        assert torch.equal(place.low, ref.min_height[clip])
+        done = (frame >= ref.length[clip] - 1) & ~ref.cyclic[clip]
+        assert torch.equal(place.end > 0, done)
+
+
 def test_a_cyclic_clip_is_carried_on_without_a_seam():
     ref = reference_of(swing(1.0, speed=1.2, bend=0.7, cyclic=True))
     last = 30

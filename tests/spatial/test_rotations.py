@@ -208,6 +208,8 @@ def test_the_short_ways_equal_the_long_ones():
     assert not spatial.quat_distance(a.float(), -a.float()).any()
     near = spatial.quat_mul(a, spatial.rotvec_to_quat(torch.tensor([1e-5, 0, 0]).double())).float()
     assert float(spatial.quat_distance(a.float(), near).max()) < 2e-5
+    between = spatial.quat_mul(spatial.quat_conj(a), b)
+    torch.testing.assert_close(spatial.quat_between(a, b), between)
     heading = spatial.heading_quat(a)
     turned = spatial.quat_rotate_inv(heading[:, None].expand(50, 7, 4), v)
     torch.testing.assert_close(spatial.into_heading(heading, v), turned)

@@ -31,7 +31,7 @@ class PDTargets:
     def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""
         base = q_ref_next if self.mode == "additive" else self.offset
-        target = action * self.scale
+        target = action if self.scale == 1.0 else action * self.scale
         drive.ctrl.add_(target if base is None else target + base.to(target.device))
 
 

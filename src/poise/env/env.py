@@ -100,16 +100,14 @@ class ImitationEnv:
         self._weights = seconds if weights is None else weights.double().cpu()
         n, here = self.num_envs, self.device
         self.clip = torch.zeros(n, dtype=torch.long, device=here)
-        self.frame = torch.zeros(n, dtype=torch.long, device=here)
-        self.age = torch.zeros(n, dtype=torch.long, device=here)
+        # Views of one tensor, since every step adds one to both.
+        self._counts = torch.zeros(2, n, dtype=torch.long, device=here)
+        self.frame, self.age = self._counts.unbind(0)
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
         self.help = HelpBudget(task.help if task.auto_reset and task.residual else None, here)
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
-        # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
-        shares = [[t.weight, t.weight * t.imitation] for t in task.rewards]
-        self._reward_weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(here)
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
         self._goal, self._goal_rows = torch.empty(0), torch.empty(0, dtype=torch.long)
         self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long).to(here)
@@ -118,7 +116,7 @@ class ImitationEnv:
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
-        self._terms = Terms(*terms, self._frame_of, fused)
+        self._terms = Terms(*terms, self._frame_of, self._ends, here, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
         self._obs = torch.empty(n, self.num_obs, device=here)
@@ -181,22 +179,15 @@ class ImitationEnv:
             self._guard.step(self.substeps)
         else:
             self.backend.step(self.substeps)
-        self.frame += 1
-        self.age += 1
+        self._counts += 1
         ref = self._goal
-        self._aim()
-        final, values, failed = self._terms.judge(self._seen(ref, self._goal))
-        self.terms = {t.name: values[k] for k, t in enumerate(self.task.rewards)}
-        reward, self.imitation = (self._reward_weights @ values).unbind(0)
-        # A clip that is done to its end is a finished task, whose remaining return is stated: as many
-        # steps like the last as `finish` says, since with nothing to come the last moments would not
-        # matter and characters would fall in them. To bootstrap there would rest on a state whose
-        # value is never learned, and the policy comes to exploit it.
-        last = self.frame >= self.reference.length[self.clip] - 1
-        finished = last & ~self.reference.cyclic[self.clip]
-        terminated = failed | finished
-        reward = torch.where(finished & ~failed, reward * (1.0 + self.task.finish), reward)
-        truncated = (self.age >= self.task.horizon) & ~terminated
+        self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame)
+        final, scores, ends = self._terms.judge(self._seen(ref, self._goal))
+        reward, self.imitation, *values = scores.unbind(0)
+        self.terms = {t.name: v for t, v in zip(self.task.rewards, values, strict=True)}
+        failed, terminated, truncated = ends.unbind(0)
+        if self.task.finish:
+            reward = torch.where(terminated & ~failed, reward * (1.0 + self.task.finish), reward)
         obs = final
         log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
         if self.task.auto_reset:
@@ -209,12 +200,22 @@ class ImitationEnv:
                 obs[ids] = self._terms.observe(self._seen(ref, self._goal[ids], ids))
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
 
+    def _ends(self, seen: Seen, failed: Tensor) -> tuple[Tensor, Tensor]:
+        """Which episodes are terminated and which are truncated."""
+        # A clip that is done to its end is a finished task, whose remaining return is stated: as many
+        # steps like the last as `finish` says, since with nothing to come the last moments would not
+        # matter and characters would fall in them. To bootstrap there would rest on a state whose
+        # value is never learned, and the policy comes to exploit it.
+        terminated = failed | (self.reference.place(seen.ref).end > 0)
+        return terminated, (seen.age >= self.task.horizon) & ~terminated
+
     def _apply(self) -> None:
         """Turns the action into what drives the characters, held over the control step."""
         state, drive, residual = self.backend.state, self.backend.drive, self.task.residual
         given = (
             self.action,
-            self.reference.hinges.index_select(0, self._goal_rows),
+            self.reference.hinges,
+            self._goal_rows,
             state.xpos,
             state.xquat,
             state.xipos,
@@ -230,13 +231,18 @@ class ImitationEnv:
             force, torque, point = done
             self.wrench = Wrench(force, torque, point, self._helped)
 
-    def _controlled(self, action: Tensor, targets: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Fills the drive, which `state` holds, anew; the wrench's force, torque and point."""
+    def _controlled(
+        self, action: Tensor, hinges: Tensor, goal: Tensor, *state: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Fills the drive, which `state` holds, anew; the wrench's force, torque and point.
+
+        hinges: the reference's angles, of which the rows `goal` are aimed at.
+        """
         xpos, xquat, xipos, *applied, scale = state
         drive = Drive(*applied)
         drive.clear()
         joints, extra = action[:, : self.hinges], action[:, self.hinges :]
-        self.task.pd.apply(joints, targets, drive)
+        self.task.pd.apply(joints, hinges.index_select(0, goal), drive)
         if self.task.residual is None:
             return (joints,)
         force, torque, point, self._helped = self.task.residual.apply(
@@ -257,38 +263,25 @@ class ImitationEnv:
 
     def _seen(self, ref: Tensor, ahead: Tensor, ids: Tensor | None = None) -> Seen:
         """What the terms are worked out from, of all worlds or of the worlds `ids`."""
-        state = self.backend.state
-        clip, frame, action = self.clip, self.frame, self.action
-        if ids is not None:
-            clip, frame, action = clip[ids], frame[ids], action[ids]
-
-        def of(field: Tensor) -> Tensor:
-            return field if ids is None else field[ids]
-
-        return Seen(
-            of(state.qpos),
-            of(state.qvel),
-            of(state.xpos),
-            of(state.xquat),
-            of(state.cvel),
-            of(state.subtree_com),
-            ref,
-            ahead,
-            self.reference.phase(clip, frame),
-            action[:, self.hinges :],
-            self.reference.min_height[clip],
-        )
+        s = self.backend.state
+        fields = s.qpos, s.qvel, s.xpos, s.xquat, s.cvel, s.subtree_com
+        seen = Seen(*fields, ref, ahead, self.action, self.age)
+        if ids is None:
+            return seen
+        # The reference is that of the worlds `ids` already.
+        return Seen(*(x if x is ref or x is ahead else x[ids] for x in seen))
 
     def _frame_of(self, seen: Seen) -> Frame:
         residual, reference = self.task.residual, self.reference
+        place, extra = reference.place(seen.ref), seen.action[:, self.hinges :]
         return Frame(
             sim_pose(seen, reference.local, self._roots),
             reference.unpacked(seen.ref),
             reference.unpacked(seen.ahead),
-            seen.phase,
-            seen.residual,
-            residual.regularizer(seen.residual) if residual else torch.ones_like(seen.phase),
-            seen.low,
+            place.phase,
+            extra,
+            residual.regularizer(extra) if residual else torch.ones_like(place.phase),
+            place.low,
         )
 
     def _frame(self) -> Frame:

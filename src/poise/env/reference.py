@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +20,18 @@ from poise.spatial import heading_quat, quat_mul, quat_rotate
 
 #: The fields of a pose in the order in which they are packed.
 FIELDS = tuple(f.name for f in fields(Pose))
+
+
+class Place(NamedTuple):
+    """What a packed pose says of its clip, float32 `(N)` each.
+
+    phase: place in the clip, 0 to 1. low: the clip's lowest root height, m. end: 1 on the last frame
+    of a clip that does not go on, else 0.
+    """
+
+    phase: Tensor
+    low: Tensor
+    end: Tensor
 
 
 class Reference:
@@ -56,7 +69,6 @@ class Reference:
             np.concatenate([of(q, rate_hz) for of, q in zip(speed, motions, strict=True)])
         )
         self.qpos, self.qvel = qpos, qvel
-        self.pose = self._pose(qpos, qvel)
         self.hinges = qpos[:, 7:].contiguous()
         self.length = torch.tensor([len(q) for q in motions])
         self.start = torch.cumsum(self.length, 0) - self.length
@@ -65,6 +77,13 @@ class Reference:
             [p.min() for p in torch.split(qpos[:, 2].float(), self.length.tolist())]
         )
         self.any_cyclic = bool(self.cyclic.any())
+        clip = torch.arange(len(motions)).repeat_interleave(self.length)
+        frame = torch.arange(len(qpos)) - self.start[clip]
+        end = (frame == self.length[clip] - 1) & ~self.cyclic[clip]
+        self._place = torch.stack((self.phase(clip, frame), self.min_height[clip], end.float()), 1)
+        #: The row that follows each row.
+        self._after = self.rows(clip, frame + 1)
+        self.pose = self._pose(qpos, qvel)
         # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
         steps = [cycle_step(q) for q in motions]
         self.cycle_turn = torch.stack([turn for turn, _ in steps])
@@ -140,8 +159,8 @@ class Reference:
     def pose(self, pose: Pose) -> None:
         shapes = [getattr(pose, name).shape[1:] for name in FIELDS]
         self._shapes = tuple(shapes)
-        self._widths = [math.prod(shape) for shape in shapes]
-        self._packed = _pack(pose)
+        self._widths = [*(math.prod(shape) for shape in shapes), self._place.shape[1]]
+        self._packed = torch.cat((_pack(pose), self._place), 1)
 
     def gather(self, clip: Tensor, frame: Tensor) -> Pose:
         """The reference pose of `frame (N)` of `clip (N)`; cyclic clips are carried on."""
@@ -156,17 +175,29 @@ class Reference:
         carry = self._carry(clip, frame)
         if carry is None:
             return packed
-        return _pack(_carried(self.unpacked(packed), carry[0].float(), carry[1].float()))
+        pose = _carried(self.unpacked(packed), carry[0].float(), carry[1].float())
+        return torch.cat((_pack(pose), packed[:, -self._place.shape[1] :]), 1)
+
+    def follow(self, rows: Tensor, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """The row after each of `rows (N)`, and its packed pose; it is frame `frame + 1` of `clip`."""
+        rows = self._after.index_select(0, rows)
+        if not self.any_cyclic:
+            return rows, self._packed.index_select(0, rows)
+        return rows, self.gather_packed(clip, frame + 1, rows)
 
     def unpacked(self, packed: Tensor) -> Pose:
         """The poses whose numbers are the rows of `packed (N, W)`, as views of it."""
-        parts = packed.split_with_sizes(self._widths, -1)
+        parts = packed.split_with_sizes(self._widths, -1)[: len(FIELDS)]
         return Pose(
             *(
                 part if len(shape) == 1 else part.unflatten(-1, shape)
                 for part, shape in zip(parts, self._shapes, strict=True)
             )
         )
+
+    def place(self, packed: Tensor) -> Place:
+        """What the rows of `packed (N, W)` say of their clips, as views of it."""
+        return Place(*packed[:, -self._place.shape[1] :].unbind(-1))
 
     def coordinates(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """`qpos (N, 7 + n)` and `qvel (N, 6 + n)`, float64, of the poses that `gather` gives."""

@@ -22,8 +22,8 @@ class RslRlVecEnv:
     """All worlds of an `ImitationEnv` with the members of `rsl_rl.env.VecEnv`.
 
     Observations are a TensorDict with one group, `"policy"`, `(N, O)` float32, not normalised.
-    Time-outs and ends of clips are in `extras["time_outs"]`; rsl_rl bootstraps there with the value
-    of the observation before the step.
+    Time-outs alone are in `extras["time_outs"]`: rsl_rl bootstraps there with the value of the
+    observation before the step. A clip done to its end is a finished task, with nothing to bootstrap.
 
     Args:
         env: the worlds, with automatic reset; they are reset here.

@@ -60,7 +60,7 @@ class PolicyBundle:
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
         """The mean action `(N, A)` for raw observations `(N, O)`."""
-        return self.policy(self.norm(obs))
+        return self.policy.forward(self.norm.forward(obs))
 
     @torch.no_grad()
     def sample(self, obs: Tensor, generator: torch.Generator) -> Tensor:

@@ -59,7 +59,7 @@ class GaussianPolicy(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """The mean action `(..., A)` for normalised observations `(..., O)`."""
-        return self.mean(obs)
+        return self.mean.forward(obs)
 
     def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A drawn action and the mean action, each `(..., A)`."""

@@ -91,7 +91,7 @@ class RunningNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalised values, the shape of `x (..., size)`."""
-        y = (x - self.shift) / self.std
+        y = (x - self.shift).div_(self.std)
         return y if math.isinf(self.clip) else y.clamp_(-self.clip, self.clip)
 
     def inverse(self, y: Tensor) -> Tensor:

@@ -34,6 +34,8 @@ _PRODUCT = (
     (0, 0, 1, 0), (0, 0, 0, -1), (-1, 0, 0, 0), (0, 1, 0, 0),
     (0, 0, 0, 1), (0, 0, 1, 0), (0, -1, 0, 0), (-1, 0, 0, 0),
 )  # fmt: skip
+#: The same for the product with a's conjugate, whose x, y and z are the other way round.
+_BETWEEN = _PRODUCT[:4] + tuple(tuple(-x for x in row) for row in _PRODUCT[4:])
 #: Row 4 i + j holds what q_i q_j adds to the first two columns of the rotation matrix.
 _SIXD = (
     (1, 0, 0, 0, 1, 0), (0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0), (0, 1, 0, -1, 0, 0),
@@ -41,6 +43,10 @@ _SIXD = (
     (0, 0, -1, 0, 0, 0), (0, 1, 0, 1, 0, 0), (-1, 0, 0, 0, 1, 0), (0, 0, 0, 0, 0, 1),
     (0, 1, 0, -1, 0, 0), (0, 0, 1, 0, 0, 0), (0, 0, 0, 0, 0, 1), (-1, 0, 0, 0, -1, 0),
 )  # fmt: skip
+_NONE = (0,) * 9
+_WW, _WZ, _ZZ = (1, 0, 0, 0, 1, 0, 0, 0, 1), (0, -1, 0, 1, 0, 0, 0, 0, 0), (-1, 0, 0, 0, -1, 0, 0, 0, 1)
+#: Row 4 i + j holds what q_i q_j of a turn about +Z adds to its rotation matrix, row by row.
+_ABOUT_UP = (_WW, _NONE, _NONE, _WZ, *(_NONE,) * 8, _WZ, _NONE, _NONE, _ZZ)
 
 
 def normalize(q: Tensor) -> Tensor:
@@ -56,6 +62,11 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
 def quat_conj(q: Tensor) -> Tensor:
     """The inverse of unit quaternions `(..., 4)`."""
     return torch.cat((q[..., :1], -q[..., 1:]), -1)
+
+
+def quat_between(a: Tensor, b: Tensor) -> Tensor:
+    """What turns `a` into `b`, in the frame of `a`: a^-1 b `(..., 4)` of unit quaternions."""
+    return _bilinear(a, b, _BETWEEN)
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
@@ -206,18 +217,16 @@ def slerp(a: Tensor, b: Tensor, t: Tensor) -> Tensor:
 
 def heading_quat(q: Tensor) -> Tensor:
     """The turn about +Z that best matches `q`: its twist about Z (swing removed)."""
-    twist = q * _table(((1, 0, 0, 1),), q.dtype, q.device)[0]
-    n = twist.norm(dim=-1, keepdim=True)
-    identity = _table(((1, 0, 0, 0),), q.dtype, q.device)[0]
-    return torch.where(n < 1e-8, identity, twist / n.clamp_min(1e-8))
+    # The tiny number is lost beside any twist, and alone where there is none, for the identity.
+    tiny, about_up = _table(((1e-18, 0, 0, 0), (1, 0, 0, 1)), q.dtype, q.device).unbind(0)
+    twist = torch.addcmul(tiny, q, about_up)
+    return twist / twist.norm(dim=-1, keepdim=True)
 
 
 def into_heading(heading: Tensor, v: Tensor) -> Tensor:
-    """Vectors `v (..., K, 3)` of the world in the frames of turns about +Z `heading (..., 4)`."""
-    w, z = heading[..., :1], heading[..., 3:]
-    cos, sin = 1.0 - 2.0 * z * z, 2.0 * w * z
-    x, y, up = v.unbind(-1)
-    return torch.stack((cos * x + sin * y, cos * y - sin * x, up), -1)
+    """Vectors `v (N, K, 3)` of the world in the frames of turns about +Z `heading (N, 4)`."""
+    # R^T v, written v R for rows v
+    return torch.bmm(v, _bilinear(heading, heading, _ABOUT_UP).unflatten(-1, (3, 3)))
 
 
 def quat_to_sixd(q: Tensor) -> Tensor:

@@ -20,8 +20,8 @@ MANY = 256
 class Seen(NamedTuple):
     """What the terms of N worlds are worked out from: MuJoCo's own arrays (float64) and the rest.
 
-    ref, ahead: packed reference poses now and one control step later, see `Reference`. phase, low
-    `(N,)`: place in the clip and lowest reference height. residual `(N, k)`: the unscaled action.
+    ref, ahead: packed reference poses now and one control step later, see `Reference`. action
+    `(N, A)`: the last one. age `(N)`: control steps since the episode began.
     """
 
     qpos: Tensor
@@ -32,9 +32,8 @@ class Seen(NamedTuple):
     subtree_com: Tensor
     ref: Tensor
     ahead: Tensor
-    phase: Tensor
-    residual: Tensor
-    low: Tensor
+    action: Tensor
+    age: Tensor
 
 
 def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Pose:
@@ -63,11 +62,12 @@ def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Po
 
 
 class Evaluation(NamedTuple):
-    """obs `(N, O)`; values `(K, N)`, one row per reward term; failed `(N,)` bool."""
+    """obs `(N, O)`. scores `(2 + K, N)`: the reward, the part of it that is imitation, and the value of
+    each of K reward terms. ends `(3, N)` bool: failed, terminated, truncated."""
 
     obs: Tensor
-    values: Tensor
-    failed: Tensor
+    scores: Tensor
+    ends: Tensor
 
 
 class Terms:
@@ -75,6 +75,7 @@ class Terms:
 
     Args:
         frame: what the terms see, made of `Seen`.
+        ends: which episodes are terminated and which are truncated, by what was seen and what failed.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
 
@@ -84,10 +85,16 @@ class Terms:
         rewards: tuple[RewardTerm, ...],
         dones: tuple[DoneTerm, ...],
         frame: Callable[[Seen], Frame],
+        ends: Callable[[Seen, Tensor], tuple[Tensor, Tensor]],
+        device: torch.device,
         fused: bool = True,
     ):
-        self.obs, self.rewards, self.dones, self.frame = obs, rewards, dones, frame
+        self.obs, self.rewards, self.dones = obs, rewards, dones
+        self.frame, self.ends = frame, ends
         self.fused = fused
+        # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
+        shares = [[t.weight, t.weight * t.imitation] for t in rewards]
+        self._weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(device)
         self._recorded: dict[str, TensorFunction] = {}
         self._pool: ThreadPoolExecutor | None = None
 
@@ -97,9 +104,9 @@ class Terms:
 
     def judge(self, seen: Seen) -> Evaluation:
         """Observations, rewards and failures."""
-        worlds = len(seen.phase)
+        worlds = len(seen.ref)
         if not self.fused or worlds < MANY:
-            return Evaluation(*self._run("judge", self._judge, seen))
+            return Evaluation(*(x.clone() for x in self._run("judge", self._judge, seen)))
         # A recording runs without Python's lock, so that the second half really runs beside the first.
         # Many worlds are always cut, whatever the machine, since it may move the last digit.
         first, second = (Seen(*half) for half in zip(*(x.tensor_split(2) for x in seen), strict=True))
@@ -107,8 +114,8 @@ class Terms:
             self._run("judge", self._judge, first)
         other = self._helper().submit(self._run, "judge", self._judge, second)
         ours, theirs = self._run("judge", self._judge, first), other.result()
-        obs, values, failed = zip(ours, theirs, strict=True)
-        return Evaluation(torch.cat(obs), torch.cat(values, 1), torch.cat(failed))
+        obs, scores, ends = zip(ours, theirs, strict=True)
+        return Evaluation(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1))
 
     def _helper(self) -> ThreadPoolExecutor:
         if self._pool is None:
@@ -121,13 +128,16 @@ class Terms:
         return (torch.cat([term.fn(frame, **term.params) for term in self.obs], -1),)
 
     def _judge(self, *seen: Tensor) -> tuple[Tensor, ...]:
-        frame = self.frame(Seen(*seen))
-        values = [term.fn(frame, **term.params) for term in self.rewards]
+        all_seen = Seen(*seen)
+        frame = self.frame(all_seen)
+        rewards = [term.fn(frame, **term.params) for term in self.rewards]
+        values = torch.stack(rewards or [frame.phase])[: len(rewards)]
         failed = torch.zeros_like(frame.phase, dtype=torch.bool)
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         obs = torch.cat([term.fn(frame, **term.params) for term in self.obs], -1)
-        return obs, torch.stack(values or [frame.phase])[: len(values)], failed
+        scores = torch.cat((self._weights @ values, values))
+        return obs, scores, torch.stack((failed, *self.ends(all_seen, failed)))
 
     def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
         if not self.fused:

@@ -6,28 +6,29 @@ import torch
 from torch import Tensor
 
 from poise.env.frame import Frame, Pose
-from poise.spatial import into_heading, quat_conj, quat_mul, quat_rotate_inv, quat_to_sixd
+from poise.spatial import into_heading, quat_between, quat_to_sixd
 
 
 def root_height(frame: Frame) -> Tensor:
     """Root height above the floor, m `(N, 1)`."""
-    return frame.sim.pos[:, 0, 2:3]
+    return frame.sim.qpos[:, 2:3]
 
 
 def root_quat(frame: Frame) -> Tensor:
     """Root orientation wxyz as it is `(N, 4)` (the authors' observation)."""
-    return frame.sim.quat[:, 0]
+    return _root(frame.sim)
 
 
 def root_tilt(frame: Frame) -> Tensor:
     """Root orientation without heading, first two matrix columns `(N, 6)`."""
-    return quat_to_sixd(quat_mul(quat_conj(frame.sim.heading), frame.sim.quat[:, 0]))
+    columns = quat_to_sixd(_root(frame.sim)).unflatten(-1, (2, 3))
+    return into_heading(frame.sim.heading, columns).flatten(1)
 
 
 def root_velocity(frame: Frame) -> Tensor:
     """Root linear velocity in the heading frame (m/s) and angular in the root frame (rad/s) `(N, 6)`."""
-    linear = quat_rotate_inv(frame.sim.heading, frame.sim.qvel[:, :3])
-    return torch.cat((linear, frame.sim.qvel[:, 3:6]), -1)
+    linear = into_heading(frame.sim.heading, frame.sim.qvel[:, None, :3])
+    return torch.cat((linear.squeeze(1), frame.sim.qvel[:, 3:6]), -1)
 
 
 def joint_angles(frame: Frame) -> Tensor:
@@ -65,13 +66,17 @@ def target_root(frame: Frame) -> Tensor:
     ahead, sim = _ahead(frame), frame.sim
     vectors = torch.stack((ahead.pos[:, 0] - sim.pos[:, 0], ahead.qvel[:, :3]), 1)
     offset, velocity = into_heading(sim.heading, vectors).unbind(1)
-    turn = quat_mul(quat_conj(sim.quat[:, 0]), ahead.quat[:, 0])
+    turn = quat_between(_root(sim), _root(ahead))
     return torch.cat((offset, quat_to_sixd(turn), velocity), -1)
 
 
 def target_bodies(frame: Frame) -> Tensor:
     """Next reference body origins minus the present ones, in the present heading frame, m."""
     return into_heading(frame.sim.heading, _ahead(frame).pos - frame.sim.pos).flatten(1)
+
+
+def _root(pose: Pose) -> Tensor:
+    return pose.qpos[:, 3:7]
 
 
 def _ahead(frame: Frame) -> Pose:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.env.frame import Frame, Pose
-from poise.spatial import into_heading, quat_conj, quat_distance, quat_mul
+from poise.spatial import into_heading, quat_between, quat_distance
 
 
 def pose(frame: Frame, alpha: float = 2.0, weights: Tensor | None = None, half: bool = False) -> Tensor:
@@ -48,8 +48,8 @@ def root_pose(frame: Frame, alpha: float = 300.0, half: bool = False) -> Tensor:
     The orientations are compared with their headings removed, since all features are local.
     """
     height = frame.sim.pos[:, 0, 2] - frame.ref.pos[:, 0, 2]
-    ours = quat_mul(quat_conj(frame.sim.heading), frame.sim.quat[:, 0])
-    theirs = quat_mul(quat_conj(frame.ref.heading), frame.ref.quat[:, 0])
+    ours = quat_between(frame.sim.heading, frame.sim.quat[:, 0])
+    theirs = quat_between(frame.ref.heading, frame.ref.quat[:, 0])
     angle = quat_distance(ours, theirs)
     angle = 0.5 * angle if half else angle
     return torch.exp(-alpha * (height.square() + angle.square()))
