@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CLIP := src/poise/data/walk.bvh
-MINUTES ?= 0.7
+MINUTES ?= 1.2
 # Where the CMU clips of the benchmark lie, as benchmarks/first_light.py describes them.
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
 

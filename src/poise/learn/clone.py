@@ -22,7 +22,6 @@ from poise.learn.ppo import PPO
 from poise.learn.protocols import Teacher, VecEnv
 from poise.learn.rollout import Episodes, Rollout, collect
 from poise.learn.state import State, make_generator, prefixed
-from poise.learn.threads import torch_threads
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,6 @@ def clone(
     ppo: PPOConfig | None = None,
     seed: int = 0,
     on_round: Callable[[CloneStats], bool | None] | None = None,
-    update_threads: int = 0,
 ) -> tuple[WarmStart, tuple[CloneStats, ...]]:
     """A policy (and critic) that acts like `teacher`, ready for `Trainer(warm_start=...)`.
 
@@ -97,7 +95,6 @@ def clone(
         teacher: acts for the environment's present state.
         ppo: the network sizes, action noise sigma, discount and critic settings.
         on_round: called after each round; returning False ends the cloning there.
-        update_threads: torch's threads while the networks learn, as for `Trainer`.
 
     The same seed on the same environment gives the same bits. Numbers that are not finite raise a
     `TrainingError`.
@@ -106,21 +103,19 @@ def clone(
     begun = time.perf_counter()
     device = torch.device(env.device)
     learner = PPO(env.num_obs, env.num_actions, ppo, seed, device)
-    fitter = _Fitter(learner.actor, config, (config.rounds + 1) * config.steps * env.num_envs, seed)
+    fitter = _Fitter(learner, config, (config.rounds + 1) * config.steps * env.num_envs, seed)
     stats: list[CloneStats] = []
     obs = env.reset()
     for k in range(config.rounds + 1):
         obs, reward, failures = _gather(env, teacher, learner.actor, fitter, config, k, obs, seed)
-        with torch_threads(update_threads):
-            loss = fitter.fit(config.epochs[min(k, 1)])
+        loss = fitter.fit(config.epochs[min(k, 1)])
         elapsed = time.perf_counter() - begun
         stats.append(CloneStats(k, fitter.size, loss, reward, failures, elapsed))
         if on_round is not None and on_round(stats[-1]) is False:
             break
     policy, samples, critic = learner.actor.copy(), fitter.size, None
     if config.critic_steps:
-        with torch_threads(update_threads):
-            critic = _fit_critic(env, learner, config, obs, seed)
+        critic = _fit_critic(env, learner, config, obs, seed)
         samples += config.critic_steps * env.num_envs
     return WarmStart(policy, critic, samples, time.perf_counter() - begun), tuple(stats)
 
@@ -128,8 +123,11 @@ def clone(
 class _Fitter:
     """All states seen so far with the teacher's actions, and the regression on them."""
 
-    def __init__(self, actor: PolicyBundle, config: CloneConfig, capacity: int, seed: int):
+    def __init__(self, learner: PPO, config: CloneConfig, capacity: int, seed: int):
+        actor = learner.actor
         self.actor, self.config, self.size = actor, config, 0
+        # The products of the hidden layers are those of the learner.
+        self.mean = learner.mean
         device = actor.norm.shift.device
         self.obs = torch.empty(capacity, actor.num_obs, device=device)
         self.action = torch.empty(capacity, actor.num_actions, device=device)
@@ -158,7 +156,7 @@ class _Fitter:
                 group["lr"] = self.config.lr * 0.1 ** (epoch / max(1, epochs - 1))
             total = torch.zeros((), device=self.obs.device)
             for index in order.tensor_split(parts):
-                error = policy(norm(self.obs.index_select(0, index)))
+                error = self.mean(norm(self.obs.index_select(0, index)))
                 error = (error - self.action.index_select(0, index)) * scale
                 loss = error.square().mean()
                 self.optimizer.zero_grad(set_to_none=True)

@@ -256,6 +256,11 @@ class PPO:
             self._pool = ThreadPoolExecutor(1, "critic", torch.set_num_threads, (1,))
         return self._pool.submit(work, *args).result
 
+    def mean(self, obs: Tensor) -> Tensor:
+        """Mean actions of normalised `obs (N, O)` by the products of the update, with gradients."""
+        mean = self.actor.policy.mean
+        return half_forward(mean, obs) if self._half else mean(obs)
+
     def _net(self, net: MLP, batch: _Batch, index: Tensor) -> Tensor:
         """The network's output for some samples, multiplied as the config wants it."""
         obs = batch.obs.index_select(0, index)

@@ -5,7 +5,6 @@ The clone is saved as the run's first checkpoint, so that a killed run goes on f
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -115,7 +114,6 @@ def clone_expert(
             imitation.ppo(),
             imitation.config.seed,
             tell.round,
-            min(threads or len(os.sched_getaffinity(0)), 4),
         )[0]
     finally:
         env.close()
