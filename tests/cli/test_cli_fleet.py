@@ -83,7 +83,14 @@ def test_ctrl_c_and_going_on(library: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     argv = ["fleet", str(library / "stand.txt"), "-o", str(out), "--set", "envs=16"]
     command = [sys.executable, "-m", "poise", *argv]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Shells start background jobs with SIGINT turned off, and processes inherit that.
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL) and None,
+    )
     checkpoint, limit = out / "stand" / "run" / "checkpoint.safetensors", time.monotonic() + 90
     while not checkpoint.exists() and time.monotonic() < limit and process.poll() is None:
         time.sleep(0.05)
