@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from poise.bench.engine import Progress
 from poise.bench.stable_pd import StablePDBackend
 from poise.env import ImitationEnv
-from poise.eval import run_episodes, score_rollouts, start_frames
+from poise.eval import run_episodes, score_rollouts
 from poise.learn import PolicyBundle
+from poise.recipes.expert import some_starts
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import build
 from poise.recipes.session import help_left, reopen, trained_policy
@@ -36,8 +36,7 @@ def bench_physics(
     own = reopen(folder)
     policy, meta = trained_policy(folder, own)
     limit, scale = help_left(own, meta)
-    clip, frame = start_frames(own.reference)
-    pick = torch.linspace(0, len(clip) - 1, min(starts, len(clip))).round().long()
+    clip, frame = some_starts(own, starts)
     kinds: list[tuple[str, SimConfig]] = [("trained", own.config.sim), ("fine", FINE)]
     if stable_pd:
         kinds.append(("stable PD", PAPER))
@@ -49,7 +48,7 @@ def bench_physics(
         imitation = build(own.library, replace(own.config, sim=sim))
         make = (_stable if name == "stable PD" else _servos)(imitation, scale)
         rows.append({"physics": name, "rate_hz": sim.rate_hz, "integrator": sim.integrator}
-                    | _score(imitation, policy, make, clip[pick], frame[pick], limit))  # fmt: skip
+                    | _score(imitation, policy, make, clip, frame, limit))  # fmt: skip
     return rows
 
 

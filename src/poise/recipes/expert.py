@@ -151,7 +151,8 @@ def _trainer(
 ) -> Trainer:
     ppo = finetuning(imitation.ppo()) if warm else None
     how = {"start": "expert"} if warm else {}
-    return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)
+    with together(comm):
+        return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)
 
 
 class _Acts:
