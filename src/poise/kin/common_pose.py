@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,6 +37,8 @@ _TREAD, _TREAD_HEIGHT, _ANKLE_HEIGHT = 0.16, 0.025, 0.09
 #: Tilt (rad) between the rest pose's foot and the standing foot of the motion, beyond which the motion is
 #: believed.
 _FOOT_TILT = math.radians(15)
+#: Tips of bones that are longer than this share of a leg are mistakes of the file.
+LONGEST_TIP = 0.4
 _NEXT = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}
 
 
@@ -47,6 +50,8 @@ class CommonPose:
     above: `(J, 4)` wxyz, local rotations that joints above the pelvis keep.
     treads: `(2, 3)` m, in the frame of the left and right foot, the point on which it stands and rolls
     (toe joint, or where it would be). hip_height: m, of the hip joints over these points.
+    tips: `(joint, (x, y, z) m)` in its frame, tips of bones that can be believed. sole: m, how far the
+    lowest joint or tip of the standing feet lies under the treads.
     evidence: from what the pose was found, in a sentence.
     """
 
@@ -55,7 +60,24 @@ class CommonPose:
     above: np.ndarray
     treads: np.ndarray
     hip_height: float
+    tips: tuple[tuple[int, tuple[float, float, float]], ...]
+    sole: float
     evidence: str
+
+    def lowest(self, roles: Roles, pos: Tensor, quat: Tensor, joints: Collection[int]) -> Tensor:
+        """`(T)` m, the lowest of those of `joints` that are parts of the body, of their tips and treads.
+
+        pos, quat: `(T, J, 3)` and `(T, J, 4)`, world. Without any part it is infinite.
+        """
+        heights = [pos[:, r.joint, 2] for r in roles.rows if r.joint in joints]
+        feet = [(roles.joint(f"{side}_foot"), t) for side, t in zip(SIDES, self.treads, strict=True)]
+        for j, tip in (*self.tips, *feet):
+            if j in joints:
+                reach = torch.tensor(tip, dtype=pos.dtype).expand(len(pos), 3)
+                heights.append((pos[:, j] + quat_rotate(quat[:, j], reach))[:, 2])
+        if not heights:
+            return torch.full((len(pos),), torch.inf, dtype=pos.dtype)
+        return torch.stack(heights, -1).min(-1).values
 
 
 def common_pose(roles: Roles, clip: Clip | None = None) -> CommonPose:
@@ -187,6 +209,7 @@ class _Builder:
         self.skeleton = roles.skeleton
         self.pos, self.quat = pose_positions(roles, local)
         self.leg = self._leg()
+        self.standing = self._standing_tilt()
 
     def build(self) -> CommonPose:
         rot = self.quat.clone()
@@ -212,13 +235,19 @@ class _Builder:
         pos = pos - hips
         feet = [self._joint(f"{side}_foot") for side in SIDES]
         treads = torch.stack([self._tread(pos, rot, side) for side in SIDES])
-        heights = [float((pos[f] + quat_rotate(rot[f], t))[2]) for f, t in zip(feet, treads, strict=True)]
+        heights = [
+            float((pos[f] + quat_rotate(rot[f], t))[2]) for f, t in zip(feet, treads, strict=True)
+        ]
         above = torch.stack([_one()] * len(self.skeleton))
         if self.clip is not None and not self.rested:
             above = torch.tensor(self.clip.rot[0])
-        return CommonPose(
-            pos.numpy(), rot.numpy(), above.numpy(), treads.numpy(), -float(np.mean(heights)), self.evidence
+        tread = float(np.mean(heights))
+        tips = tuple((r.joint, v) for r in self.roles.rows if (v := self._believed(r.joint)) is not None)
+        pose = CommonPose(
+            *(x.numpy() for x in (pos, rot, above, treads)), -tread, tips, 0.0, self.evidence
         )
+        low = pose.lowest(self.roles, pos[None], rot[None], range(len(self.skeleton)))
+        return replace(pose, sole=max(0.0, tread - float(low[0])))
 
     def _joint(self, role: str) -> int:
         joint = self.roles.joint(role)
@@ -246,22 +275,32 @@ class _Builder:
             return None
         return quat_rotate_inv(self.quat[j], tip - self.pos[j])
 
+    def _believed(self, j: int) -> tuple[float, float, float] | None:
+        """The tip of the bone at `j` in its frame; None without one, or where no hand or foot is so long."""
+        for k, tip in self.skeleton.ends:
+            if k == j and 1e-3 < float(np.linalg.norm(tip)) < LONGEST_TIP * self.leg:
+                return tip
+        return None
+
+    def _tip(self, j: int) -> Tensor | None:
+        tip = self._believed(j)
+        return None if tip is None else torch.tensor(tip, dtype=torch.float64)
+
     def _hand_tip(self, j: int, side: str) -> Tensor | None:
         for finger in ("middle", "fingers", "index", "ring"):
             joints = [x for n in (0, 1) if (x := self.roles.joint(f"{side}_{finger}{n}")) is not None]
             far = [x for x in joints if float((self.pos[x] - self.pos[j]).norm()) > 1e-3]
             if far:
                 return self.pos[far[0]]
-        ends = [torch.tensor(v) for k, v in self.skeleton.ends if k == j]
-        return self.pos[j] + quat_rotate(self.quat[j], ends[0].double()) if ends else None
+        tip = self._tip(j)
+        return None if tip is None else self.pos[j] + quat_rotate(self.quat[j], tip)
 
     def _toe(self, j: int, side: str) -> Tensor | None:
         """Where the foot points, in its own frame; None where the file does not say."""
         toes = self.roles.joint(f"{side}_toes")
         if toes is not None:
             return quat_rotate_inv(self.quat[j], self.pos[toes] - self.pos[j])
-        ends = [torch.tensor(v, dtype=torch.float64) for k, v in self.skeleton.ends if k == j]
-        return ends[0] if ends else None
+        return self._tip(j)
 
     def _foot(self, j: int, side: str) -> Tensor:
         """The foot's world rotation: flat, and its toe straight ahead."""
@@ -274,29 +313,35 @@ class _Builder:
         z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         rot = quat_mul(axis_angle_to_quat(z, -torch.atan2(ahead[1], ahead[0])), rot)
         tilt = float(torch.atan2(ahead[2], ahead[:2].norm()))
-        stood = self._standing_tilt(j, toe)
+        stood = self.standing
         if stood is not None and (not self.rested or abs(stood - tilt) > _FOOT_TILT):
             y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
             # A turn about +y by a positive angle lowers what points along +x.
             rot = quat_mul(axis_angle_to_quat(y, torch.tensor(tilt - stood, dtype=torch.float64)), rot)
         return rot
 
-    def _standing_tilt(self, j: int, toe: Tensor) -> float | None:
-        """How far (rad) the line from ankle to toe rises, median of the moments in which the foot stands."""
+    def _standing_tilt(self) -> float | None:
+        """How far (rad) the line from ankle to toe rises: median over the moments in which a foot stands."""
         if self.clip is None:
             return None
-        pos, quat = (torch.tensor(x[:, j]) for x in self.clip.world())
-        line = quat_rotate(quat, toe.expand_as(pos))
-        points = torch.stack((pos, pos + line), 1)
-        grounds = points[..., 2].quantile(0.1, dim=0)
-        stands = [
-            contact_labels(points[:, k : k + 1], self.clip.fps, 0.03, 0.35, float(grounds[k]))[:, 0]
-            for k in (0, 1)
-        ]
-        flat = stands[0] & stands[1]
-        if int(flat.sum()) < 5:
-            return None
-        return float(torch.atan2(line[flat, 2], line[flat, :2].norm(dim=-1)).median())
+        found = []
+        pos, quat = (torch.tensor(x) for x in self.clip.world())
+        for side in SIDES:
+            j = self._joint(f"{side}_foot")
+            toe = self._toe(j, side)
+            if toe is None:
+                continue
+            line = quat_rotate(quat[:, j], toe.expand(len(pos), 3))
+            points = torch.stack((pos[:, j], pos[:, j] + line), 1)
+            grounds = points[..., 2].quantile(0.1, dim=0)
+            stands = [
+                contact_labels(points[:, k : k + 1], self.clip.fps, 0.03, 0.35, float(grounds[k]))[:, 0]
+                for k in (0, 1)
+            ]
+            flat = line[stands[0] & stands[1]]
+            found.append(torch.atan2(flat[:, 2], flat[:, :2].norm(dim=-1)))
+        tilts = torch.cat(found) if found else torch.zeros(0)
+        return float(tilts.median()) if len(tilts) >= 5 else None
 
     def _tread(self, pos: Tensor, rot: Tensor, side: str) -> Tensor:
         """The point on which a foot stands and rolls, in the foot's frame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,25 +13,18 @@ from poise.kin.common_pose import CommonPose
 from poise.kin.contacts import contact_labels
 from poise.kin.ground import smooth_hull
 from poise.kin.limbs import Limb, match_positions
-from poise.motion import Clip, Skeleton
+from poise.motion import Clip, Roles, Skeleton
 from poise.motion.joint_map import JointMap
 from poise.motion.roles import SIDES
 from poise.spatial import forward_kinematics, quat_rotate
 
 #: Time (s) over which a foot goes from its own path to its contact and back.
 BLEND_S = 0.15
-#: Heights (m, of a person of 0.85 m hip height) under which an ankle, a toe or a hand touches.
-_LOW = {"tread": 0.05, "ankle": 0.05, "hand": 0.1}
-_USUAL_HIPS = 0.85
+#: Half the time (s) over which a lift is spread.
+LIFT_S = 0.05
+#: Height (m) over the ground under which a slow toe or wrist touches, and what is slow (m/s).
+_LOW = {"foot": 0.05, "hand": 0.1}
 _SLOW = 0.35
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Height (m) on which the source's feet tread, and how it was found."""
-
-    height: float
-    sentence: str
 
 
 @dataclass(frozen=True)
@@ -40,7 +34,6 @@ class Scale:
     factor: float
     centre: tuple[float, float, float]
     ground: float
-    hip_height: float
 
     @staticmethod
     def between(
@@ -52,11 +45,13 @@ class Scale:
         treads = []
         for side, tread in zip(SIDES, here.treads, strict=True):
             foot = joints.source.joint(f"{side}_foot") or 0
-            treads.append(pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3)))
+            treads.append(
+                pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3))
+            )
         ground = tread_height(torch.stack(treads, 1), clip.fps)
         hips = [pos[0, joints.source.joint(f"{s}_thigh") or 0] for s in SIDES]
         middle = (hips[0] + hips[1]) / 2
-        return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground, here.hip_height)
+        return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground)
 
     def place(self, x: Tensor) -> Tensor:
         """Points `(..., 3)` m of the source's world where the target has them."""
@@ -105,7 +100,10 @@ class Foot:
 def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot, ...]:
     """Both feet, and the hands that both skeletons have."""
     out = []
-    for kinds, label in ((("thigh", "shin", "foot"), "foot"), (("upper_arm", "forearm", "hand"), "hand")):
+    for kinds, label in (
+        (("thigh", "shin", "foot"), "foot"),
+        (("upper_arm", "forearm", "hand"), "hand"),
+    ):
         for k, side in enumerate(SIDES):
             pairs = [joints.limb_pair(f"{side}_{kind}") for kind in kinds]
             if any(p is None for p in pairs):
@@ -120,22 +118,20 @@ def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot
 
 
 def source_contacts(clip: Clip, feet: tuple[Foot, ...], ground: float) -> Tensor:
-    """`(T, F)` bool, which end touches the ground in the source: low and slow, at toe or ankle."""
+    """`(T, F)` bool, which end touches the ground in the source: low and slow."""
     pos, quat = (torch.tensor(x) for x in clip.world())
     out = []
     for foot in feet:
         tread = foot.points(pos, quat, target=False)[:, None]
-        if foot.name.endswith("hand"):
-            out.append(contact_labels(tread, clip.fps, _LOW["hand"], _SLOW, ground)[:, 0])
-            continue
-        label = contact_labels(tread, clip.fps, _LOW["tread"], _SLOW, ground)[:, 0]
-        out.append(label)
+        low = _LOW[foot.name.split()[1]]
+        out.append(contact_labels(tread, clip.fps, low, _SLOW, ground)[:, 0])
     return torch.stack(out, 1)
 
 
 def plant(
     clip: Clip,
-    skeleton: Skeleton,
+    joints: JointMap,
+    poses: tuple[CommonPose, CommonPose],
     rot: Tensor,
     root: Tensor,
     feet: tuple[Foot, ...],
@@ -151,31 +147,42 @@ def plant(
     source are lifted, and where the trunk is, all of it. The limbs are solved by two bones in closed form;
     feet and hands keep their turn.
     """
+    skeleton = joints.target.skeleton
     source_pos, source_quat = (torch.tensor(x) for x in clip.world())
     offsets = torch.tensor(skeleton.offsets)
-    depth = allowed_depth(clip, scale)
+    depth = floor_depth(joints.source, poses[0], source_pos, source_quat, scale.ground) * scale.factor
+
+    def lift(pos: Tensor, quat: Tensor, parts: set[int]) -> Tensor:
+        """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
+        excess = floor_depth(joints.target, poses[1], pos, quat, scale.ground, parts) - depth
+        if float(excess.max()) < 1e-6:
+            return torch.zeros(len(pos), dtype=pos.dtype)
+        reach = max(1, round(LIFT_S * clip.fps))
+        hull = smooth_hull(excess.clamp_min(0.0).numpy(), reach, clip.cyclic)
+        return torch.tensor(np.maximum(hull, 0.0))
+
     if clear:
+        limbs = {j for foot in feet for j in hanging(skeleton, foot.limb.mid)}
         pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
-        rest = [j for j in range(len(skeleton)) if not any(_hangs(skeleton, j, f.limb.mid) for f in feet)]
-        root = root.clone()
-        root[:, 2] += _lift(_lowest(skeleton, pos, quat, rest), depth, scale, clip)
+        up = torch.zeros_like(root)
+        up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - limbs)
+        root = root + up
     pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
     goals: dict[int | str, Tensor] = {}
     for k, foot in enumerate(feet):
-        arm = quat_rotate(quat[:, foot.target], foot.tread_target.expand(len(pos), 3))
         goal = pos[:, foot.target]
         if hold:
+            arm = quat_rotate(quat[:, foot.target], foot.tread_target.expand(len(pos), 3))
             wanted = scale.place(foot.points(source_pos, source_quat, target=False)) - arm
-            weight = contact_weight(contacts[:, k], clip.fps)[:, None]
-            goal = goal + weight * (wanted - goal)
+            goal = goal + contact_weight(contacts[:, k], clip.fps)[:, None] * (wanted - goal)
         if clear:
-            below = [j for j in range(len(skeleton)) if _hangs(skeleton, j, foot.target)]
             moved = pos + (goal - pos[:, foot.target])[:, None]
-            goal = goal.clone()
-            goal[:, 2] += _lift(_lowest(skeleton, moved, quat, below), depth, scale, clip)
+            up = torch.zeros_like(goal)
+            up[:, 2] = lift(moved, quat, hanging(skeleton, foot.target))
+            goal = goal + up
         goals[foot.target] = goal
-    limbs: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
-    return match_positions(skeleton, rot, root, goals, limbs), root
+    by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
+    return match_positions(skeleton, rot, root, goals, by_end), root
 
 
 def contact_weight(contact: Tensor, fps: float) -> Tensor:
@@ -191,36 +198,26 @@ def contact_weight(contact: Tensor, fps: float) -> Tensor:
     return 0.5 + 0.5 * torch.cos(torch.pi * (away / BLEND_S).clamp(max=1.0))
 
 
-def allowed_depth(clip: Clip, scale: Scale) -> Tensor:
-    """`(T)` m, how deep under its ground the target may be: as deep as the source, scaled."""
-    pos, quat = (torch.tensor(x) for x in clip.world())
-    low = _lowest(clip.skeleton, pos, quat, list(range(len(clip.skeleton))))
-    return (scale.ground - low).clamp_min(0.0) * scale.factor
+def floor_depth(
+    roles: Roles,
+    pose: CommonPose,
+    pos: Tensor,
+    quat: Tensor,
+    ground: float,
+    joints: Collection[int] | None = None,
+) -> Tensor:
+    """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
+
+    The floor lies as far under the `ground` of the treads as the soles do while standing.
+    """
+    joints = range(len(roles.skeleton)) if joints is None else joints
+    return (ground - pose.sole - pose.lowest(roles, pos, quat, joints)).clamp_min(0.0)
 
 
-def _lift(low: Tensor, depth: Tensor, scale: Scale, clip: Clip) -> Tensor:
-    """The smooth lift `(T)` m that keeps `low (T)` from being deeper than `depth (T)`."""
-    excess = (scale.ground - low - depth).clamp_min(0.0).numpy()
-    if excess.max() < 1e-6:
-        return torch.zeros_like(low)
-    reach = max(1, round(0.05 * clip.fps))
-    return torch.tensor(np.maximum(smooth_hull(excess, reach, clip.cyclic), 0.0))
-
-
-def _lowest(skeleton: Skeleton, pos: Tensor, quat: Tensor, joints: list[int]) -> Tensor:
-    """`(T)` m, the lowest of some joints and of the bone tips on them."""
-    heights = [pos[:, j, 2] for j in joints]
-    for j, tip in skeleton.ends:
-        if j in joints:
-            reach = torch.tensor(tip, dtype=pos.dtype).expand(len(pos), 3)
-            heights.append((pos[:, j] + quat_rotate(quat[:, j], reach))[:, 2])
-    if not heights:
-        return torch.full((len(pos),), torch.inf, dtype=pos.dtype)
-    return torch.stack(heights, -1).min(-1).values
-
-
-def _hangs(skeleton: Skeleton, joint: int, below: int) -> bool:
-    """Whether `joint` is `below` or hangs on it."""
-    while joint > below:
-        joint = skeleton.parents[joint]
-    return joint == below
+def hanging(skeleton: Skeleton, joint: int) -> set[int]:
+    """`joint` and all that hangs on it."""
+    out = {joint}
+    for j in range(joint + 1, len(skeleton)):
+        if skeleton.parents[j] in out:
+            out.add(j)
+    return out

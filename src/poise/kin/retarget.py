@@ -20,7 +20,6 @@ from poise.spatial import (
     normalize,
     quat_conj,
     quat_mul,
-    quat_rotate,
     slerp,
     unwrap_quats,
 )
@@ -77,7 +76,9 @@ def retarget(
     feet = feet_of(joints, here, there)
     contacts = source_contacts(clip, feet, scale.ground)
     if config.contacts or config.clear:
-        rot, root = plant(clip, target, rot, root, feet, contacts, scale, config.contacts, config.clear)
+        rot, root = plant(
+            clip, joints, (here, there), rot, root, feet, contacts, scale, config.contacts, config.clear
+        )
     flat = [unwrap_quats(normalize(rot[:, j])) for j in range(len(target))]
     made = Clip(target, root.numpy(), torch.stack(flat, 1).numpy(), clip.fps, clip.name, clip.cyclic)
     seconds = time.perf_counter() - began
@@ -124,7 +125,10 @@ def transfer(
             q = quat_mul(world[parent], local.expand(frames, 4))
         world.append(normalize(q))
     rot = torch.stack(
-        [q if p < 0 else quat_mul(quat_conj(world[p]), q) for q, p in zip(world, target.parents, strict=True)],
+        [
+            q if p < 0 else quat_mul(quat_conj(world[p]), q)
+            for q, p in zip(world, target.parents, strict=True)
+        ],
         1,
     )
     zero = torch.zeros(frames, 3, dtype=torch.float64)
@@ -148,9 +152,7 @@ def _above(skeleton: Skeleton, joint: int) -> set[int]:
     return out
 
 
-def _shared(
-    joints: JointMap, here: CommonPose, there: CommonPose, turned: Tensor
-) -> dict[int, Tensor]:
+def _shared(joints: JointMap, here: CommonPose, there: CommonPose, turned: Tensor) -> dict[int, Tensor]:
     """World turns `(T, 4)` from the common pose of the target's spine, neck and head.
 
     A chain's joints have places in [0, 1] from what carries it (0) to its last joint (1); between the
@@ -166,7 +168,10 @@ def _shared(
         if not source and kinds != SHARED[:1]:
             # Neck and head without a source ride on the chest.
             continue
-        knots = [(0.0, carrier), *zip(_places(joints.source, source, here), (turned[:, j] for j in source))]
+        knots = [
+            (0.0, carrier),
+            *zip(_places(joints.source, source, here), (turned[:, j] for j in source)),
+        ]
         for j, at in zip(target, _places(joints.target, target, there), strict=True):
             out[j] = _between(knots, at)
         chest = knots[-1][1]
@@ -180,7 +185,9 @@ def _places(roles, chain: tuple[int, ...], pose: CommonPose) -> list[float]:
         return []
     first = roles.skeleton.parents[chain[0]]
     line = [first, *chain]
-    gaps = [float(np.linalg.norm(pose.pos[b] - pose.pos[a])) for a, b in zip(line, line[1:], strict=False)]
+    gaps = [
+        float(np.linalg.norm(pose.pos[b] - pose.pos[a])) for a, b in zip(line, line[1:], strict=False)
+    ]
     # The last joint's own bone is taken as long as the one below it.
     gaps.append(gaps[-1])
     ends = np.cumsum([0.0, *gaps])

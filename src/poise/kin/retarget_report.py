@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.kin.common_pose import CommonPose, body_axes
-from poise.kin.plant import Foot, Scale, allowed_depth
+from poise.kin.plant import Foot, Scale, floor_depth
 from poise.metrics.tracking import MM
 from poise.motion import Clip
 from poise.motion.joint_map import JointMap
@@ -125,7 +125,12 @@ def measure(
     lean = [_up(pose, r) for pose, r in zip(poses, (joints.source, joints.target), strict=True)]
     ends = _ends(joints, worlds[0][0], worlds[1][0], poses)
     slide, held = _slide(feet, contacts, worlds, scale, clip.fps)
-    depths = allowed_depth(clip, scale), allowed_depth(made, Scale(1.0, scale.centre, scale.ground, 1.0))
+    depths = [
+        floor_depth(roles, pose, *world, scale.ground) * factor * MM
+        for roles, pose, world, factor in zip(
+            (joints.source, joints.target), poses, worlds, (scale.factor, 1.0), strict=True
+        )
+    ]
     tilt = _angle(trunk[0], trunk[1]) - float(_angle(lean[0], lean[1]))
     return RetargetReport(
         joints,
@@ -140,8 +145,8 @@ def measure(
         float(np.mean([e for _, e in ends])) if ends else 0.0,
         held,
         slide,
-        (float(depths[0].mean()) * MM, float(depths[1].mean()) * MM),
-        (float(depths[0].max()) * MM, float(depths[1].max()) * MM),
+        (float(depths[0].mean()), float(depths[1].mean())),
+        (float(depths[0].max()), float(depths[1].max())),
         seconds,
     )
 

@@ -93,7 +93,9 @@ def _stated(
     source: Skeleton, target: Skeleton, stated: Mapping[str, str]
 ) -> tuple[dict[str, str], dict[str, str], list[tuple[int, int]]]:
     """Roles that the user's pairs fix in both skeletons, and pairs that bear no role."""
-    guessed_source, guessed_target = (find_roles(s) for s in (source, target)) if stated else (None, None)
+    guessed_source, guessed_target = (
+        (find_roles(s) for s in (source, target)) if stated else (None, None)
+    )
     in_source: dict[str, str] = {}
     in_target: dict[str, str] = {}
     extra: list[tuple[int, int]] = []

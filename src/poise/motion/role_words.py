@@ -18,7 +18,14 @@ _WORDS: dict[str, dict[str, float]] = {
     },
     "neck": {"neck": 1, "lowerneck": 1, "upperneck": 1, "neckbase": 1, "necklower": 1, "neckupper": 1},
     "head": {"head": 1, "skull": 1},
-    "clavicle": {"clavicle": 1, "collar": 1, "collarbone": 1, "clav": 1, "scapula": 0.9, "shoulder": 0.8},
+    "clavicle": {
+        "clavicle": 1,
+        "collar": 1,
+        "collarbone": 1,
+        "clav": 1,
+        "scapula": 0.9,
+        "shoulder": 0.8,
+    },
     "upper_arm": {
         **{"upperarm": 1, "arm": 1, "humerus": 1, "shldr": 1, "uparm": 1, "shoulder": 0.8, "bicep": 1},
         **{"shldrbend": 1, "armupper": 1},
@@ -56,11 +63,35 @@ _BIPED_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 #: Words of joints that carry no part of the body: tips, twist bones, control rigs, faces, clothes.
 _HELPERS = frozenset(
     (
-        *("end", "nub", "tip", "top", "site", "effector", "rigmesh", "mesh", "twist", "roll", "ik", "fk"),
+        *(
+            "end",
+            "nub",
+            "tip",
+            "top",
+            "site",
+            "effector",
+            "rigmesh",
+            "mesh",
+            "twist",
+            "roll",
+            "ik",
+            "fk",
+        ),
         *("pole", "target", "ctrl", "control", "helper", "sec", "adj", "eye", "jaw", "hair", "skirt"),
         *("breast", "bust", "tongue", "brow", "eyebrow", "lip", "cheek", "ear", "nose", "weapon", "gun"),
         *("prop", "attach", "socket", "cloth", "tail", "hat", "holster", "corrective", "correctiveroot"),
-        *("mch", "org", "interaction", "center", "hipjoint", "buttock", "lid", "eyelid", "face", "teeth"),
+        *(
+            "mch",
+            "org",
+            "interaction",
+            "center",
+            "hipjoint",
+            "buttock",
+            "lid",
+            "eyelid",
+            "face",
+            "teeth",
+        ),
     )
 )
 #: Words that say nothing about the part.
@@ -145,7 +176,8 @@ _SMPL_SIDED = "Hip Knee Ankle Foot Collar Shoulder Elbow Wrist"
 CONVENTIONS: dict[str, frozenset[str]] = {
     "Mixamo or MotionBuilder": _both(_SIDED, f"{_ARM} {_UPLEG} ToeBase")
     | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
-    "LAFAN1": _both(_SIDED, f"{_ARM} {_UPLEG} Toe") | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
+    "LAFAN1": _both(_SIDED, f"{_ARM} {_UPLEG} Toe")
+    | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
     "CMU (ASF)": _both(
         ("l{}", "r{}"),
         "hipjoint femur tibia foot toes clavicle humerus radius wrist hand fingers thumb",
@@ -167,9 +199,7 @@ CONVENTIONS: dict[str, frozenset[str]] = {
     | {"Pelvis", "Spine1", "Spine2", "Spine3", "Neck", "Head"},
     "SMPL-X": _both(("left_{}", "right_{}"), _SMPL_SIDED.lower())
     | {"pelvis", "spine1", "spine2", "spine3", "neck", "head"},
-    "Unreal mannequin": _both(
-        ("{}_l", "{}_r"), "clavicle upperarm lowerarm hand thigh calf foot ball"
-    )
+    "Unreal mannequin": _both(("{}_l", "{}_r"), "clavicle upperarm lowerarm hand thigh calf foot ball")
     | {"root", "pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"},
     "VRM (VRoid)": _both(
         ("J_Bip_L_{}", "J_Bip_R_{}"), "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase"
