@@ -9,6 +9,8 @@ from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
 from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
+from poise.kin.retarget import RetargetConfig, retarget
+from poise.kin.retarget_report import RetargetReport
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
@@ -19,6 +21,8 @@ __all__ = [
     "GroundFit",
     "Kinematics",
     "Limb",
+    "RetargetConfig",
+    "RetargetReport",
     "TwoBone",
     "chain_angles",
     "chain_quat",
@@ -36,6 +40,7 @@ __all__ = [
     "match_positions",
     "qpos_to_clip",
     "qpos_velocity",
+    "retarget",
     "shortest_arc",
     "two_bone",
 ]

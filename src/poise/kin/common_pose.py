@@ -13,13 +13,11 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.kin.contacts import contact_labels
 from poise.kin.limbs import shortest_arc
-from poise.motion import Clip, Roles
-from poise.motion.info import sampled
+from poise.kin.standing import World, hinge_axis, identity, mean_pose, pose_positions, rest_axes
+from poise.motion import Clip, Roles, Skeleton
 from poise.motion.roles import SIDES
 from poise.spatial import (
     axis_angle_to_quat,
-    forward_kinematics,
-    matrix_to_quat,
     normalize,
     quat_conj,
     quat_mul,
@@ -27,18 +25,16 @@ from poise.spatial import (
     quat_rotate_inv,
 )
 
-#: Cosine of the largest angle between a limb and where it hangs in a rest pose that a person could hold.
-_LIKE_STANDING = math.cos(math.radians(50))
-#: Cosine of the lean up to which a person counts as upright.
-_UPRIGHT = math.cos(math.radians(35))
 #: Where a skeleton has no toes: how far ahead of the ankle it treads, and how high such a point and the
 #: ankle lie above the sole, as shares of the leg.
 _TREAD, _TREAD_HEIGHT, _ANKLE_HEIGHT = 0.16, 0.025, 0.09
-#: Tilt (rad) between the rest pose's foot and the standing foot of the motion, beyond which the motion is
-#: believed.
+#: Tilt (rad) between the rest pose's foot and the standing foot of the motion, beyond which the motion
+#: is believed.
 _FOOT_TILT = math.radians(15)
 #: Tips of bones that are longer than this share of a leg are mistakes of the file.
 LONGEST_TIP = 0.4
+#: Twist (rad) of a standing limb beyond which its hinge is not believed.
+_MOST_TWIST = math.radians(100)
 _NEXT = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot"}
 
 
@@ -80,26 +76,32 @@ class CommonPose:
         return torch.stack(heights, -1).min(-1).values
 
 
-def common_pose(roles: Roles, clip: Clip | None = None) -> CommonPose:
+def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = None) -> CommonPose:
     """How the skeleton of `roles` stands in the pose that all skeletons share.
 
     It starts from the rest pose where a person could stand so, else from the mean pose of the upright
-    frames of `clip` (skeletons such as LAFAN1's lie folded at rest), and swings each bone of the arms and
-    legs by the smallest turn into its common direction, parents first, so that its twist is kept. Trunk,
-    head, clavicles and fingers stay as they are.
+    frames of `clip` (skeletons such as LAFAN1's lie folded at rest), and swings each bone of the arms
+    and legs by the smallest turn into its common direction, parents first. Where the motion shows about
+    which axis a knee or elbow bends, its bones are twisted so that all bend alike; else twist is kept.
+    Trunk, head, clavicles and fingers stay as they are.
+
+    Args:
+        clip: a motion of the skeleton. world: its joints in the world, where they are known already.
 
     Raises:
         PoiseError: a rest pose in which nobody stands and no clip, or legs of no length.
     """
     roles.require()
-    at_rest = _rest_axes(roles)
+    if clip is not None and world is None:
+        world = World.of(clip)
+    at_rest = rest_axes(roles)
     if at_rest is not None:
         local = torch.zeros(len(roles.skeleton), 4, dtype=torch.float64)
         local[:, 0] = 1.0
         local[0] = at_rest
         evidence = "its rest pose stands"
-    elif clip is not None:
-        local = _mean_pose(roles, clip)
+    elif clip is not None and world is not None:
+        local = mean_pose(roles, clip, world)
         evidence = "nobody stands as in its rest pose; the mean pose of the motion was taken"
     else:
         raise PoiseError(
@@ -107,104 +109,22 @@ def common_pose(roles: Roles, clip: Clip | None = None) -> CommonPose:
             roles.skeleton.source.path,
             "Give a clip on it instead of the skeleton alone",
         )
-    return _Builder(roles, local, clip, rested=at_rest is not None, evidence=evidence).build()
-
-
-def pose_positions(roles: Roles, local: Tensor) -> tuple[Tensor, Tensor]:
-    """World positions `(J, 3)` and rotations `(J, 4)` of local rotations `(J, 4)`, root at the origin."""
-    skeleton = roles.skeleton
-    zero = torch.zeros(3, dtype=torch.float64)
-    return forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), zero, local)
-
-
-def body_axes(roles: Roles, pos: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors to the left (hip to hip) and up (hips to shoulders, neck or head), each `(..., 3)`."""
-
-    def of(role: str) -> Tensor:
-        joint = roles.joint(role)
-        assert joint is not None
-        return pos[..., joint, :]
-
-    left = of("left_thigh") - of("right_thigh")
-    hips = (of("left_thigh") + of("right_thigh")) / 2
-    if roles.missing(("left_upper_arm", "right_upper_arm")):
-        tops = [*roles.chain("head"), *roles.chain("neck"), *roles.chain("spine")[::-1]]
-        if not tops:
-            raise PoiseError("the skeleton has neither arms nor spine above its legs")
-        top = pos[..., tops[0], :]
-    else:
-        top = (of("left_upper_arm") + of("right_upper_arm")) / 2
-    return normalize(left), normalize(top - hips)
-
-
-def _rest_axes(roles: Roles) -> Tensor | None:
-    """wxyz that turns the rest pose to stand and face +x, None where nobody could stand so."""
-    pos = torch.tensor(roles.skeleton.rest_positions())
-    left, up = body_axes(roles, pos)
-    # The nearest axis of the file: a rest pose stands, or lies as a whole.
-    axis = torch.zeros(3, dtype=torch.float64)
-    k = int(up.abs().argmax())
-    axis[k] = 1.0 if up[k] > 0 else -1.0
-    lines = [up @ axis]
-    for side in SIDES:
-        thigh, shin, foot = (pos[roles.joint(f"{side}_{k}") or 0] for k in ("thigh", "shin", "foot"))
-        lines += [normalize(shin - thigh) @ -axis, normalize(foot - shin) @ -axis]
-    if min(float(x) for x in lines) < _LIKE_STANDING or abs(float(left @ axis)) > 0.3:
-        return None
-    return _facing(left, axis)
-
-
-def _facing(left: Tensor, up: Tensor) -> Tensor:
-    """wxyz `(..., 4)` that turns `up` onto +z and the part of `left` across it onto +y."""
-    y = normalize(left - (left * up).sum(-1, keepdim=True) * up)
-    # Rows are the body's axes, so the matrix turns them onto the world's.
-    return matrix_to_quat(torch.stack((torch.linalg.cross(y, up), y, up), -2))
-
-
-def _mean_pose(roles: Roles, clip: Clip) -> Tensor:
-    """`(J, 4)` wxyz local, mean over upright frames; standing upright and facing +x.
-
-    A joint's mean rotation is the principal eigenvector of the sum of q q^T (Markley et al. 2007).
-    """
-    frames = sampled(clip.frames, 2000)
-    part = clip.replaced(root_pos=clip.root_pos[frames], rot=clip.rot[frames])
-    pos, quat = (torch.tensor(x) for x in part.world())
-    left, up = body_axes(roles, pos)
-    chosen = up[:, 2] > _UPRIGHT
-    if int(chosen.sum()) < max(2, len(frames) // 50):
-        # Hardly ever upright: the most upright tenth.
-        chosen = up[:, 2] >= up[:, 2].quantile(0.9)
-    local = torch.stack([_mean(torch.tensor(part.rot[:, j])[chosen]) for j in range(len(clip.skeleton))])
-    hips = roles.joint("hips") or 0
-    vertical = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(int(chosen.sum()), 3)
-    heading = _facing(left[chosen], vertical)
-    level = _mean(quat_mul(heading, quat[chosen, hips]))
-    # The root is turned so that the pelvis stands as it does on average, then that the trunk is upright.
-    local[0] = _one()
-    rest = pose_positions(roles, local)[1][hips]
-    local[0] = quat_mul(level, quat_conj(rest))
-    _, lean = body_axes(roles, pose_positions(roles, local)[0])
-    local[0] = quat_mul(shortest_arc(lean, vertical[0]), local[0])
-    left_now, _ = body_axes(roles, pose_positions(roles, local)[0])
-    local[0] = quat_mul(_facing(left_now, vertical[0]), local[0])
-    return local
-
-
-def _mean(q: Tensor) -> Tensor:
-    return torch.linalg.eigh(q.T @ q)[1][:, -1]
-
-
-def _one() -> Tensor:
-    return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    return _Builder(roles, local, clip, world, at_rest is not None, evidence).build()
 
 
 class _Builder:
     """Swings the limbs of a standing pose into their common directions."""
 
     def __init__(
-        self, roles: Roles, local: Tensor, clip: Clip | None, rested: bool, evidence: str
+        self,
+        roles: Roles,
+        local: Tensor,
+        clip: Clip | None,
+        world: World | None,
+        rested: bool,
+        evidence: str,
     ) -> None:
-        self.roles, self.local, self.clip = roles, local, clip
+        self.roles, self.local, self.clip, self.world = roles, local, clip, world
         self.rested, self.evidence = rested, evidence
         self.skeleton = roles.skeleton
         self.pos, self.quat = pose_positions(roles, local)
@@ -226,6 +146,9 @@ class _Builder:
                 bone = self._bone(j, side, kind)
                 if bone is not None:
                     rot[j] = quat_mul(shortest_arc(quat_rotate(rot[j], bone), _way(side, kind)), rot[j])
+        for side in SIDES:
+            for kinds in (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot")):
+                self._align_hinge(rot, side, kinds)
         parents = self.skeleton.parents
         local = torch.stack(
             [rot[0]] + [quat_mul(quat_conj(rot[p]), rot[j]) for j, p in enumerate(parents) if p >= 0]
@@ -238,16 +161,37 @@ class _Builder:
         heights = [
             float((pos[f] + quat_rotate(rot[f], t))[2]) for f, t in zip(feet, treads, strict=True)
         ]
-        above = torch.stack([_one()] * len(self.skeleton))
+        above = torch.stack([identity()] * len(self.skeleton))
         if self.clip is not None and not self.rested:
             above = torch.tensor(self.clip.rot[0])
         tread = float(np.mean(heights))
         tips = tuple((r.joint, v) for r in self.roles.rows if (v := self._believed(r.joint)) is not None)
-        pose = CommonPose(
-            *(x.numpy() for x in (pos, rot, above, treads)), -tread, tips, 0.0, self.evidence
-        )
+        arrays = pos.numpy(), rot.numpy(), above.numpy(), treads.numpy()
+        pose = CommonPose(*arrays, -tread, tips, 0.0, self.evidence)
         low = pose.lowest(self.roles, pos[None], rot[None], range(len(self.skeleton)))
         return replace(pose, sole=max(0.0, tread - float(low[0])))
+
+    def _align_hinge(self, rot: Tensor, side: str, kinds: tuple[str, str, str]) -> None:
+        """Twists the two bones of a limb until it bends as all limbs do: knees back, elbows forward.
+
+        Hands and feet stay: palms and soles are known better from the standing pose.
+        """
+        joints = [self.roles.joint(f"{side}_{kind}") for kind in kinds]
+        if self.world is None or any(j is None for j in joints):
+            return
+        limb = joints[0] or 0, joints[1] or 0, joints[2] or 0
+        axis = hinge_axis(self.world, limb)
+        if axis is None:
+            return
+        way = _way(side, kinds[0])
+        ahead = torch.tensor([1.0 if kinds[0] == "upper_arm" else -1.0, 0.0, 0.0], dtype=torch.float64)
+        wanted, now = torch.linalg.cross(way, ahead), quat_rotate(rot[limb[0]], axis)
+        angle = torch.atan2(torch.linalg.cross(now, wanted) @ way, now @ wanted)
+        if float(angle.abs()) > _MOST_TWIST:
+            return
+        ends = hanging(self.skeleton, limb[2])
+        for j in hanging(self.skeleton, limb[0]) - ends:
+            rot[j] = quat_mul(axis_angle_to_quat(way, angle), rot[j])
 
     def _joint(self, role: str) -> int:
         joint = self.roles.joint(role)
@@ -276,7 +220,7 @@ class _Builder:
         return quat_rotate_inv(self.quat[j], tip - self.pos[j])
 
     def _believed(self, j: int) -> tuple[float, float, float] | None:
-        """The tip of the bone at `j` in its frame; None without one, or where no hand or foot is so long."""
+        """The tip of the bone at `j` in its frame; None without one or where no bone is so long."""
         for k, tip in self.skeleton.ends:
             if k == j and 1e-3 < float(np.linalg.norm(tip)) < LONGEST_TIP * self.leg:
                 return tip
@@ -321,11 +265,11 @@ class _Builder:
         return rot
 
     def _standing_tilt(self) -> float | None:
-        """How far (rad) the line from ankle to toe rises: median over the moments in which a foot stands."""
-        if self.clip is None:
+        """How far (rad) the line from ankle to toe rises, the median while a foot stands."""
+        if self.clip is None or self.world is None:
             return None
         found = []
-        pos, quat = (torch.tensor(x) for x in self.clip.world())
+        pos, quat = self.world
         for side in SIDES:
             j = self._joint(f"{side}_foot")
             toe = self._toe(j, side)
@@ -355,9 +299,9 @@ class _Builder:
     def _ankle_height(self, j: int) -> float:
         """Height (m) of a standing ankle over the floor of the clip, or what is usual."""
         usual = _ANKLE_HEIGHT * self.leg
-        if self.clip is None:
+        if self.world is None:
             return usual
-        low = float(np.quantile(self.clip.positions()[:, j, 2], 0.2))
+        low = float(self.world.pos[:, j, 2].quantile(0.2))
         return low if 0.4 * usual < low < 1.6 * usual else usual
 
 
@@ -366,3 +310,12 @@ def _way(side: str, kind: str) -> Tensor:
     out = 1.0 if side == "left" else -1.0
     leg = kind in ("thigh", "shin")
     return normalize(torch.tensor([0.0, 0.0 if leg else out, -1.0], dtype=torch.float64))
+
+
+def hanging(skeleton: Skeleton, joint: int) -> set[int]:
+    """`joint` and all that hangs on it."""
+    out = {joint}
+    for j in range(joint + 1, len(skeleton)):
+        if skeleton.parents[j] in out:
+            out.add(j)
+    return out

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.common_pose import CommonPose
+from poise.kin.common_pose import CommonPose, hanging
 from poise.kin.contacts import contact_labels
 from poise.kin.ground import smooth_hull
 from poise.kin.limbs import Limb, match_positions
-from poise.motion import Clip, Roles, Skeleton
+from poise.kin.standing import World
+from poise.motion import Clip, Roles
 from poise.motion.joint_map import JointMap
 from poise.motion.roles import SIDES
 from poise.spatial import forward_kinematics, quat_rotate
@@ -37,18 +38,23 @@ class Scale:
 
     @staticmethod
     def between(
-        clip: Clip, joints: JointMap, here: CommonPose, there: CommonPose, factor: float | None
+        world: World,
+        fps: float,
+        joints: JointMap,
+        here: CommonPose,
+        there: CommonPose,
+        factor: float | None,
     ) -> Scale:
         """Scaled by the heights of the hips over the feet, about where the clip begins on its ground."""
         factor = there.hip_height / here.hip_height if factor is None else factor
-        pos, quat = (torch.tensor(x) for x in clip.world())
+        pos, quat = world
         treads = []
         for side, tread in zip(SIDES, here.treads, strict=True):
             foot = joints.source.joint(f"{side}_foot") or 0
             treads.append(
                 pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3))
             )
-        ground = tread_height(torch.stack(treads, 1), clip.fps)
+        ground = tread_height(torch.stack(treads, 1), fps)
         hips = [pos[0, joints.source.joint(f"{s}_thigh") or 0] for s in SIDES]
         middle = (hips[0] + hips[1]) / 2
         return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground)
@@ -117,19 +123,19 @@ def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot
     return tuple(out)
 
 
-def source_contacts(clip: Clip, feet: tuple[Foot, ...], ground: float) -> Tensor:
+def source_contacts(world: World, fps: float, feet: tuple[Foot, ...], ground: float) -> Tensor:
     """`(T, F)` bool, which end touches the ground in the source: low and slow."""
-    pos, quat = (torch.tensor(x) for x in clip.world())
     out = []
     for foot in feet:
-        tread = foot.points(pos, quat, target=False)[:, None]
+        tread = foot.points(*world, target=False)[:, None]
         low = _LOW[foot.name.split()[1]]
-        out.append(contact_labels(tread, clip.fps, low, _SLOW, ground)[:, 0])
+        out.append(contact_labels(tread, fps, low, _SLOW, ground)[:, 0])
     return torch.stack(out, 1)
 
 
 def plant(
     clip: Clip,
+    world: World,
     joints: JointMap,
     poses: tuple[CommonPose, CommonPose],
     rot: Tensor,
@@ -142,15 +148,14 @@ def plant(
 ) -> tuple[Tensor, Tensor]:
     """New local rotations `(T, J, 4)` and root path `(T, 3)` of the target with its contacts kept.
 
-    While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is after
-    scaling: what stood still stands still. Limbs that would then be under the floor by more than in the
-    source are lifted, and where the trunk is, all of it. The limbs are solved by two bones in closed form;
-    feet and hands keep their turn.
+    While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
+    after scaling: what stood still stands still. Limbs that would then be under the floor by more than
+    in the source are lifted, and where the trunk is, all of it. The limbs are solved by two bones in
+    closed form; feet and hands keep their turn.
     """
     skeleton = joints.target.skeleton
-    source_pos, source_quat = (torch.tensor(x) for x in clip.world())
     offsets = torch.tensor(skeleton.offsets)
-    depth = floor_depth(joints.source, poses[0], source_pos, source_quat, scale.ground) * scale.factor
+    depth = floor_depth(joints.source, poses[0], *world, scale.ground) * scale.factor
 
     def lift(pos: Tensor, quat: Tensor, parts: set[int]) -> Tensor:
         """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
@@ -173,7 +178,7 @@ def plant(
         goal = pos[:, foot.target]
         if hold:
             arm = quat_rotate(quat[:, foot.target], foot.tread_target.expand(len(pos), 3))
-            wanted = scale.place(foot.points(source_pos, source_quat, target=False)) - arm
+            wanted = scale.place(foot.points(*world, target=False)) - arm
             goal = goal + contact_weight(contacts[:, k], clip.fps)[:, None] * (wanted - goal)
         if clear:
             moved = pos + (goal - pos[:, foot.target])[:, None]
@@ -212,12 +217,3 @@ def floor_depth(
     """
     joints = range(len(roles.skeleton)) if joints is None else joints
     return (ground - pose.sole - pose.lowest(roles, pos, quat, joints)).clamp_min(0.0)
-
-
-def hanging(skeleton: Skeleton, joint: int) -> set[int]:
-    """`joint` and all that hangs on it."""
-    out = {joint}
-    for j in range(joint + 1, len(skeleton)):
-        if skeleton.parents[j] in out:
-            out.add(j)
-    return out

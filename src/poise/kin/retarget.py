@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -13,7 +14,8 @@ from torch import Tensor
 from poise.kin.common_pose import CommonPose, common_pose
 from poise.kin.plant import Scale, feet_of, plant, source_contacts
 from poise.kin.retarget_report import RetargetReport, measure
-from poise.motion import Clip, Skeleton
+from poise.kin.standing import World
+from poise.motion import Clip, Roles, Skeleton
 from poise.motion.joint_map import SHARED, JointMap, map_joints
 from poise.spatial import (
     forward_kinematics,
@@ -69,20 +71,25 @@ def retarget(
     config = config or RetargetConfig()
     target, example = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
     joints = map_joints(clip.skeleton, target, mapping)
-    here = common_pose(joints.source, clip)
+    world = World.of(clip)
+    here = common_pose(joints.source, clip, world)
     there = here if _same(clip.skeleton, target) else _other_pose(joints, clip, example)
-    scale = Scale.between(clip, joints, here, there, config.scale)
-    rot, root = transfer(clip, joints, here, there, scale)
+    scale = Scale.between(world, clip.fps, joints, here, there, config.scale)
+    rot, root = transfer(world, joints, here, there, scale)
     feet = feet_of(joints, here, there)
-    contacts = source_contacts(clip, feet, scale.ground)
+    contacts = source_contacts(world, clip.fps, feet, scale.ground)
     if config.contacts or config.clear:
         rot, root = plant(
-            clip, joints, (here, there), rot, root, feet, contacts, scale, config.contacts, config.clear
+            *(clip, world, joints, (here, there), rot, root, feet, contacts, scale),
+            hold=config.contacts,
+            clear=config.clear,
         )
     flat = [unwrap_quats(normalize(rot[:, j])) for j in range(len(target))]
     made = Clip(target, root.numpy(), torch.stack(flat, 1).numpy(), clip.fps, clip.name, clip.cyclic)
     seconds = time.perf_counter() - began
-    return made, measure(clip, made, joints, (here, there), feet, contacts, scale, seconds)
+    return made, measure(
+        (world, World.of(made)), clip.fps, joints, (here, there), feet, contacts, scale, seconds
+    )
 
 
 def _same(a: Skeleton, b: Skeleton) -> bool:
@@ -99,12 +106,12 @@ def _other_pose(joints: JointMap, clip: Clip, example: Clip | None) -> CommonPos
 
 
 def transfer(
-    clip: Clip, joints: JointMap, here: CommonPose, there: CommonPose, scale: Scale
+    world_in: World, joints: JointMap, here: CommonPose, there: CommonPose, scale: Scale
 ) -> tuple[Tensor, Tensor]:
-    """Local rotations `(T, J, 4)` and root path `(T, 3)` of the target, before contacts are corrected."""
+    """Local rotations `(T, J, 4)` and root path `(T, 3)` of the target, contacts not yet corrected."""
     target = joints.target.skeleton
-    source_pos, source_quat = (torch.tensor(x) for x in clip.world())
-    frames = clip.frames
+    source_pos, source_quat = world_in
+    frames = len(source_pos)
     turned = quat_mul(source_quat, quat_conj(torch.tensor(here.rot)).expand_as(source_quat))
     rest = torch.tensor(there.rot)
     moves = dict((b, a) for a, b in joints.direct)
@@ -170,7 +177,7 @@ def _shared(joints: JointMap, here: CommonPose, there: CommonPose, turned: Tenso
             continue
         knots = [
             (0.0, carrier),
-            *zip(_places(joints.source, source, here), (turned[:, j] for j in source)),
+            *zip(_places(joints.source, source, here), [turned[:, j] for j in source], strict=True),
         ]
         for j, at in zip(target, _places(joints.target, target, there), strict=True):
             out[j] = _between(knots, at)
@@ -179,15 +186,13 @@ def _shared(joints: JointMap, here: CommonPose, there: CommonPose, turned: Tenso
     return out
 
 
-def _places(roles, chain: tuple[int, ...], pose: CommonPose) -> list[float]:
+def _places(roles: Roles, chain: tuple[int, ...], pose: CommonPose) -> list[float]:
     """Places in (0, 1] of a chain's joints: the middle of the bone above each, by length."""
     if not chain:
         return []
     first = roles.skeleton.parents[chain[0]]
     line = [first, *chain]
-    gaps = [
-        float(np.linalg.norm(pose.pos[b] - pose.pos[a])) for a, b in zip(line, line[1:], strict=False)
-    ]
+    gaps = [float(np.linalg.norm(pose.pos[b] - pose.pos[a])) for a, b in pairwise(line)]
     # The last joint's own bone is taken as long as the one below it.
     gaps.append(gaps[-1])
     ends = np.cumsum([0.0, *gaps])
@@ -198,7 +203,7 @@ def _places(roles, chain: tuple[int, ...], pose: CommonPose) -> list[float]:
 
 
 def _between(knots: list[tuple[float, Tensor]], at: float) -> Tensor:
-    for (a, low), (b, high) in zip(knots, knots[1:], strict=False):
+    for (a, low), (b, high) in pairwise(knots):
         if at <= b + 1e-9:
             share = 1.0 if b - a < 1e-9 else min(max((at - a) / (b - a), 0.0), 1.0)
             if share > 1.0 - 1e-9:

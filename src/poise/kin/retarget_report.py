@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.common_pose import CommonPose, body_axes
+from poise.kin.common_pose import CommonPose
 from poise.kin.plant import Foot, Scale, floor_depth
+from poise.kin.standing import World, body_axes
 from poise.metrics.tracking import MM
-from poise.motion import Clip
+from poise.motion import Roles
 from poise.motion.joint_map import JointMap
 from poise.motion.roles import SIDES
 from poise.spatial import normalize
@@ -26,9 +27,9 @@ class RetargetReport:
 
     joints: what moves what. poses: how each skeleton's common pose was found, source first.
     scale: size of the target's steps over the source's. ground_m: height of the source's ground.
-    bones: per limb bone ("left thigh") the mean and largest angle in degrees between its direction in the
-    target and in the source. direction_deg, direction_max_deg: over all of them. trunk_deg: mean angle of
-    the line from hips to shoulders.
+    bones: per limb bone ("left thigh") the mean and largest angle in degrees between its direction in
+    the target and in the source. direction_deg, direction_max_deg: over all of them. trunk_deg: mean
+    angle of the line from hips to shoulders.
     ends: per hand, foot and head the mean distance from where the source has it, seen from the hips, in
     percent of the height of the hips. end_percent: over all of them.
     contact_s: seconds of foot contact, both feet together. slide_mm_s: mean horizontal speed of the feet
@@ -54,7 +55,9 @@ class RetargetReport:
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain numbers, lists and names, ready for JSON."""
-        out = {k: v for k, v in asdict_shallow(self).items() if k != "joints"}
+        out = {
+            k: v for k, v in ((n, getattr(self, n)) for n in self.__dataclass_fields__) if k != "joints"
+        }
         source, target = self.joints.source.skeleton.names, self.joints.target.skeleton.names
         out["bones"] = {name: {"mean_deg": a, "max_deg": b} for name, a, b in self.bones}
         out["ends"] = dict(self.ends)
@@ -76,17 +79,17 @@ class RetargetReport:
         out = [
             f"The source: {joints.source.evidence}; {self.poses[0]}.",
             f"The target: {joints.target.evidence}; {self.poses[1]}.",
-            f"Steps are scaled by {self.scale:.3f}, the ratio of the heights of the hips, over a ground at "
-            f"{self.ground_m * 1000:+.0f} mm.",
-            f"Bones of arms and legs point {self.direction_deg:.1f} degrees away from the source's on average "
-            f"and {self.direction_max_deg:.0f} at most; the trunk {self.trunk_deg:.1f}.",
-            f"Hands, feet and head are {self.end_percent:.1f} % of the hips' height from where the source has "
-            "them, seen from the hips.",
+            f"Steps are scaled by {self.scale:.3f}, the ratio of the heights of the hips, over a ground "
+            f"at {self.ground_m * 1000:+.0f} mm.",
+            f"Bones of arms and legs point {self.direction_deg:.1f} degrees away from the source's on "
+            f"average and {self.direction_max_deg:.0f} at most, the trunk {self.trunk_deg:.1f}.",
+            f"Hands, feet and head are {self.end_percent:.1f} % of the hips' height from where the "
+            "source has them, seen from the hips.",
         ]
         if self.contact_s > 0:
             out.append(
-                f"Standing feet slide {self.slide_mm_s[1]:.0f} mm/s ({self.slide_mm_s[0]:.0f} in the source) "
-                f"over {self.contact_s:.1f} s of contact."
+                f"Standing feet slide {self.slide_mm_s[1]:.0f} mm/s ({self.slide_mm_s[0]:.0f} in the "
+                f"source) over {self.contact_s:.1f} s of contact."
             )
         else:
             out.append("No foot of the source stands, so none was held.")
@@ -102,14 +105,9 @@ class RetargetReport:
         return out
 
 
-def asdict_shallow(report: RetargetReport) -> dict[str, Any]:
-    """The fields of a report by name."""
-    return {name: getattr(report, name) for name in report.__dataclass_fields__}
-
-
 def measure(
-    clip: Clip,
-    made: Clip,
+    worlds: tuple[World, World],
+    fps: float,
     joints: JointMap,
     poses: tuple[CommonPose, CommonPose],
     feet: tuple[Foot, ...],
@@ -117,14 +115,13 @@ def measure(
     scale: Scale,
     seconds: float,
 ) -> RetargetReport:
-    """Measures the result `made` of retargeting `clip`; see `RetargetReport`."""
-    worlds = [tuple(torch.tensor(x) for x in c.world()) for c in (clip, made)]
+    """Measures what came of a retargeting; see `RetargetReport`. worlds: source and target."""
     bones = _bones(joints, worlds[0][0], worlds[1][0])
     angles = [torch.cat([a for _, a in bones])] if bones else [torch.zeros(1)]
     trunk = [body_axes(r, w[0])[1] for r, w in zip((joints.source, joints.target), worlds, strict=True)]
     lean = [_up(pose, r) for pose, r in zip(poses, (joints.source, joints.target), strict=True)]
     ends = _ends(joints, worlds[0][0], worlds[1][0], poses)
-    slide, held = _slide(feet, contacts, worlds, scale, clip.fps)
+    slide, held = _slide(feet, contacts, worlds, scale, fps)
     depths = [
         floor_depth(roles, pose, *world, scale.ground) * factor * MM
         for roles, pose, world, factor in zip(
@@ -157,7 +154,7 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
     return torch.rad2deg(2.0 * torch.atan2((a - b).norm(dim=-1), (a + b).norm(dim=-1)))
 
 
-def _up(pose: CommonPose, roles) -> Tensor:
+def _up(pose: CommonPose, roles: Roles) -> Tensor:
     return body_axes(roles, torch.tensor(pose.pos))[1]
 
 
@@ -194,7 +191,7 @@ def _ends(
 def _slide(
     feet: tuple[Foot, ...],
     contacts: Tensor,
-    worlds: list[tuple[Tensor, ...]],
+    worlds: tuple[World, World],
     scale: Scale,
     fps: float,
 ) -> tuple[tuple[float, float], float]:

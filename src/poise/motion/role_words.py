@@ -133,7 +133,7 @@ class NameWords:
 
 @cache
 def name_words(name: str) -> NameWords:
-    """The words in a joint's name: "mixamorig:LeftUpLeg" is ("left", "upleg"), "lfemur" ("left", "femur")."""
+    """The words in a joint's name: "mixamorig:LeftUpLeg" is left and upleg, "lfemur" left and femur."""
     text = re.split(r"[:|]", name)[-1]
     text = re.sub(r"^(mixamorig|character)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
     raw = [t.lower() for t in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
