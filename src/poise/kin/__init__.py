@@ -8,6 +8,7 @@ from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
 from poise.kin.hinges import chain_angles, chain_quat
+from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
@@ -17,6 +18,8 @@ __all__ = [
     "FitReport",
     "GroundFit",
     "Kinematics",
+    "Limb",
+    "TwoBone",
     "chain_angles",
     "chain_quat",
     "clean_clip",
@@ -28,7 +31,11 @@ __all__ = [
     "find_faults",
     "fit_ground",
     "fit_humanoid",
+    "limb_of",
     "lowest_height",
+    "match_positions",
     "qpos_to_clip",
     "qpos_velocity",
+    "shortest_arc",
+    "two_bone",
 ]
