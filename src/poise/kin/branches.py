@@ -12,9 +12,9 @@ def best_path(price: np.ndarray, pull: np.ndarray) -> np.ndarray:
         price: `(T - 1, R, 2, 2)`, what the step from candidate i to candidate j costs.
         pull: `(T, R, 2)`, what a candidate costs by itself.
 
-    The sequence of least sum is the shortest path of Viterbi's algorithm. Its costs are products of 2 x 2
-    matrices in the algebra of minimum and sum, which is associative, so prefixes and suffixes of all
-    frames come in log2(T) passes; a frame takes the candidate through which the shortest path leads.
+    The sequence of least sum is the shortest path of Viterbi's algorithm. Its costs are products of
+    2 x 2 matrices in the algebra of minimum and sum, which is associative, so prefixes and suffixes of
+    all frames come in log2(T) passes; a frame takes the candidate through which the best path leads.
     """
     if len(pull) == 1:
         return pull.argmin(-1)

@@ -14,7 +14,14 @@ import torch
 
 from poise.body import Humanoid
 from poise.errors import PoiseError, did_you_mean
-from poise.kin.ik_angles import by_order, continuous_euler, pointing_angles, zyx_angles, zyx_matrix
+from poise.kin.ik_angles import (
+    by_order,
+    continuous_euler,
+    pointing_angles,
+    unwrapped,
+    zyx_angles,
+    zyx_matrix,
+)
 from poise.kin.ik_body import IkBody
 from poise.kin.ik_config import IkConfig
 from poise.kin.ik_frames import Frames, rest_frames
@@ -142,37 +149,52 @@ def _coordinates(
     points: np.ndarray, wanted: dict[int, np.ndarray], body: IkBody, config: IkConfig
 ) -> np.ndarray:
     """qpos from world rotations: three hinges make any rotation, fewer point their bone."""
-    rows, frames = body.table.rows, len(points)
+    rows = body.table.rows
     angles: dict[int, np.ndarray] = {}
-    local: dict[int, np.ndarray] = {}
-    world = [wanted[0]]
+    world: list[np.ndarray] = [wanted[0]]
+    free: list[int] = []
     for i, row in enumerate(rows[1:], 1):
+        if len(row.order) == 3 and i in wanted:
+            free.append(i)
+            world.append(wanted[i])
+            continue
         zero = world[row.parent] @ body.links[i]
-        world.append(zero)
         tip = _tip(body, i)
-        known = tip >= 0 and bool(np.isfinite(points[0, tip]).all())
-        if len(row.order) == 3 and (i in wanted or known):
-            if i not in wanted:
-                # The bone is seen and its twist is not (necks): the smallest turn from the parent.
-                bone = rotate(zero, body.rest_rot[i].T @ unit(body.rest_pos[tip] - body.rest_pos[i]))
-                wanted[i] = arc(bone, unit(points[:, tip] - points[:, i])) @ zero
-            world[i] = wanted[i]
-            turn = np.swapaxes(zero, -1, -2) @ wanted[i]
-            local[i] = body.axes[i].T @ turn @ body.axes[i]
-        elif row.order and known:
-            bone = body.rest_rot[i].T @ unit(body.rest_pos[tip] - body.rest_pos[i])
-            along = unit(points[:, tip] - points[:, i])
+        if not row.order or tip < 0 or np.isnan(points[0, tip, 0]):
+            angles[i] = np.zeros((len(points), len(row.order)))
+            world.append(zero)
+            continue
+        bone = body.rest_rot[i].T @ unit(body.rest_pos[tip] - body.rest_pos[i])
+        along = unit(points[:, tip] - points[:, i])
+        if len(row.order) == 3:
+            # The bone is seen and its twist is not (necks): the smallest turn from the parent.
+            free.append(i)
+            world.append(arc(rotate(zero, bone), along) @ zero)
+        else:
             seen = rotate(np.swapaxes(zero, -1, -2), along)
             angles[i] = pointing_angles(bone, seen, row.order, body.axes[i])
-            world[i] = zero @ body.axes[i] @ _chain(angles[i], row.order) @ body.axes[i].T
-        elif row.order:
-            angles[i] = np.zeros((frames, len(row.order)))
-    for order, group in by_order([rows[i].order for i in local]).items():
-        at = [list(local)[g] for g in group]
-        found = continuous_euler(np.stack([local[i] for i in at], 1), order, config.on("branches"))
-        angles.update({i: found[:, k] for k, i in enumerate(at)})
-    root = unwrap_quats(matrix_to_quat(torch.tensor(wanted[0]))).numpy()
-    return np.concatenate((points[:, 0], root, *(angles[i] for i in sorted(angles))), -1)
+            world.append(zero @ body.axes[i] @ _chain(angles[i], row.order) @ body.axes[i].T)
+    angles.update(_free_angles(free, np.stack(world, 1), body, config))
+    hinges = np.concatenate([angles[i] for i in sorted(angles)], -1)
+    hinges = unwrapped(hinges) if config.on("branches") else hinges
+    root = unwrap_quats(matrix_to_quat(torch.tensor(world[0]))).numpy()
+    return np.concatenate((points[:, 0], root, hinges), -1)
+
+
+def _free_angles(
+    free: list[int], world: np.ndarray, body: IkBody, config: IkConfig
+) -> dict[int, np.ndarray]:
+    """Angles `(T, 3)` of rows with three hinges from all world rotations `(T, R, 3, 3)`."""
+    parents = [body.table.rows[i].parent for i in free]
+    zero = world[:, parents] @ body.links[free]
+    axes = body.axes[free]
+    # The chain's rotation (B_parent link)^T B, stated in the hinges' own frame.
+    local = np.swapaxes(axes, -1, -2) @ (np.swapaxes(zero, -1, -2) @ world[:, free]) @ axes
+    out: dict[int, np.ndarray] = {}
+    for order, group in by_order([body.table.rows[i].order for i in free]).items():
+        found = continuous_euler(local[:, group], order, config.on("branches"))
+        out.update({free[g]: found[:, k] for k, g in enumerate(group)})
+    return out
 
 
 def _chain(angles: np.ndarray, order: str) -> np.ndarray:

@@ -41,7 +41,7 @@ def zyx_matrix(angles: np.ndarray) -> np.ndarray:
 
 
 def euler_angles(m: np.ndarray, order: str) -> np.ndarray:
-    """Intrinsic angles `(..., 3)` of matrices for three different axes, the middle one in +-90 degrees."""
+    """Intrinsic angles `(..., 3)` of matrices, three different axes, the middle one in +-90 degrees."""
     i, j, k = (_AXIS[c] for c in order)
     s = 1.0 if (j - i) % 3 == 1 else -1.0
     # R = Ri(a) Rj(b) Rk(c):  R[i,k] = s sin b,  R[i,i] = cos b cos c,  R[j,k] = -s sin a cos b
@@ -58,15 +58,15 @@ def euler_angles(m: np.ndarray, order: str) -> np.ndarray:
 def continuous_euler(m: np.ndarray, order: str, branches: bool = True) -> np.ndarray:
     """Angles `(T, R, 3)` of rotations `m (T, R, 3, 3)` for one hinge order, without jumps.
 
-    With `branches` the smoothest sequence through both Euler branches and through gimbal lock, whole
-    turns unwrapped; without, Eq. 7 as it is printed.
+    With `branches` the smoothest sequence through both Euler branches and through gimbal lock, up to
+    whole turns (`unwrapped`); without, Eq. 7 as it is printed.
     """
     angles = euler_angles(m, order)
     if not branches:
         return one_turn_check(angles)
     for r in np.flatnonzero((np.abs(angles[..., 1]) > math.pi / 2 - 1e-6).any(0)):
         angles[:, r] = through_lock(torch.tensor(angles[:, r]), order).numpy()
-    return unwrapped(euler_path(angles))
+    return euler_path(angles)
 
 
 def unwrapped(angles: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ def one_turn_check(angles: np.ndarray) -> np.ndarray:
 def pointing_angles(at_rest: np.ndarray, wanted: np.ndarray, order: str, axes: np.ndarray) -> np.ndarray:
     """Angles `(T, n)` of one or two hinges that turn direction `at_rest (3)` nearest to `wanted (T, 3)`.
 
-    Both are unit and stated in the body at zero angles; `axes (3, 3)` holds the hinges' frame. One hinge
+    Whole turns apart (`unwrapped`). Both are unit and stated in the body at zero angles; `axes (3, 3)` holds the hinges' frame. One hinge
     turns the part across its axis onto that of the wanted direction. Two hinges reach any direction
     within their cone, in two ways of which the smoother one is taken; with i the first axis and k the
     second, e_i . R_k(c) v = e_i . w gives c, and a turns the rest about e_i.
@@ -98,7 +98,7 @@ def pointing_angles(at_rest: np.ndarray, wanted: np.ndarray, order: str, axes: n
     v, w = axes.T @ at_rest, wanted @ axes
     i = _AXIS[order[0]]
     if len(order) == 1:
-        return unwrapped(_about(np.broadcast_to(v, w.shape), w, i)[:, None])
+        return _about(np.broadcast_to(v, w.shape), w, i)[:, None]
     k = _AXIS[order[1]]
     m = 3 - i - k
     sign = 1.0 if (i + 1) % 3 == m else -1.0
@@ -117,7 +117,7 @@ def pointing_angles(at_rest: np.ndarray, wanted: np.ndarray, order: str, axes: n
     pair = wrapped(np.stack(both, 1))[:, None]  # (T, 1, 2, 2)
     step = wrapped(pair[1:, :, None, :] - pair[:-1, :, :, None])
     pick = best_path((step**2).sum(-1), 1e-2 * (pair**2).sum(-1))
-    return unwrapped(np.take_along_axis(pair, pick[..., None, None], -2)[:, 0, 0])
+    return np.take_along_axis(pair, pick[..., None, None], -2)[:, 0, 0]
 
 
 def _about(v: np.ndarray, w: np.ndarray, axis: int) -> np.ndarray:

@@ -25,10 +25,10 @@ def held_normals(
     """Unit bend axes `(T, L, 3)`, world, that never jump where a limb is straight.
 
     The angle theta of the observed axis about the upper bone is stated against an axis that is carried
-    along with the bone without turning about it. It is averaged over time with weights sin^4 of the bend,
-    so that what a bent limb shows holds through the frames where it is straight; so stated as a doubled
-    angle, a limb that is stretched beyond straight shows the same plane. Which way is forward is then the
-    smoothest choice that costs bends to the wrong side.
+    along with the bone without turning about it. It is averaged over time with weights sin^4 of the
+    bend, so that what a bent limb shows holds through the frames where it is straight; as a doubled
+    angle, since a limb that is stretched beyond straight shows the same plane. Which side is forward is
+    then the smoothest choice, where bends to the wrong side cost.
 
     Args:
         upper, lower: `(T, L, 3)` unit bones, world. parent: `(T, L, 3, 3)` what the upper bone hangs on.

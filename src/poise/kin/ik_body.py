@@ -172,7 +172,7 @@ def _normal(
     """
     upper = unit(rest[arm.lower] - rest[arm.upper])
     lower = unit(rest[arm.end] - rest[arm.lower])
-    left, up, forward = trunk.T
+    up, forward = trunk[:, 1], trunk[:, 2]
     towards = -forward if arm.leg else forward
     usual = cross(upper, towards)
     if np.linalg.norm(usual) < 0.3:
@@ -195,7 +195,7 @@ def _normal(
 
 
 def body_points(body: IkBody, pos: np.ndarray, rot: np.ndarray) -> np.ndarray:
-    """World positions `(T, P, 3)` of all points from body places `(T, R, 3)` and rotations `(T, R, 3, 3)`."""
+    """World positions `(T, P, 3)` of points; bodies at `pos (T, R, 3)` turned by `rot (T, R, 3, 3)`."""
     out = [pos]
     for foot, toe in sorted(body.toes.items(), key=lambda item: item[1]):
         local = body.rest_rot[foot].T @ (body.rest_pos[toe] - body.rest_pos[foot])

@@ -11,12 +11,12 @@ from poise.errors import PoiseError
 #: denominators of Eqs. 11 and 12 are misprints of norms, and elbows bend to -z on the left and +z on the
 #: right (Eqs. 10 and 13), so that ranges must be mirrored, which generated humanoids do.
 CORRECTIONS: dict[str, str] = {
-    "knee_subscripts": "Eq. 20 builds the left knee's parent from the child's axes; Eq. 23 (right) does not",
+    "knee_subscripts": "Eq. 20 builds the left knee's parent from the child's axes; Eq. 23 does not",
     "square_ankle": "Eqs. 21, 24: shin and foot are not square, so Eq. 6 reads 30 degrees as 26.6",
-    "hold_bend": "Eqs. 5, 10, 13, 20, 23: the bend axis of a straight limb is undefined, and flips beyond",
-    "spine_twist": "Eqs. 16-18: the bend axis of a straight spine is undefined, and flips with the bend",
-    "trunk_fit": "Eqs. 16, 18: cross products that point elsewhere, or vanish, on other skeletons",
-    "thigh_twist": "Eqs. 19, 22: twist from the line of the hips leaves the thigh's twist to the knee",
+    "hold_bend": "Eqs. 5, 10, 13, 20, 23: a straight limb has no bend axis, and beyond it flips",
+    "spine_twist": "Eqs. 16-18: a straight spine has no bend axis, and it flips with the bend",
+    "trunk_fit": "Eqs. 16, 18: cross products that vanish or point elsewhere on other skeletons",
+    "thigh_twist": "Eqs. 19, 22: twist from the line of the hips leaves the thigh's to the knee",
     "branches": "Eq. 7 adds one turn once, and keeps flips between the two Euler branches",
 }
 

@@ -40,7 +40,7 @@ class Frames:
         return self.p[:, self.body.roles[b]] - self.p[:, self.body.roles[a]]
 
     def _trunk(self) -> None:
-        """Pelvis (parent of Eqs. 18, 19, 22) and the row that carries the shoulders (child of Eq. 16)."""
+        """Pelvis (parent of Eqs. 18, 19, 22) and the row that carries the shoulders (child, Eq. 16)."""
         body, bone = self.body, self._l
         top = body.spine[-1]
         if self.config.on("trunk_fit"):
@@ -99,20 +99,29 @@ class Frames:
         upper = unit(np.stack([p[:, a.lower] - p[:, a.upper] for a in body.arms], 1))
         lower = unit(np.stack([p[:, a.end] - p[:, a.lower] for a in body.arms], 1))
         normals = self._normals(upper, lower)
-        for k, arm in enumerate(body.arms):
-            u, v, n = upper[:, k], lower[:, k], normals[:, k]
-            if not arm.leg:
-                # Eq. 10: z = -l_ls-le x l_le-lw, x = l_ls-le. Eq. 13: z = l_re-rw x l_re-rs, x = l_re-rs
-                way, turn = (1.0, -1.0) if arm.left else (-1.0, 1.0)
-                self.frames[arm.upper] = frame_of("x", x=way * u, z=turn * n)
-                self.frames[arm.lower] = frame_of("x", x=way * v, z=turn * n)
-                continue
-            if config.on("thigh_twist"):
-                # Both bones of the leg carry the knee's axis, x = -y_c x l_lk-lhip of Eq. 20.
-                self.frames[arm.upper] = frame_of("y", x=n, y=-u)
-                self.frames[arm.lower] = frame_of("y", x=n, y=-v)
-                continue
-            self._leg_of_hip_line(arm.upper, arm.lower, arm.left, u, v, n)
+        arms = [k for k, a in enumerate(body.arms) if not a.leg]
+        legs = [k for k, a in enumerate(body.arms) if a.leg]
+        both, twice = np.concatenate((upper, lower), 1), np.concatenate((normals, normals), 1)
+        # Eq. 10: x = l_ls-le and l_le-lw, z = -l_ls-le x l_le-lw. Eq. 13: x = l_re-rs and l_rw-re,
+        # z = l_re-rw x l_re-rs. So x points outward on the left and inward on the right.
+        way = np.array([[1.0] if body.arms[k].left else [-1.0] for k in arms * 2])
+        at = arms + [k + len(body.arms) for k in arms]
+        self._put(arms, frame_of("x", x=way * both[:, at], z=-way * twice[:, at]))
+        if config.on("thigh_twist"):
+            # Both bones of the leg carry the knee's axis, x = -y_c x l_lk-lhip of Eq. 20.
+            at = legs + [k + len(body.arms) for k in legs]
+            self._put(legs, frame_of("y", x=twice[:, at], y=-both[:, at]))
+            return
+        for k in legs:
+            arm = body.arms[k]
+            self._leg_of_hip_line(
+                arm.upper, arm.lower, arm.left, upper[:, k], lower[:, k], normals[:, k]
+            )
+
+    def _put(self, arms: list[int], frames: np.ndarray) -> None:
+        """Gives `frames (T, 2 n, 3, 3)` to the upper bones of n limbs, then to their lower bones."""
+        rows = [self.body.arms[k].upper for k in arms] + [self.body.arms[k].lower for k in arms]
+        self.frames.update({row: frames[:, i] for i, row in enumerate(rows)})
 
     def _leg_of_hip_line(
         self, thigh: int, shin: int, left: bool, u: np.ndarray, v: np.ndarray, n: np.ndarray

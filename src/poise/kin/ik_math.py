@@ -14,12 +14,12 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a . b `(..., 1)`."""
-    return (a * b).sum(-1, keepdims=True)
+    return np.einsum("...i,...i->...", a, b)[..., None]
 
 
 def norm(a: np.ndarray) -> np.ndarray:
     """|a| `(..., 1)`."""
-    return np.sqrt((a * a).sum(-1, keepdims=True))
+    return np.sqrt(np.einsum("...i,...i->...", a, a))[..., None]
 
 
 def unit(a: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def frame_of(
     y: np.ndarray | None = None,
     z: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Orthonormal `(..., 3, 3)` from two directions; axis `hold` is kept, the other made square to it."""
+    """Orthonormal `(..., 3, 3)` of two directions; axis `hold` is kept, the other made square to it."""
     given = {"x": x, "y": y, "z": z}
     kept = given.pop(hold)
     name, other = next((k, v) for k, v in given.items() if v is not None)
@@ -67,7 +67,7 @@ def frame_of(
 
 def rotate(m: np.ndarray, v: np.ndarray) -> np.ndarray:
     """m v `(..., 3)`."""
-    return (m * v[..., None, :]).sum(-1)
+    return (m @ v[..., None])[..., 0]
 
 
 def arc(a: np.ndarray, b: np.ndarray) -> np.ndarray:
