@@ -181,7 +181,8 @@ def match_positions(
         if weight is not None:
             goal = now + torch.as_tensor(weight, dtype=rot.dtype).unsqueeze(-1) * (goal - now)
         goal = torch.where(goal.isfinite().all(-1, keepdim=True), goal, now)
-        bend, swing = _reach(*(pos[:, j] for j in limb), goal, quat[:, limb.root], soft)
+        hip, knee = pos[:, limb.root], pos[:, limb.mid]
+        bend, swing = _reach(hip, knee, now, goal, quat[:, limb.root], soft)
         _turn(skeleton, out, quat, limb, bend, swing)
     return normalize(out)
 
