@@ -26,7 +26,7 @@ MAX_KEYS = 4096
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
 _HEADER_BYTES = 1 << 16
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError)
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,7 @@ def require(data: Mapping[str, Any], keys: Sequence[str], path: Path, what: str)
         raise PoiseError(f"{what} needs the array{plural} {listed(missing)}", path, hint)
 
 
-def numeric(
-    data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path
-) -> np.ndarray:
+def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path) -> np.ndarray:
     """An array as float64 of the given shape; None allows any length."""
     where = f"{path}, array {shown(key)}"
     value = np.asarray(data[key])
@@ -167,6 +165,14 @@ def numeric(
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise PoiseError(f"it has the shape {value.shape}, not ({wanted})", where)
     return value.astype(np.float64)
+
+
+def one_number(data: Mapping[str, Any], key: str, path: Path) -> float:
+    """A finite number that stands alone, in an array of any number of axes."""
+    value = float(numeric({key: np.ravel(np.asarray(data[key]))}, key, (1,), path)[0])
+    if not np.isfinite(value):
+        raise PoiseError(f"it holds {value}, not a finite number", f"{path}, array {shown(key)}")
+    return value
 
 
 def text_of(value: Any, default: str = "") -> str:

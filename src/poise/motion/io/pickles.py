@@ -22,7 +22,7 @@ from poise.errors import PoiseError
 from poise.motion.io.arrays import MAX_ARRAY_BYTES, NPY_MAGIC, npy_header
 from poise.motion.io.text import CUT_OFF, check_file, shown
 
-ASK = "Read it with --allow-pickle (allow_pickle=True) if you trust where it comes from"
+ASK = "Read it with --allow-pickle (in Python: allow_pickle) if you want that; no code of its runs"
 """The hint of every refusal of a pickled file."""
 _MAX_STEPS = 5_000_000
 _CORE = ("numpy.core.", "numpy._core.")
@@ -93,9 +93,7 @@ def load_restricted(path: str | Path) -> dict[str, Any]:
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
-        raise PoiseError(
-            f"the pickle holds a {type(value).__name__}, not a dict of named arrays", path
-        )
+        raise PoiseError(f"the pickle holds a {type(value).__name__}, not a dict of named arrays", path)
     return value
 
 
@@ -310,14 +308,14 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "collections.OrderedDict": _made_dict,
 }
 
+_PUSHED = (
+    *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
+    *("STRING", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
+    *("BYTEARRAY8", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"),
+)
 _STEPS: dict[str, Callable[[_Machine, Any], None]] = {
     **dict.fromkeys(("PROTO", "FRAME"), _nothing),
-    **dict.fromkeys(
-        "INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING "
-        "BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 UNICODE BINUNICODE SHORT_BINUNICODE "
-        "BINUNICODE8".split(),
-        _push,
-    ),
+    **dict.fromkeys(_PUSHED, _push),
     "NONE": _const(None),
     "NEWTRUE": _const(True),
     "NEWFALSE": _const(False),
