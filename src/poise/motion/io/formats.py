@@ -12,6 +12,8 @@ from poise.motion.io.amc import read_amc
 from poise.motion.io.bvh_read import read_bvh
 from poise.motion.io.bvh_write import write_bvh
 from poise.motion.io.deepmimic import read_deepmimic
+from poise.motion.io.gltf_read import read_gltf
+from poise.motion.io.gltf_write import write_gltf
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.text import read_head, shown
 
@@ -48,6 +50,10 @@ def _looks_like_json(head: bytes) -> bool:
     return head[:1] == b"{" and (b'"Frames"' in head or b'"Loop"' in head)
 
 
+def _looks_like_gltf(head: bytes) -> bool:
+    return head[:4] == b"glTF" or (head[:1] == b"{" and b'"asset"' in head and b'"version"' in head)
+
+
 def _refuse_asf(path: Path, options: Options) -> Clip:
     raise PoiseError(
         "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
@@ -58,12 +64,12 @@ READERS = (
     Reader("BVH", (".bvh",), _looks_like_bvh, read_bvh),
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
+    Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
 )
-_READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json)"
+_READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), glTF (.glb, .gltf)"
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
-    (b"glTF", "glTF"),
     (b"\x93NUMPY", "NumPy"),
     (b"PK\x03\x04", "NumPy or zip"),
     (b"\x89HDF", "HDF5"),
@@ -74,8 +80,6 @@ _MAGIC = (
 _NOT_YET = {
     ".fbx": "FBX",
     ".c3d": "C3D",
-    ".glb": "glTF",
-    ".gltf": "glTF",
     ".pkl": "pickle",
     ".pickle": "pickle",
     ".npy": "NumPy",
@@ -97,6 +101,7 @@ def read_clip(
     fps: float | None = None,
     unit_m: float | None = None,
     up_axis: str | None = None,
+    take: str | None = None,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
 
@@ -106,12 +111,13 @@ def read_clip(
         skeleton: the ASF file of an AMC; by default the one beside it that bears its subject's name.
         fps, unit_m, up_axis: frames per second, metres per file unit and "Y" or "Z", stated
             instead of read or guessed.
+        take: which animation of a file that holds several, by name or number (glTF).
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     path = Path(path)
-    options = Options(None if skeleton is None else Path(skeleton), fps, unit_m, up_axis)
+    options = Options(None if skeleton is None else Path(skeleton), fps, unit_m, up_axis, take)
     check_options(options)
     reader = _reader_of(path)
     try:
@@ -142,11 +148,15 @@ def _reader_of(path: Path) -> Reader:
     raise PoiseError(f"{what} and its content belong to no known motion format", path, _READABLE)
 
 
-WRITERS: dict[str, Callable[[Clip, Path], None]] = {".bvh": write_bvh}
+WRITERS: dict[str, Callable[[Clip, Path], None]] = {
+    ".bvh": write_bvh,
+    ".glb": write_gltf,
+    ".gltf": write_gltf,
+}
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh`.
+    """Writes a clip in the format of the file's suffix; see `write_bvh` and `write_gltf`.
 
     Raises:
         PoiseError: an unknown suffix (the known ones are listed) or a folder that cannot be written.
