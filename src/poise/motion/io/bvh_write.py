@@ -202,7 +202,7 @@ def _rows(
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Writes a file (text as UTF-8) so that it appears whole or not at all: beside, then in its place."""
+    """Writes a file, text as UTF-8, whole or not at all: beside its place, then into it."""
     if path.is_dir():
         raise PoiseError("this is a folder; name a file to write", path)
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")

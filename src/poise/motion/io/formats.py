@@ -67,7 +67,10 @@ READERS = (
     Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
 )
-_READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), glTF (.glb, .gltf)"
+_READABLE = (
+    "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), "
+    "glTF (.glb, .gltf)"
+)
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
     (b"\x93NUMPY", "NumPy"),

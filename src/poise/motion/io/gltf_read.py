@@ -13,7 +13,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.info import body_height, sampled
 from poise.motion.io.gltf_file import GltfFile, load_gltf
-from poise.motion.io.gltf_tracks import Take, choose_take, clock
+from poise.motion.io.gltf_tracks import Take, choose_take, clock, number_of
 from poise.motion.io.gltf_tree import Tree, choose_joints, read_tree
 from poise.motion.io.guess import guess_unit, guess_up
 from poise.motion.io.raw import Options, RawMotion, assemble
@@ -123,7 +123,7 @@ def _raw_motion(
         rot=rot,
         fps=fps,
         channels=(),
-        frame_time=_number(own.get("frame_time")),
+        frame_time=number_of(own.get("frame_time")),
         unit_m=unit_m,
         up_axis="Y",
         travel_joint=None if travel is None else names[travel],
@@ -133,10 +133,6 @@ def _raw_motion(
         extra=(("gltf", json.dumps(kept)),),
         whole="fps" in own,
     )
-
-
-def _number(value: object) -> float | None:
-    return float(value) if type(value) is float and 0 < value < 1e3 else None
 
 
 def _channel(tree: Tree, take: Take, node: int, path: str, when: np.ndarray) -> np.ndarray:

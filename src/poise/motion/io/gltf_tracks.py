@@ -231,11 +231,11 @@ def clock(
     start, end = min(t[0] for t in inputs), max(t[-1] for t in inputs)
     if end <= start:
         raise PoiseError("the animation has a single key, which is no motion", file.path)
-    own = take.extras.get("fps")
+    own = number_of(take.extras.get("fps"))
     if fps is not None:
         rate = fps
-    elif type(own) in (int, float) and 0 < own < _FAST_HZ and _on_grid(list(inputs), start, 1.0 / own):
-        rate = float(own)
+    elif own is not None and own < _FAST_HZ and _on_grid(list(inputs), start, 1.0 / own):
+        rate = own
     else:
         rate = _guessed_rate(list(inputs), start, notes)
     count = int(np.floor((end - start) * rate * (1 + 1e-9) + 0.02)) + 1
@@ -253,6 +253,11 @@ def clock(
     )
     slack = _SAME_TIME / rate + 2 * float(np.spacing(np.float32(max(abs(start), abs(end)))))
     return np.where(np.abs(nearest - when) <= slack, nearest, when), rate
+
+
+def number_of(value: object) -> float | None:
+    """A number above 0 from `extras`, None for anything else there."""
+    return float(value) if isinstance(value, int | float) and 0 < value < MAX_VALUE else None
 
 
 def _spacings(inputs: list[np.ndarray]) -> np.ndarray:

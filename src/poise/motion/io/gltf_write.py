@@ -83,7 +83,7 @@ def _plan(clip: Clip) -> _Plan:
     rot = torch.tensor(quats_from_z_up(clip.rot, axis))
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
     offsets = vectors_from_z_up(skeleton.offsets, axis) / unit
-    above = [(n, *map(np.array, rest)) for n, *rest in kept.get("above", [])]
+    above = [(n, np.array(p), np.array(q), np.array(s)) for n, p, q, s in kept.get("above", [])]
     scale = np.array(kept.get("scale", np.ones(count)))
     base = base_of([(p, q, s) for _, p, q, s in above])
     paths = {0: root_pos}
