@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 _WAIST = 0.18
-_THICK_M = (0.012, 0.045)
+_THICK_M = (0.022, 0.05)
 _TIP_M = 0.12
 
 
@@ -55,7 +55,7 @@ def _octahedron(start: np.ndarray, end: np.ndarray, metre: float) -> np.ndarray:
     x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
     x /= np.linalg.norm(x)
     y = np.cross(z, x)
-    half = float(np.clip(0.12 * length, _THICK_M[0] * metre, _THICK_M[1] * metre))
+    half = min(float(np.clip(0.13 * length, _THICK_M[0] * metre, _THICK_M[1] * metre)), 0.45 * length)
     middle = start + _WAIST * way
     ring = [middle + half * v for v in (x, y, -x, -y)]
     out = []
