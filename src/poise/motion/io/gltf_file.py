@@ -6,8 +6,7 @@ import base64
 import binascii
 import json
 import struct
-import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
@@ -133,6 +132,8 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
 
 
 def _parse(text: bytes, path: Path) -> dict[str, Any]:
+    if text.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
+        raise PoiseError("this is no glTF: it starts with neither 'glTF' nor '{'", path)
     try:
         content = json.loads(text.removeprefix(b"\xef\xbb\xbf").decode("utf-8"))
     except UnicodeDecodeError:
@@ -169,7 +170,10 @@ def _check_parts(content: dict[str, Any], path: Path) -> list[str | None]:
             )
     for i, animation in enumerate(content["animations"]):
         for part in ("channels", "samplers"):
-            if len(animation.get(part) or ()) > MAX_OBJECTS:
+            held = animation.setdefault(part, [])
+            if not isinstance(held, list):
+                raise PoiseError(f"the {part} of animation {i} are no list", path)
+            if len(held) > MAX_OBJECTS:
                 raise PoiseError(f"animation {i} has more than {MAX_OBJECTS} {part}", path)
     uris = [buffer.pop("uri", None) for buffer in content["buffers"]]
     for i, uri in enumerate(uris):
@@ -179,15 +183,46 @@ def _check_parts(content: dict[str, Any], path: Path) -> list[str | None]:
 
 
 def _typed(content: dict[str, Any], path: Path) -> GLTF2:
-    from pygltflib import GLTF2
+    """The parts as pygltflib's dataclasses, filled here: its own decoder takes 0.5 ms per object."""
+    import pygltflib as gl
 
-    part = {key: content[key] for key in (*_PARTS, "asset")}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return GLTF2.from_json(json.dumps(part), infer_missing=True)
-    except (TypeError, ValueError, AttributeError, KeyError, RecursionError):
-        raise PoiseError("the document does not follow the glTF 2.0 specification", path) from None
+    inner: dict[type, dict[str, type]] = {
+        gl.Accessor: {"sparse": gl.Sparse},
+        gl.Sparse: {"indices": gl.AccessorSparseIndices, "values": gl.AccessorSparseValues},
+        gl.Animation: {"channels": gl.AnimationChannel, "samplers": gl.AnimationSampler},
+        gl.AnimationChannel: {"target": gl.AnimationChannelTarget},
+    }
+    kinds: dict[str, type] = {
+        "nodes": gl.Node,
+        "skins": gl.Skin,
+        "scenes": gl.Scene,
+        "animations": gl.Animation,
+        "accessors": gl.Accessor,
+        "bufferViews": gl.BufferView,
+        "buffers": gl.Buffer,
+    }
+    known = {kind: {f.name for f in fields(kind)} for kind in (*kinds.values(), *_values(inner))}
+
+    def built(kind: type, value: Any, what: str) -> Any:
+        if not isinstance(value, dict):
+            raise PoiseError(f"{what} is no object, as glTF demands", path)
+        out = kind(**{key: v for key, v in value.items() if key in known[kind]})
+        for key, part in inner.get(kind, {}).items():
+            held = value.get(key)
+            if isinstance(held, list):
+                setattr(out, key, [built(part, v, f"an entry of '{key}'") for v in held])
+            elif held is not None:
+                setattr(out, key, built(part, held, f"'{key}'"))
+        return out
+
+    doc = gl.GLTF2()
+    for part in _PARTS:
+        setattr(doc, part, [built(kinds[part], v, f"an entry of '{part}'") for v in content[part]])
+    return doc
+
+
+def _values(inner: dict[type, dict[str, type]]) -> list[type]:
+    return [kind for parts in inner.values() for kind in parts.values()]
 
 
 def _embedded(uri: str, index: int, path: Path) -> bytes:

@@ -79,8 +79,8 @@ def _raw_motion(
     index = {node: j for j, node in enumerate(joints)}
     parents = tuple(index.get(tree.parents[n], -1) if j else -1 for j, n in enumerate(joints))
     base = _base(above, place, turn, scale)
-    # Metres-like factor before each node's own scale: the product of all scales above it.
-    factor = {joints[0]: base.factor}
+    # The product of all scales above a node, without its own.
+    factor = {joints[0]: base.factor * _even(base.scale)}
     offsets = np.zeros((len(joints), 3))
     paths: dict[int, np.ndarray] = {}
     for j, node in enumerate(joints[1:], 1):

@@ -24,6 +24,8 @@ _MODES = ("LINEAR", "STEP", "CUBICSPLINE")
 _SLOW_HZ = 12.0
 _USUAL_HZ = 30.0
 _FAST_HZ = 1000.0
+# Keys off any grid are read at the next of these rates.
+_UNEVEN_HZ = (30.0, 60.0, 120.0, 240.0)
 # Rates that exporters write as float32 times; NTSC ones lie 0.1 % below the whole number.
 _RATE_SLACK = 2e-4
 _SAME_TIME = 1e-3
@@ -110,7 +112,7 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]
             raise PoiseError(
                 f"it has no animation {shown(wanted)}",
                 file.path,
-                f"Known: {listed((shown(n) for n in names), 20)}",
+                f"Known, by name or number: {listed((f'{i} {shown(n)}' for i, n in enumerate(names)), 20)}",
             )
         return _take(file, tree, picked[0], names[picked[0]])
     times: dict[int, np.ndarray] = {}
@@ -119,9 +121,9 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]
     if spans[best] < 0:
         raise PoiseError("no animation of the file moves or turns a node", file.path)
     if len(names) > 1:
-        others = listed((shown(n) for i, n in enumerate(names) if i != best), 6)
+        others = listed((f"{i} {shown(n)}" for i, n in enumerate(names) if i != best), 6)
         notes.append(
-            f"Of {len(names)} animations the longest, {shown(names[best])} ({spans[best]:.2f} s), was "
+            f"Of {len(names)} animations the longest, {best} {shown(names[best])} ({spans[best]:.2f} s), was "
             f"taken; the others are {others}"
         )
     return _take(file, tree, best, names[best])
@@ -294,6 +296,7 @@ def _guessed_rate(inputs: list[np.ndarray], start: float, notes: list[str]) -> f
         )
         return _USUAL_HZ
     if not _on_grid(inputs, start, 1.0 / rate):
+        rate = next((r for r in _UNEVEN_HZ if r >= rate * 0.99), rate)
         notes.append(f"The keys are not evenly spaced; they were read at {rate:.6g} frames per second")
     return rate
 
