@@ -102,6 +102,7 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]
     """The animation of that name or number (from 0), or else the longest that moves nodes."""
     animations = file.doc.animations
     names = [str(a.name or f"animation {i}") for i, a in enumerate(animations)]
+    numbered = [f"{i} {shown(name)}" for i, name in enumerate(names)]
     if not animations:
         raise PoiseError("the file holds no animation", file.path, "Export it with its animation")
     if wanted is not None:
@@ -112,7 +113,7 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]
             raise PoiseError(
                 f"it has no animation {shown(wanted)}",
                 file.path,
-                f"Known, by name or number: {listed((f'{i} {shown(n)}' for i, n in enumerate(names)), 20)}",
+                f"Known, by number or name: {listed(numbered, 20)}",
             )
         return _take(file, tree, picked[0], names[picked[0]])
     times: dict[int, np.ndarray] = {}
@@ -121,9 +122,9 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]
     if spans[best] < 0:
         raise PoiseError("no animation of the file moves or turns a node", file.path)
     if len(names) > 1:
-        others = listed((f"{i} {shown(n)}" for i, n in enumerate(names) if i != best), 6)
+        others = listed((n for i, n in enumerate(numbered) if i != best), 6)
         notes.append(
-            f"Of {len(names)} animations the longest, {best} {shown(names[best])} ({spans[best]:.2f} s), was "
+            f"Of {len(names)} animations the longest, {numbered[best]} ({spans[best]:.2f} s), was "
             f"taken; the others are {others}"
         )
     return _take(file, tree, best, names[best])
