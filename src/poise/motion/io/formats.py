@@ -12,6 +12,8 @@ from poise.motion.io.amc import read_amc
 from poise.motion.io.bvh_read import read_bvh
 from poise.motion.io.bvh_write import write_bvh
 from poise.motion.io.deepmimic import read_deepmimic
+from poise.motion.io.gltf_read import read_gltf
+from poise.motion.io.gltf_write import write_gltf
 from poise.motion.io.motion_csv import looks_like_csv, read_csv, write_csv
 from poise.motion.io.numpy_files import (
     looks_like_npz,
@@ -61,6 +63,10 @@ def _looks_like_json(head: bytes) -> bool:
     return head[:1] == b"{" and (b'"Frames"' in head or b'"Loop"' in head)
 
 
+def _looks_like_gltf(head: bytes) -> bool:
+    return head[:4] == b"glTF" or (head[:1] == b"{" and b'"asset"' in head and b'"version"' in head)
+
+
 def _refuse_asf(path: Path, options: Options) -> Clip:
     raise PoiseError(
         "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
@@ -71,6 +77,7 @@ READERS = (
     Reader("BVH", (".bvh",), _looks_like_bvh, read_bvh),
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
+    Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL or Poise", (".npz",), looks_like_npz, read_npz),
     Reader("pickled SMPL or poselib", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
@@ -82,15 +89,12 @@ READABLE = "Formats that can be read: " + ", ".join(
 )
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
-    (b"glTF", "glTF"),
     (b"PK\x03\x04", "zip"),
     (b"\x89HDF", "HDF5"),
 )
 _NOT_YET = {
     ".fbx": "FBX",
     ".c3d": "C3D",
-    ".glb": "glTF",
-    ".gltf": "glTF",
     ".trc": "TRC",
     ".mot": "OpenSim",
     ".h5": "HDF5",
@@ -108,6 +112,7 @@ def read_clip(
     unit_m: float | None = None,
     up_axis: str | None = None,
     allow_pickle: bool = False,
+    take: str | None = None,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
 
@@ -119,13 +124,14 @@ def read_clip(
             instead of read or guessed.
         allow_pickle: reads pickled files too (AIST++, poselib); what they hold is rebuilt as plain
             arrays, and no code of theirs runs.
+        take: which animation of a file that holds several, by name or number (glTF).
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
-    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle)
+    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take)
     check_options(options)
     reader = _reader_of(path)
     try:
@@ -160,11 +166,13 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
     ".bvh": write_bvh,
     ".npz": write_npz,
     ".csv": write_csv,
+    ".glb": write_gltf,
+    ".gltf": write_gltf,
 }
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_csv`.
+    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_csv`, `write_gltf`.
 
     `.npz`: a clip that came from the SMPL family is written with the keys of AMASS, any other as
     Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the one or the other.

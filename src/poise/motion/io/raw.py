@@ -33,6 +33,7 @@ class Options:
     unit_m: float | None = None
     up_axis: str | None = None
     allow_pickle: bool = False
+    take: str | None = None
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class RawMotion:
     unit_m, up_axis: what the format itself states, None where it states nothing.
     unit_hint: a unit the file suggests, checked with the person's height.
     strays: `(joint, largest distance)` of position channels that did not stay constant.
+    whole: frame 0 belongs to the motion for certain, so no rest pose is sought there.
     """
 
     format: str
@@ -64,6 +66,7 @@ class RawMotion:
     notes: tuple[str, ...] = ()
     strays: tuple[tuple[str, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
+    whole: bool = False
 
 
 def vectors_to_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
@@ -151,7 +154,7 @@ def _check(raw: RawMotion) -> None:
 
 
 def _drop_rest_frame(raw: RawMotion, notes: list[str]) -> RawMotion:
-    note = None if raw.format == "deepmimic" else inserted_rest_frame(raw.rot)
+    note = None if raw.whole or raw.format == "deepmimic" else inserted_rest_frame(raw.rot)
     if note is None:
         return raw
     notes.append(note)
