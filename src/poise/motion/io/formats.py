@@ -14,6 +14,7 @@ from poise.motion.io.bvh_write import write_bvh
 from poise.motion.io.deepmimic import read_deepmimic
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.text import read_head, shown
+from poise.motion.io.trc import looks_like_trc, read_trc
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,12 @@ READERS = (
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
+    Reader("TRC keypoints", (".trc",), looks_like_trc, read_trc),
 )
-_READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json)"
+_READABLE = (
+    "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), "
+    "keypoints (.trc)"
+)
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
     (b"glTF", "glTF"),
@@ -80,7 +85,6 @@ _NOT_YET = {
     ".pickle": "pickle",
     ".npy": "NumPy",
     ".npz": "NumPy",
-    ".trc": "TRC",
     ".mot": "OpenSim",
     ".csv": "CSV",
     ".h5": "HDF5",
