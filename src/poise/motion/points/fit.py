@@ -120,5 +120,6 @@ def _misfit_note(distances: dict[str, np.ndarray]) -> str:
     worst = sorted(means, key=lambda j: -means[j])[:3]
     return (
         f"A skeleton of rigid bones was fitted: its joints lie "
-        f"{np.mean(list(means.values())):.1f} mm from the keypoints on average (most: {listed(f'{j} {means[j]:.0f} mm' for j in worst)})"
+        f"{np.mean(list(means.values())):.1f} mm from the keypoints on average (most: "
+        f"{listed(f'{j} {means[j]:.0f} mm' for j in worst)})"
     )

@@ -11,7 +11,7 @@ from poise.motion.io.text import listed
 from poise.motion.keypoints import Keypoints
 from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
 from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels
-from poise.motion.points.markers import find_markers
+from poise.motion.points.markers import marker_places
 
 # What a place is filled relative to, so that a hidden wrist travels with its elbow.
 _CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
@@ -41,7 +41,7 @@ def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
     """
     found = find_places(points.names)
     tracks = {place: points.positions[:, list(k)].mean(1) for place, k in found.items()}
-    marked, notes = find_markers(points, tracks)
+    marked, notes = marker_places(points.names, points.positions, tracks)
     # Joints that are named outright win over estimates from surface markers.
     tracks = {**marked, **tracks}
     lost = [place for place in NEEDED if place not in tracks]
