@@ -152,9 +152,7 @@ def require(data: Mapping[str, Any], keys: Sequence[str], path: Path, what: str)
         raise PoiseError(f"{what} needs the array{plural} {listed(missing)}", path, hint)
 
 
-def numeric(
-    data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path
-) -> np.ndarray:
+def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path) -> np.ndarray:
     """An array as float64 of the given shape; None allows any length."""
     where = f"{path}, array {shown(key)}"
     value = np.asarray(data[key])

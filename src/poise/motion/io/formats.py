@@ -11,7 +11,16 @@ from poise.motion.clip import Clip
 from poise.motion.io.amc import read_amc
 from poise.motion.io.bvh_read import read_bvh
 from poise.motion.io.bvh_write import write_bvh
+from poise.motion.io.c3d import looks_like_c3d, read_c3d
 from poise.motion.io.deepmimic import read_deepmimic
+from poise.motion.io.points_csv import looks_like_points_csv, read_points_csv
+from poise.motion.io.points_refused import (
+    looks_like_openpose,
+    looks_like_opensim,
+    refuse_folder,
+    refuse_openpose,
+    refuse_opensim,
+)
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.text import read_head, shown
 from poise.motion.io.trc import looks_like_trc, read_trc
@@ -61,10 +70,14 @@ READERS = (
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("TRC keypoints", (".trc",), looks_like_trc, read_trc),
+    Reader("C3D markers", (".c3d",), looks_like_c3d, read_c3d),
+    Reader("OpenPose", (), looks_like_openpose, refuse_openpose),
+    Reader("OpenSim", (".mot", ".sto"), looks_like_opensim, refuse_opensim),
+    Reader("CSV keypoints", (), looks_like_points_csv, read_points_csv),
 )
 _READABLE = (
     "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), "
-    "keypoints (.trc)"
+    "keypoints (.trc, .c3d, .csv)"
 )
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
@@ -78,14 +91,12 @@ _MAGIC = (
 )
 _NOT_YET = {
     ".fbx": "FBX",
-    ".c3d": "C3D",
     ".glb": "glTF",
     ".gltf": "glTF",
     ".pkl": "pickle",
     ".pickle": "pickle",
     ".npy": "NumPy",
     ".npz": "NumPy",
-    ".mot": "OpenSim",
     ".csv": "CSV",
     ".h5": "HDF5",
     ".usd": "USD",
@@ -130,6 +141,8 @@ def read_clip(
 
 
 def _reader_of(path: Path) -> Reader:
+    if path.is_dir():
+        refuse_folder(path)
     head = read_head(path)
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     for reader in READERS:

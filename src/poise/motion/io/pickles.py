@@ -93,9 +93,7 @@ def load_restricted(path: str | Path) -> dict[str, Any]:
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
-        raise PoiseError(
-            f"the pickle holds a {type(value).__name__}, not a dict of named arrays", path
-        )
+        raise PoiseError(f"the pickle holds a {type(value).__name__}, not a dict of named arrays", path)
     return value
 
 

@@ -19,6 +19,9 @@ from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
 from poise.motion.skeleton import Source
 
+FLAT_HINT = "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file"
+"""What to do with 2D keypoints."""
+
 
 @dataclass(frozen=True)
 class RawPoints:
@@ -108,7 +111,7 @@ def _check(raw: RawPoints) -> None:
         raise PoiseError(
             f"the keypoints are flat: {' and '.join(flat)} never changes, as in the 2D of a camera",
             raw.path,
-            "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file",
+            FLAT_HINT,
         )
 
 

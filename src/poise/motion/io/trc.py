@@ -9,12 +9,12 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
+from poise.motion.io.cells import row_numbers
 from poise.motion.io.points import RawPoints, points_clip
 from poise.motion.io.raw import Options
 from poise.motion.io.text import CUT_OFF, at_line, decode, number, read_bytes, shown
 
 UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-_MISSING = {"", "nan", "-nan", "nan(ind)", "-nan(ind)", "na", "null"}
 _LABEL_LINE = 3
 
 
@@ -23,6 +23,10 @@ class _Header:
     fields: dict[str, str]
     names: tuple[str, ...]
     first: int
+
+    def column(self, k: int) -> str:
+        """The name of column `k`, for errors."""
+        return ("Frame#", "Time")[k] if k < 2 else f"{self.names[(k - 2) // 3]} {'XYZ'[(k - 2) % 3]}"
 
 
 def looks_like_trc(head: bytes) -> bool:
@@ -126,28 +130,10 @@ def _rows(lines: list[str], header: _Header, path: Path) -> np.ndarray:
                 at_line(path, i + 1),
             )
         cells += [""] * (width - len(cells))
-        out.append(_numbers(cells, header, path, i + 1))
+        out.append(row_numbers(cells, header.column, path, i + 1))
     if not out:
         raise PoiseError("the file has a header and no frames", path, CUT_OFF)
     return np.array(out)
-
-
-def _numbers(cells: list[str], header: _Header, path: Path, line: int) -> list[float]:
-    try:
-        if "_" not in "".join(cells):
-            values = [float(c) if c.strip() else np.nan for c in cells]
-            if all(abs(v) <= 1e8 or v != v for v in values):
-                return values
-    except ValueError:
-        pass
-    out = []
-    for k, cell in enumerate(cells):
-        if cell.strip().lower() in _MISSING:
-            out.append(np.nan)
-            continue
-        column = ("Frame#", "Time")[k] if k < 2 else f"{header.names[(k - 2) // 3]} {'XYZ'[(k - 2) % 3]}"
-        out.append(number(cell.strip(), f"{at_line(path, line)}, column {k + 1} ({column})"))
-    return out
 
 
 def _rate(header: _Header, times: np.ndarray, path: Path, notes: list[str]) -> float:

@@ -92,6 +92,7 @@ MARKER_CORES = (
     *("kneestudy", "mkneestudy", "anklestudy", "manklestudy", "toestudy", "5metastudy", "calcstudy"),
     *("shoulderstudy", "hjcstudy", "lelbowstudy", "melbowstudy", "lwriststudy", "mwriststudy"),
 )
+_MIDDLE_MARKERS = {"c7", "clav", "strn", "t10", "sacr", "sacrum"}
 _CORES = frozenset(core for cores in _SIDED.values() for core in cores) | frozenset(MARKER_CORES)
 
 
@@ -102,6 +103,14 @@ def known_labels() -> tuple[str, ...]:
         *("Heel", "BigToe", "Toe", "Ear", "Eye"),
     )
     return (*(f"{s}{core}" for core in sided for s in "LR"), "MidHip", "Neck", "Head", "Nose")
+
+
+def unknown_labels(labels: Sequence[str]) -> list[str]:
+    """The labels that tell no place of a body."""
+    known = _CORES | {core for cores in _MIDDLE.values() for core in cores} | _MIDDLE_MARKERS
+    split = [split_label(label)[1] for label in labels]
+    return [n for n, core in zip(labels, split, strict=True)
+            if core not in known and not _SPINE.fullmatch(core)]  # fmt: skip
 
 
 def find_places(labels: Sequence[str]) -> Found:

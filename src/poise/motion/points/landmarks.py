@@ -10,7 +10,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.io.text import listed
 from poise.motion.keypoints import Keypoints
 from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
-from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels
+from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels, unknown_labels
 from poise.motion.points.markers import marker_places
 
 # What a place is filled relative to, so that a hidden wrist travels with its elbow.
@@ -85,6 +85,12 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         points = points.replaced(positions=cleaned)
     tracks, found = places_of(points)
     notes += found
+    unknown = unknown_labels(points.names)
+    if unknown:
+        notes.append(
+            f"{len(unknown)} of {len(points.names)} labels tell no place of a body and were left out "
+            f"({listed(unknown, 5)})"
+        )
     tracks = _without_rare(tracks, notes)
     missing = np.stack([np.isnan(tracks[place][:, 0]) for place in NEEDED], -1)
     start, stop = longest_stretch(missing, max(0, round(max_gap_s * points.fps)))

@@ -20,6 +20,7 @@ TITLE = {"left": "Left", "right": "Right"}
 # Shares for what keypoints do not show. Spine joints along the line from hips to neck; the neck above
 # the shoulders in trunk lengths; the collar's inner end in half shoulder widths; the ball of the foot
 # along it.
+_SPINE_GAP = 0.2
 _SPINE_SHARES, _NECK_SHARE, _COLLAR_SHARE, _BALL_SHARE = (0.25, 0.55), 0.08, 0.2, 0.72
 # Shares of the standing height: leg from hip to ankle; neck to head joint; ball of the foot below the
 # ankle.
@@ -77,11 +78,18 @@ def trunk_tracks(tracks: dict[str, Tensor], notes: list[str]) -> tuple[dict[str,
         if 0.03 < share[place] < 0.93 and (not spine or share[place] - share[spine[-1]] > 0.03):
             out[place] = tracks[place]
             spine.append(place)
-    if not spine:
-        made.append("spine")
-        for i, s in enumerate(_SPINE_SHARES):
-            spine.append(f"spine {i}")
-            out[spine[-1]] = out["pelvis"] + s * line
+    seen, top = len(spine), share[spine[-1]] if spine else 0.0
+    for made_share in _SPINE_SHARES:
+        if made_share > top + _SPINE_GAP:
+            # Between what is seen below and the neck, so that a seen pelvis bends against the rest.
+            below = out[spine[-1]] if spine else out["pelvis"]
+            out[f"spine at {made_share}"] = below + (made_share - top) / (1 - top) * (
+                out["neck"] - below
+            )
+            spine.append(f"spine at {made_share}")
+            top = made_share
+    if len(spine) > seen:
+        made.append("upper spine" if seen else "spine")
     if "head" not in out:
         out["head"] = _head(out)
         made.append("head joint")
