@@ -1,5 +1,6 @@
 """Rotations and rigid transforms: torch, quaternions wxyz, any leading batch dimensions."""
 
+from poise.spatial.directions import across, cluster_quat, frame_quat, rejected, shortest_arc
 from poise.spatial.rotations import (
     axis_angle_to_quat,
     euler_to_quat,
@@ -25,9 +26,12 @@ from poise.spatial.rotations import (
 from poise.spatial.tree import forward_kinematics
 
 __all__ = [
+    "across",
     "axis_angle_to_quat",
+    "cluster_quat",
     "euler_to_quat",
     "forward_kinematics",
+    "frame_quat",
     "heading_quat",
     "into_heading",
     "matrix_to_quat",
@@ -43,7 +47,9 @@ __all__ = [
     "quat_to_matrix",
     "quat_to_rotvec",
     "quat_to_sixd",
+    "rejected",
     "rotvec_to_quat",
+    "shortest_arc",
     "slerp",
     "unwrap_quats",
 ]

@@ -11,6 +11,7 @@ from poise.motion.clip import Clip
 from poise.motion.io.amc import read_amc
 from poise.motion.io.bvh_read import read_bvh
 from poise.motion.io.bvh_write import write_bvh
+from poise.motion.io.c3d import looks_like_c3d, read_c3d
 from poise.motion.io.deepmimic import read_deepmimic
 from poise.motion.io.gltf_read import read_gltf
 from poise.motion.io.gltf_write import write_gltf
@@ -22,9 +23,18 @@ from poise.motion.io.numpy_files import (
     read_pickled,
     write_npz,
 )
+from poise.motion.io.points_csv import looks_like_points_csv, read_points_csv
+from poise.motion.io.points_refused import (
+    looks_like_openpose,
+    looks_like_opensim,
+    refuse_folder,
+    refuse_openpose,
+    refuse_opensim,
+)
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
+from poise.motion.io.trc import looks_like_trc, read_trc
 
 
 @dataclass(frozen=True)
@@ -82,10 +92,17 @@ READERS = (
     Reader("npz of AMASS, SMPL or Poise", (".npz",), looks_like_npz, read_npz),
     Reader("pickled SMPL or poselib", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
     Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
+    Reader("TRC keypoints", (".trc",), looks_like_trc, read_trc),
+    Reader("C3D markers", (".c3d",), looks_like_c3d, read_c3d),
+    Reader("OpenPose", (), looks_like_openpose, refuse_openpose),
+    Reader("OpenSim", (".mot", ".sto"), looks_like_opensim, refuse_opensim),
+    Reader("CSV keypoints", (), looks_like_points_csv, read_points_csv),
     Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
 )
+#: Readers that only say what to give instead.
+_REFUSERS = ("ASF", "robot", "OpenPose", "OpenSim")
 READABLE = "Formats that can be read: " + ", ".join(
-    f"{r.name} ({', '.join(r.suffixes)})" for r in READERS if r.name not in ("ASF", "robot")
+    f"{r.name} ({', '.join(r.suffixes)})" for r in READERS if r.name not in _REFUSERS
 )
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
@@ -94,9 +111,6 @@ _MAGIC = (
 )
 _NOT_YET = {
     ".fbx": "FBX",
-    ".c3d": "C3D",
-    ".trc": "TRC",
-    ".mot": "OpenSim",
     ".h5": "HDF5",
     ".usd": "USD",
     ".usda": "USD",
@@ -146,6 +160,8 @@ def read_clip(
 
 
 def _reader_of(path: Path) -> Reader:
+    if path.is_dir():
+        refuse_folder(path)
     head = read_head(path)
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     for reader in READERS:

@@ -1,0 +1,176 @@
+"""Keypoints as a file holds them, and their way into metres and Z up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.motion.info import body_height, landmarks, sampled
+from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
+from poise.motion.io.raw import Options, vectors_to_z_up
+from poise.motion.io.text import MAX_JOINTS, MAX_VALUE
+from poise.motion.keypoints import Keypoints
+from poise.motion.points import FitConfig, fit_clip
+from poise.motion.points.labels import NEEDED, SIDES
+from poise.motion.points.landmarks import places_of
+from poise.motion.skeleton import Source
+
+FLAT_HINT = "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file"
+"""What to do with 2D keypoints."""
+
+
+@dataclass(frozen=True)
+class RawPoints:
+    """Named points in their file's own unit and axes.
+
+    positions: `(T, K, 3)`, NaN where missing. unit_m, up_axis: what the file states, None where it
+    states nothing. confidence: `(T, K)` or None.
+    """
+
+    format: str
+    path: Path
+    names: tuple[str, ...]
+    positions: np.ndarray
+    fps: float
+    unit_m: float | None = None
+    up_axis: str | None = None
+    confidence: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+
+# The places whose bones make up a body's height, as the guesses know their names.
+_TREE = {"hips": None, "neck": "hips", "head": "neck"}
+_TREE |= {f"{s} {part}": above for s in SIDES for part, above in (("hip", "hips"),)}
+_TREE |= {f"{s} knee": f"{s} hip" for s in SIDES} | {f"{s} ankle": f"{s} knee" for s in SIDES}
+
+
+def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
+    """Keypoints in metres, Z up, with every guess in the source's notes.
+
+    Unit and vertical are guessed as for skeletons (`guess.py`), from the places of a body that the
+    labels name. Points that stand on their head (Y down, as cameras have it) are turned over.
+
+    Raises:
+        PoiseError: too few frames, flat (2D) points, a person of no human size.
+    """
+    _check(raw)
+    probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, _of(raw))
+    bones = _body(probe)
+    notes = list(raw.notes)
+    up, unit = _up(bones, options, raw), _unit(bones, options, raw)
+    notes += [guess.note for guess in (up, unit) if guess.note]
+    axis, scale = str(up.value), float(unit.value)
+    positions = vectors_to_z_up(probe.positions, axis) * scale
+    if _upside_down(bones, axis):
+        # Half a turn about X keeps left and right, which a mirror would not.
+        positions = positions * (1.0, -1.0, -1.0)
+        notes.append(f"The heads lie below the feet along {axis}: the points were turned over")
+    return Keypoints(
+        raw.names,
+        positions,
+        float(options.fps or raw.fps),
+        raw.path.stem,
+        raw.confidence,
+        Source(
+            format=raw.format, path=str(raw.path), unit_m=scale, up_axis=axis, notes=tuple(notes),
+            frame_time=1.0 / raw.fps,
+        ),
+    )  # fmt: skip
+
+
+def points_clip(raw: RawPoints, options: Options) -> Clip:
+    """The clip of a skeleton that follows the file's keypoints, see `fit_clip`."""
+    return fit_clip(assemble_points(raw, options), FitConfig())
+
+
+def _of(raw: RawPoints) -> Source:
+    return Source(format=raw.format, path=str(raw.path))
+
+
+def _check(raw: RawPoints) -> None:
+    frames = len(raw.positions)
+    if len(raw.names) > MAX_JOINTS:
+        raise PoiseError(
+            f"it has {len(raw.names)} keypoints, more than the {MAX_JOINTS} allowed", raw.path
+        )
+    if frames < 2:
+        raise PoiseError(
+            f"it has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2", raw.path
+        )
+    known = raw.positions[~np.isnan(raw.positions).any(-1)]
+    if not len(known):
+        raise PoiseError("every keypoint is missing in every frame", raw.path)
+    if np.abs(known).max() > MAX_VALUE:
+        raise PoiseError(f"it holds coordinates above {MAX_VALUE:g}, no place of a person", raw.path)
+    flat = [c for c, width in zip("XYZ", np.ptp(known, axis=0), strict=True) if width == 0]
+    if flat:
+        raise PoiseError(
+            f"the keypoints are flat: {' and '.join(flat)} never changes, as in the 2D of a camera",
+            raw.path,
+            FLAT_HINT,
+        )
+
+
+def _body(points: Keypoints) -> tuple[list[str], list[int], np.ndarray]:
+    """Names, parents and sampled positions `(S, P, 3)` of the places that tell a body's size."""
+    tracks, _ = places_of(points)
+    seen = ~np.isnan(np.stack([tracks[p][:, 0] for p in NEEDED], -1)).any(-1)
+    frames = np.flatnonzero(seen)
+    if not len(frames):
+        raise PoiseError(
+            "in no frame are all hips, knees, ankles, shoulders, elbows and wrists seen",
+            points.source.path,
+        )
+    at = frames[sampled(len(frames))]
+    tracks = {p.replace("_", " "): t[at] for p, t in tracks.items()}
+    hips = (tracks["left hip"] + tracks["right hip"]) / 2
+    neck = (tracks["left shoulder"] + tracks["right shoulder"]) / 2
+    places = {**tracks, "hips": hips, "neck": neck}
+    if "head" not in places or np.isnan(places["head"]).any():
+        places.pop("head", None)
+    names = [n for n in _TREE if n in places]
+    parents = [-1 if (up := _TREE[n]) is None else names.index(up) for n in names]
+    return names, parents, np.stack([places[n] for n in names], 1)
+
+
+def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
+    """`(P, 3)` with the median length of each bone."""
+    out = np.zeros((len(parents), 3))
+    for j, parent in enumerate(parents):
+        if parent >= 0:
+            out[j, 0] = np.median(np.linalg.norm(pos[:, j] - pos[:, parent], axis=-1))
+    return out
+
+
+def _unit(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw: RawPoints) -> Guess:
+    names, parents, pos = bones
+    height, how = body_height(names, parents, _offsets(parents, pos), pos)
+    if not height > 0:
+        raise PoiseError("all keypoints lie in one place", raw.path)
+    if options.unit_m is not None:
+        return stated_unit(height, options.unit_m, raw.path)
+    if raw.unit_m is not None:
+        # A stated unit that makes a giant or a doll is a mistake of the file; the sentence tells.
+        return stated_unit(height, raw.unit_m, raw.path)
+    return guess_unit(height, how, None, raw.path)
+
+
+def _up(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw: RawPoints) -> Guess:
+    names, _, pos = bones
+    if options.up_axis is not None:
+        return Guess(options.up_axis.upper())
+    if raw.up_axis is not None:
+        return Guess(raw.up_axis)
+    return guess_up(names, pos, np.median(pos - pos[:, :1], axis=0))
+
+
+def _upside_down(bones: tuple[list[str], list[int], np.ndarray], axis: str) -> bool:
+    """Whether the neck is below the ankles in most frames."""
+    names, _, pos = bones
+    _, necks, ankles = landmarks(names)
+    height = pos[:, necks[0]] - pos[:, ankles].mean(1)
+    return bool(np.median(height[:, "XYZ".index(axis)]) < 0)

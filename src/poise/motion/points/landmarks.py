@@ -1,0 +1,158 @@
+"""From labelled keypoints to complete tracks of the places of a body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from poise.errors import PoiseError, did_you_mean
+from poise.motion.io.text import listed
+from poise.motion.keypoints import Keypoints
+from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
+from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels, unknown_labels
+from poise.motion.points.markers import marker_places
+
+# What a place is filled relative to, so that a hidden wrist travels with its elbow.
+_CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
+_CARRIER |= {"elbow": "shoulder", "wrist": "elbow", "hand": "wrist"}
+_LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Complete tracks of the places of one body; m, Z up.
+
+    tracks: place -> `(T, 3)`, no NaN. seen: place -> `(T,)`, where it was measured and not filled.
+    first: the frame of the recording that is frame 0 here. notes: one sentence per repair.
+    """
+
+    tracks: dict[str, np.ndarray]
+    seen: dict[str, np.ndarray]
+    first: int
+    notes: tuple[str, ...]
+
+
+def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Tracks `(T, 3)` of all places that labels or markers give (NaN where missing), and notes.
+
+    Raises:
+        PoiseError: a needed place has no keypoint, or a keypoint that is never seen.
+    """
+    found = find_places(points.names)
+    tracks = {place: points.positions[:, list(k)].mean(1) for place, k in found.items()}
+    marked, notes = marker_places(points.names, points.positions, tracks)
+    # Joints that are named outright win over estimates from surface markers.
+    tracks = {**marked, **tracks}
+    lost = [place for place in NEEDED if place not in tracks]
+    if lost:
+        raise _lacking(points, lost)
+    for place in NEEDED:
+        if np.isnan(tracks[place][:, 0]).all():
+            label = _label_of(points, found, place)
+            raise PoiseError(
+                f"{label} is missing in every frame, and the body needs it",
+                points.source.path or points.name,
+            )
+    return tracks, notes
+
+
+def _label_of(points: Keypoints, found: dict[str, tuple[int, ...]], place: str) -> str:
+    if place in found:
+        return f"keypoint '{points.names[found[place][0]]}'"
+    return f"the {place.replace('_', ' ')}"
+
+
+def _lacking(points: Keypoints, lost: list[str]) -> PoiseError:
+    """Which places have no keypoint, what the file has, and which label may have been meant."""
+    places = listed((place.replace("_", " ") for place in lost), 12)
+    guess = did_you_mean(lost[0].replace("_", " "), list(points.names))
+    hint = guess.split("Known:")[0] + f"The keypoints are {listed(points.names, 12)}; labels like "
+    hint += f"{listed(known_labels(), 6)} or the joint names of BVH, SMPL and COCO are understood"
+    return PoiseError(f"no keypoint is the {places}", points.source.path or points.name, hint)
+
+
+def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float | None) -> Landmarks:
+    """All places of the body without spikes and gaps.
+
+    Gaps are interpolated in the place of the joint above (wrist from elbow). The recording is cut to its
+    longest stretch in which no needed place is missing for longer than `max_gap_s`.
+    """
+    notes: list[str] = []
+    if spikes:
+        cleaned, jumps = drop_spikes(points.positions, points.fps)
+        notes += spike_note(points.names, jumps)
+        points = points.replaced(positions=cleaned)
+    tracks, found = places_of(points)
+    notes += found
+    unknown = unknown_labels(points.names)
+    if unknown:
+        notes.append(
+            f"{len(unknown)} of {len(points.names)} labels tell no place of a body and were left out "
+            f"({listed(unknown, 5)})"
+        )
+    tracks = _without_rare(tracks, notes)
+    missing = np.stack([np.isnan(tracks[place][:, 0]) for place in NEEDED], -1)
+    start, stop = longest_stretch(missing, max(0, round(max_gap_s * points.fps)))
+    if stop - start < 2:
+        worst = NEEDED[int(missing.sum(0).argmax())].replace("_", " ")
+        raise PoiseError(
+            f"no two frames in a row have all needed keypoints (the {worst} is missing most often)",
+            points.source.path or points.name,
+        )
+    if stop - start < points.frames:
+        notes.append(
+            f"Only frames {start} to {stop - 1} of {points.frames} were kept: outside, "
+            f"{_lost(missing, start, stop)} missing for longer than {max_gap_s:g} s or up to an end"
+        )
+    tracks = {place: track[start:stop] for place, track in tracks.items()}
+    seen = {place: ~np.isnan(track[:, 0]) for place, track in tracks.items()}
+    gaps = [(int((~s).sum()), place) for place, s in seen.items() if not s.all()]
+    if gaps:
+        worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
+        notes.append(f"Missing samples were interpolated: {worst} (frames)")
+    tracks = _filled(tracks)
+    if smooth_hz is not None:
+        tracks = {place: smooth(track, points.fps, smooth_hz) for place, track in tracks.items()}
+        notes.append(
+            f"The keypoints were smoothed by a zero-phase Gaussian low-pass at {smooth_hz:g} Hz"
+        )
+    return Landmarks(tracks, seen, start, tuple(notes))
+
+
+def _lost(missing: np.ndarray, start: int, stop: int) -> str:
+    outside = missing.copy()
+    outside[start:stop] = False
+    places = [NEEDED[k].replace("_", " ") for k in np.flatnonzero(outside.any(0))]
+    return f"the {listed(places, 4)} {'is' if len(places) == 1 else 'are'}"
+
+
+def _without_rare(tracks: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
+    """Drops places that the body can do without and that are seen in less than half of the frames."""
+    rare = [
+        place
+        for place, track in tracks.items()
+        if place not in NEEDED and (~np.isnan(track[:, 0])).mean() < _LEAST_SHARE
+    ]
+    if rare:
+        names = listed((place.replace("_", " ") for place in rare), 6)
+        notes.append(f"Seen in less than half of the frames and left out: {names}")
+    return {place: track for place, track in tracks.items() if place not in rare}
+
+
+def _filled(tracks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """All gaps interpolated: hips in the world, everything else as seen from its carrier."""
+    out = {f"{side}_hip": fill(tracks[f"{side}_hip"]) for side in SIDES}
+    hips = (out["left_hip"] + out["right_hip"]) / 2
+    out |= {f"{side}_shoulder": hips + fill(tracks[f"{side}_shoulder"] - hips) for side in SIDES}
+    chest = (out["left_shoulder"] + out["right_shoulder"]) / 2
+    for part, carrier in _CARRIER.items():
+        for side in SIDES:
+            place, above = f"{side}_{part}", f"{side}_{carrier}"
+            if place in tracks:
+                out[place] = out[above] + fill(tracks[place] - out[above])
+    for place, track in tracks.items():
+        if place not in out:
+            base = hips if place == "pelvis" or place.startswith("spine") else chest
+            out[place] = base + fill(track - base)
+    return out

@@ -1,0 +1,63 @@
+"""Rotations from directions: shortest arcs, frames of two axes, the best turn of a cluster of points."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from poise.spatial.rotations import matrix_to_quat, normalize
+
+
+def across(v: Tensor) -> Tensor:
+    """Some unit vector `(..., 3)` square to `v (..., 3)`."""
+    # The world axis along which v is smallest is never parallel to it.
+    least = v.abs().argmin(-1)
+    return normalize(torch.linalg.cross(v, torch.eye(3, dtype=v.dtype, device=v.device)[least]))
+
+
+def rejected(v: Tensor, axis: Tensor) -> Tensor:
+    """The part of `v (..., 3)` square to the unit vectors `axis (..., 3)`."""
+    return v - (v * axis).sum(-1, keepdim=True) * axis
+
+
+def shortest_arc(a: Tensor, b: Tensor) -> Tensor:
+    """wxyz `(..., 4)` of the smallest turn that brings direction `a (..., 3)` onto `b`.
+
+    Opposite directions turn by half a turn about some axis across; a zero vector gives the identity.
+    """
+    a, b = torch.broadcast_tensors(normalize(a), normalize(b))
+    dot = (a * b).sum(-1, keepdim=True)
+    # q = (1 + a . b, a x b) normalised
+    turn = torch.cat((1.0 + dot, torch.linalg.cross(a, b)), -1)
+    half = torch.cat((torch.zeros_like(dot), across(a)), -1)
+    one = torch.zeros_like(turn)
+    one[..., 0] = 1.0
+    known = (a.norm(dim=-1, keepdim=True) > 0.5) & (b.norm(dim=-1, keepdim=True) > 0.5)
+    return normalize(torch.where(known, torch.where(dot < -1.0 + 1e-12, half, turn), one))
+
+
+def frame_quat(axis: Tensor, normal: Tensor) -> Tensor:
+    """wxyz of the frame whose x lies along `axis (..., 3)` and whose z is `normal` made square to it.
+
+    Two such frames of one bone, at rest and now, give its rotation: now * rest^-1. Where `normal` is
+    parallel to `axis`, some axis across is taken.
+    """
+    axis, normal = torch.broadcast_tensors(axis, normal)
+    x = normalize(axis)
+    z = rejected(normal, x)
+    lost = z.norm(dim=-1, keepdim=True) < 1e-9
+    z = torch.where(lost, across(x), normalize(z))
+    return matrix_to_quat(torch.stack((x, torch.linalg.cross(z, x), z), -1))
+
+
+def cluster_quat(template: Tensor, vectors: Tensor, weights: Tensor) -> Tensor:
+    """wxyz `(..., 4)` of the rotation R that brings `template (K, 3)` nearest to `vectors (..., K, 3)`.
+
+    Minimises sum_k w_k |R t_k - v_k|^2 (Wahba 1965) by the singular values of sum_k w_k v_k t_k^T
+    (Kabsch 1976); mirror images are excluded. Needs two directions that are not parallel.
+    """
+    b = torch.einsum("...ki,kj,k->...ij", vectors, template, weights)
+    u, _, vt = torch.linalg.svd(b)
+    flip = torch.ones_like(b[..., 0])
+    flip[..., 2] = torch.linalg.det(u @ vt)
+    return matrix_to_quat((u * flip.unsqueeze(-2)) @ vt)
