@@ -117,9 +117,22 @@ def fit_ground(
     smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed.
     """
     state = Kinematics(table)(torch.tensor(qpos))
-    low = lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
-    flights = find_flights(low, centre_of_mass(table, state.pos, state.quat)[:, 2].numpy(), fps)
-    stance = stance_heights(table, state.pos, state.quat, fps)
+    fit = fit_heights(table, state.pos, state.quat, fps, cyclic)
+    out = np.array(qpos)
+    out[:, 2] += fit.lift_m - fit.settle_m + fit.clear_m
+    return out, fit
+
+
+def fit_heights(
+    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, cyclic: bool = False
+) -> GroundFit:
+    """How a motion with body poses `pos (T, B, 3)` m and `quat (T, B, 4)` would be set on the floor.
+
+    See `fit_ground`, which does it.
+    """
+    low = lowest_height(table, pos, quat).min(-1).values.numpy()
+    flights = find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), fps)
+    stance = stance_heights(table, pos, quat, fps)
     lift = -float(np.quantile(low, 0.1))
     if len(stance) >= 3:
         # Badly solved feet point their toes down while they stand; they may not drag the rest along.
@@ -129,10 +142,8 @@ def fit_ground(
     settle = np.maximum(-smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
     low_now = low + lift - settle
     clear = _clearance(np.maximum(-low_now - SINK_M, 0.0), reach, cyclic)
-    out = np.array(qpos)
-    out[:, 2] += lift - settle + clear
     after = low_now + clear
-    return out, GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
+    return GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
 
 
 def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
