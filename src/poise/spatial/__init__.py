@@ -2,6 +2,7 @@
 
 from poise.spatial.rotations import (
     axis_angle_to_quat,
+    axis_heading,
     euler_to_quat,
     heading_quat,
     into_heading,
@@ -19,17 +20,20 @@ from poise.spatial.rotations import (
     quat_to_rotvec,
     quat_to_sixd,
     rotvec_to_quat,
+    sixd_to_matrix,
     slerp,
     unwrap_quats,
 )
-from poise.spatial.tree import forward_kinematics
+from poise.spatial.tree import forward_kinematics, matrix_kinematics
 
 __all__ = [
     "axis_angle_to_quat",
+    "axis_heading",
     "euler_to_quat",
     "forward_kinematics",
     "heading_quat",
     "into_heading",
+    "matrix_kinematics",
     "matrix_to_quat",
     "normalize",
     "quat_angle",
@@ -44,6 +48,7 @@ __all__ = [
     "quat_to_rotvec",
     "quat_to_sixd",
     "rotvec_to_quat",
+    "sixd_to_matrix",
     "slerp",
     "unwrap_quats",
 ]
