@@ -189,9 +189,15 @@ def _normal(
         return unit(square_to(sign * axis, upper))
     bend = cross(upper, lower)
     angle = math.atan2(float(np.linalg.norm(bend)), float(upper @ lower))
-    if angle < REST_BEND:
-        return unit(square_to(usual, upper))
-    return unit(bend)
+    if angle > REST_BEND:
+        return unit(bend)
+    if len(row.order) == 3:
+        first, middle = (rot[arm.lower] @ axes[arm.lower][:, "XYZ".index(c)] for c in row.order[:2])
+        if abs(float(middle @ usual)) > 0.7 and abs(float(first @ upper)) < 0.3:
+            # A middle hinge would lock at 90 degrees. The first one bends the limb down, which in a
+            # T-pose is what Eqs. 10 and 13 say.
+            usual = first if float(first @ cross(upper, -up)) >= 0 else -first
+    return unit(square_to(usual, upper))
 
 
 def body_points(body: IkBody, pos: np.ndarray, rot: np.ndarray) -> np.ndarray:

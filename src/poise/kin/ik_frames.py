@@ -14,9 +14,6 @@ from poise.kin.ik_body import IkBody
 from poise.kin.ik_config import IkConfig
 from poise.kin.ik_math import best_rotation, columns, cross, frame_of, norm, square_to, unit
 
-#: Sine of the angle between shin and foot below which the knee's axis gives the foot its roll.
-POINTE = 0.3
-
 
 class Frames:
     """World frames `(T, 3, 3)` of rows from the positions `p (T, P, 3)` of one motion.
@@ -179,18 +176,15 @@ class Frames:
                 continue
             ankle = roles[f"{side}an"]
             shin = self.frames[roles[f"{side}k"]]
-            # y_c = l_lan-lk, z_c = l_lan-lf
+            # Eq. 21: y_c = l_lan-lk, z_c = l_lan-lf
             y, z = unit(self._l(f"{side}an", f"{side}k")), unit(self._l(f"{side}an", f"{side}f"))
-            x = cross(y, z)
-            if not self.config.on("square_ankle"):
-                # Eq. 21: y_c along the shin, z_c along the foot, x_c = y_c x z_c: not square.
-                self.frames[ankle] = columns(unit(x), y, z)
-                continue
-            # y_c = z_c x x_c instead. On pointe x fades into the knee's axis, which stays square to z.
-            share = np.clip(norm(x) / POINTE, 0.0, 1.0)
-            share = share**2 * (3 - 2 * share)
-            knee = square_to(shin[..., 0], z)
-            self.frames[ankle] = frame_of("z", x=share * unit(x) + (1 - share) * unit(knee), z=z)
+            if self.config.on("square_ankle"):
+                # z_c holds and y_c = z_c x x_c, with x_c the knee's axis made square to z_c: the same as
+                # y_c x z_c for a foot that is bent or turned out, and still defined for one on pointe.
+                self.frames[ankle] = frame_of("z", x=shin[..., 0], z=z)
+            else:
+                # x_c = y_c x z_c, with a shin y_c that is not square to z_c.
+                self.frames[ankle] = columns(unit(cross(y, z)), y, z)
 
 
 @lru_cache(maxsize=32)
