@@ -11,6 +11,8 @@ from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik import analytic_ik, clip_ik
 from poise.kin.ik_body import IkBody, ik_body
 from poise.kin.ik_config import CORRECTIONS, IkConfig
+from poise.kin.ik_paper import paper_humanoid
+from poise.kin.ik_polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
 from poise.kin.velocity import qpos_velocity
 
@@ -25,6 +27,8 @@ __all__ = [
     "IkConfig",
     "Kinematics",
     "Limb",
+    "PolishConfig",
+    "Polished",
     "TwoBone",
     "analytic_ik",
     "chain_angles",
@@ -43,6 +47,8 @@ __all__ = [
     "limb_of",
     "lowest_height",
     "match_positions",
+    "paper_humanoid",
+    "polish",
     "qpos_to_clip",
     "qpos_velocity",
     "shortest_arc",
