@@ -11,11 +11,11 @@ import torch
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import IkBody, Kinematics, analytic_ik, clip_ik, clip_to_qpos, ik_body
+from poise.kin import IkBody, IkConfig, Kinematics, analytic_ik, clip_ik, clip_to_qpos, ik_body
 from poise.kin.ik_angles import count_jumps
 from poise.kin.ik_body import body_points
 from poise.kin.ik_paper import paper_humanoid
-from poise.motion import read_clip
+from poise.motion import Skeleton, read_clip
 from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, quat_to_matrix
 
 FILES = (
@@ -179,6 +179,25 @@ def test_degenerate_bones_stay_finite():
     q = analytic_ik(wanted, body)
     assert np.isfinite(q).all()
     np.testing.assert_allclose(np.linalg.norm(q[:, 3:7], axis=-1), 1.0)
+
+
+def test_a_body_without_a_spine():
+    full = toy_human.human()
+    kept = [j for j, n in enumerate(full.names) if n not in ("Spine", "Chest")]
+    rest = full.rest_positions()
+    parents = [full.parents[j] if full.parents[j] in kept else 0 for j in kept]
+    offsets = [rest[j] - rest[p] if j else rest[0] for j, p in zip(kept, parents, strict=True)]
+    skeleton = Skeleton(
+        tuple(full.names[j] for j in kept),
+        tuple(kept.index(p) if j else -1 for j, p in zip(kept, parents, strict=True)),
+        np.array(offsets),
+    )
+    body = ik_body(generate_table(skeleton), skeleton)
+    assert body.spine == () and body.chest == 0
+    wanted = pose(body, random_motion(body, 20, 6))
+    for config in (IkConfig(), IkConfig(faithful="paper")):
+        assert np.isfinite(analytic_ik(wanted, body, config)).all()
+    assert distance_mm(body, analytic_ik(wanted, body), wanted).max() < 1e-6
 
 
 def test_one_frame_and_missing_toes():

@@ -60,6 +60,11 @@ class IkBody:
     normals: np.ndarray
     trunk: np.ndarray
 
+    @property
+    def chest(self) -> int:
+        """The row that carries the shoulders: the last of the spine, the pelvis where there is none."""
+        return self.spine[-1] if self.spine else 0
+
     @classmethod
     def of(cls, humanoid: Humanoid) -> IkBody:
         """The body of a humanoid that has two arms, two legs and a spine."""
@@ -130,7 +135,7 @@ def _roles(table: BodyTable, spine: tuple[int, ...], toes: Mapping[int, int]) ->
         "shin": "k",
         "foot": "an",
     }
-    out = {"root": 0, "mspine": spine[0], "lowneck": spine[-1]}
+    out = {"root": 0, "mspine": (*spine, 0)[0], "lowneck": (0, *spine)[-1]}
     for i, r in enumerate(table.rows):
         if r.kind in short:
             out[r.side[0] + short[r.kind]] = i

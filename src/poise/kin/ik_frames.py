@@ -39,7 +39,7 @@ class Frames:
     def _trunk(self) -> None:
         """Pelvis (parent of Eqs. 18, 19, 22) and the row that carries the shoulders (child, Eq. 16)."""
         body, bone = self.body, self._l
-        top = body.spine[-1]
+        top = body.chest
         if self.config.on("trunk_fit"):
             for row in (0, top):
                 self.frames[row] = self._fitted(row)
@@ -47,6 +47,8 @@ class Frames:
         # Eq. 18: x = l_rhip-lhip, y = l_root-rhip x l_root-lhip, z = x x y
         x, y = bone("rhip", "lhip"), cross(bone("root", "rhip"), bone("root", "lhip"))
         self.frames[0] = frame_of("x", x=x, y=y)
+        if top == 0:
+            return
         # Eq. 16: x = l_rcl-lcl, z = l_lowneck-lcl x l_lowneck-rcl, y = z x x
         x, z = bone("rcl", "lcl"), cross(bone("lowneck", "lcl"), bone("lowneck", "rcl"))
         self.frames[top] = frame_of("x", x=x, z=z)
@@ -63,7 +65,7 @@ class Frames:
         """Eqs. 17 and 18: the rows between the pelvis and the lower neck."""
         body, p = self.body, self.p
         chain = (0, *body.spine)
-        low, high = self.frames[0], self.frames[body.spine[-1]]
+        low, high = self.frames[0], self.frames[body.chest]
         for i in range(1, len(chain) - 1):
             along = p[:, chain[i + 1]] - p[:, chain[i]]
             below = p[:, chain[i - 1]] - p[:, chain[i]]
