@@ -1,4 +1,4 @@
-"""Two bones: laws of triangles, reach, stable bend planes, and a clip that keeps what is not asked for."""
+"""Two bones: laws of triangles, reach, stable bend planes, and clips that keep what is not asked for."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-import toy_human
 
+import toy_human
 from poise.errors import PoiseError
 from poise.kin import limb_of, match_positions, shortest_arc, two_bone
 from poise.kin.limbs import frame_quat, soft_reach
@@ -58,16 +58,16 @@ def test_bones_keep_their_lengths_and_targets_in_reach_are_reached():
 
 
 def test_out_of_reach_is_approached_softly_and_never_crossed():
-    l = torch.tensor(0.5, dtype=torch.float64)
+    bone = torch.tensor(0.5, dtype=torch.float64)
     d = torch.linspace(0.0, 3.0, 3001, dtype=torch.float64)
-    got = soft_reach(d, l, l, 0.05)
+    got = soft_reach(d, bone, bone, 0.05)
     assert float(got.max()) <= 1.0
     assert bool((got[1:] >= got[:-1] - 1e-15).all())
     # Slope 1 where it begins, so no corner: the knee's speed does not jump.
     slope = (got[1:] - got[:-1]) / (d[1:] - d[:-1])
     assert float((slope[1:] - slope[:-1]).abs().max()) < 0.03
     torch.testing.assert_close(got[:950], d[:950])
-    assert float(soft_reach(torch.tensor(9.0), l, l, 0.0)) == pytest.approx(1.0)
+    assert float(soft_reach(torch.tensor(9.0), bone, bone, 0.0)) == pytest.approx(1.0)
 
 
 def test_a_limb_folds_no_further_than_its_bones_allow():
@@ -106,7 +106,7 @@ def test_the_limbs_of_a_human():
     skeleton = toy_human.human()
     names = [skeleton.names[j] for j in limb_of(skeleton, "LeftFoot")]
     assert names == ["LeftUpLeg", "LeftLeg", "LeftFoot"]
-    assert [skeleton.names[j] for j in limb_of(skeleton, "RightToe")][0] == "RightLeg"
+    assert skeleton.names[limb_of(skeleton, "RightToe").root] == "RightLeg"
     with pytest.raises(PoiseError, match="no two bones above"):
         limb_of(skeleton, "Spine")
 

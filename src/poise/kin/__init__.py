@@ -11,6 +11,8 @@ from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik import analytic_ik, clip_ik
 from poise.kin.ik_body import IkBody, ik_body
 from poise.kin.ik_config import CORRECTIONS, IkConfig
+from poise.kin.ik_paper import paper_humanoid
+from poise.kin.ik_polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
 from poise.kin.retarget import RetargetConfig, retarget
 from poise.kin.retarget_report import RetargetReport
@@ -27,6 +29,8 @@ __all__ = [
     "IkConfig",
     "Kinematics",
     "Limb",
+    "PolishConfig",
+    "Polished",
     "RetargetConfig",
     "RetargetReport",
     "TwoBone",
@@ -47,6 +51,8 @@ __all__ = [
     "limb_of",
     "lowest_height",
     "match_positions",
+    "paper_humanoid",
+    "polish",
     "qpos_to_clip",
     "qpos_velocity",
     "retarget",

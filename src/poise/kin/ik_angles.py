@@ -90,10 +90,11 @@ def one_turn_check(angles: np.ndarray) -> np.ndarray:
 def pointing_angles(at_rest: np.ndarray, wanted: np.ndarray, order: str, axes: np.ndarray) -> np.ndarray:
     """Angles `(T, n)` of one or two hinges that turn direction `at_rest (3)` nearest to `wanted (T, 3)`.
 
-    Whole turns apart (`unwrapped`). Both are unit and stated in the body at zero angles; `axes (3, 3)` holds the hinges' frame. One hinge
+    Both are unit and stated in the body at zero angles; `axes (3, 3)` holds the hinges' frame. One hinge
     turns the part across its axis onto that of the wanted direction. Two hinges reach any direction
     within their cone, in two ways of which the smoother one is taken; with i the first axis and k the
-    second, e_i . R_k(c) v = e_i . w gives c, and a turns the rest about e_i.
+    second, e_i . R_k(c) v = e_i . w gives c, and a turns the rest about e_i. Up to whole turns
+    (`unwrapped`).
     """
     v, w = axes.T @ at_rest, wanted @ axes
     i = _AXIS[order[0]]

@@ -25,15 +25,16 @@ def held_normals(
     """Unit bend axes `(T, L, 3)`, world, that never jump where a limb is straight.
 
     The angle theta of the observed axis about the upper bone is stated against an axis that is carried
-    along with the bone without turning about it. It is averaged over time with weights sin^4 of the
-    bend, so that what a bent limb shows holds through the frames where it is straight; as a doubled
-    angle, since a limb that is stretched beyond straight shows the same plane. Which side is forward is
-    then the smoothest choice, where bends to the wrong side cost.
+    along with the bone without turning about it. A frame is trusted by c = s^4 / (s^4 + s_0^4), s the
+    sine of its bend and s_0 of `straight`; what c lacks comes from the frames around it, so that what a
+    bent limb shows holds through the frames where it is straight. Angles are averaged doubled, since a
+    limb that is stretched beyond straight shows the same plane. Which side is forward is then the
+    smoothest choice, where bends to the wrong side cost.
 
     Args:
         upper, lower: `(T, L, 3)` unit bones, world. parent: `(T, L, 3, 3)` what the upper bone hangs on.
         rest_upper, rest_normal: `(L, 3)` the bone and its bend axis at rest, in the parent.
-        straight: rad, the bend below which the neighbours in time count as much as the frame.
+        straight: rad, the bend at which the frames around count as much as the frame itself.
         reach: frames over which they do.
     """
     into = np.swapaxes(parent, -1, -2)
@@ -47,12 +48,11 @@ def held_normals(
         return np.arctan2(dot(n, other)[..., 0], dot(n, carried)[..., 0])
 
     theta = angle(normal)
-    weight = sine**4
+    weight = sine**4 / (sine**4 + np.sin(straight) ** 4)
     # The way of least turning from the rest pose; it is lost where the bone points the other way.
     home = rotate(arc(np.broadcast_to(rest_upper, u.shape), u), np.broadcast_to(rest_normal, u.shape))
     trust = (0.5 + 0.5 * dot(rest_upper, u)[..., 0]) ** 2
-    line = _mean(theta, weight, np.sin(straight) ** 4, reach) + 1e-12 * trust * np.exp(2j * angle(home))
-    line = 0.5 * np.angle(line)
+    line = 0.5 * np.angle(_mean(theta, weight, angle(home), 1e-4 * trust, reach))
     both = np.stack((line, line + np.pi), -1)  # (T, L, 2)
     # The bend about each of the two axes: negative is to the wrong side.
     bend = np.arctan2(sine, dot(u, v)[..., 0])[..., None] * np.cos(theta[..., None] - both)
@@ -72,16 +72,21 @@ def _carried(u: np.ndarray, start: np.ndarray) -> np.ndarray:
     return unit(square_to(rotate(prefix_product(steps), np.broadcast_to(begin, u.shape)), u))
 
 
-def _mean(theta: np.ndarray, weight: np.ndarray, share: float, reach: float) -> np.ndarray:
-    """Sums of w exp(2 i theta) `(T, L)`: the frame's own and `share` of those around it.
+def _mean(
+    theta: np.ndarray, weight: np.ndarray, home: np.ndarray, trust: np.ndarray, reach: float
+) -> np.ndarray:
+    """Sums of exp(2 i theta) `(T, L)`: a frame's own by its weight, the rest from those around it.
 
-    The neighbours' part falls off as exp(-|dt| / reach).
+    Around a frame, others count by their weight and exp(-|dt| / reach), and `home` by `trust`.
     """
-    own = weight * np.exp(2j * theta)
+    own = np.exp(2j * theta)
     frames = len(own)
-    lag = np.arange(frames)
-    kernel = np.exp(-lag / reach)
-    size = 2 * frames
-    both = np.concatenate((kernel, [0.0], kernel[:0:-1]))
-    around = np.fft.ifft(np.fft.fft(own, size, axis=0) * np.fft.fft(both)[:, None], axis=0)[:frames]
-    return own + share * around
+    kernel = np.exp(-np.arange(frames) / reach)
+    both = np.fft.fft(np.concatenate((kernel, [0.0], kernel[:0:-1])))[:, None]
+
+    def spread(x: np.ndarray) -> np.ndarray:
+        return np.fft.ifft(np.fft.fft(x, 2 * frames, axis=0) * both, axis=0)[:frames]
+
+    around = spread(weight * own) + trust * np.exp(2j * home)
+    total = spread(weight).real + trust + 1e-12
+    return weight * own + (1 - weight) * around / total

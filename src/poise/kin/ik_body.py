@@ -60,6 +60,11 @@ class IkBody:
     normals: np.ndarray
     trunk: np.ndarray
 
+    @property
+    def chest(self) -> int:
+        """The row that carries the shoulders: the last of the spine, the pelvis where there is none."""
+        return self.spine[-1] if self.spine else 0
+
     @classmethod
     def of(cls, humanoid: Humanoid) -> IkBody:
         """The body of a humanoid that has two arms, two legs and a spine."""
@@ -130,7 +135,7 @@ def _roles(table: BodyTable, spine: tuple[int, ...], toes: Mapping[int, int]) ->
         "shin": "k",
         "foot": "an",
     }
-    out = {"root": 0, "mspine": spine[0], "lowneck": spine[-1]}
+    out = {"root": 0, "mspine": (*spine, 0)[0], "lowneck": (0, *spine)[-1]}
     for i, r in enumerate(table.rows):
         if r.kind in short:
             out[r.side[0] + short[r.kind]] = i
@@ -189,9 +194,15 @@ def _normal(
         return unit(square_to(sign * axis, upper))
     bend = cross(upper, lower)
     angle = math.atan2(float(np.linalg.norm(bend)), float(upper @ lower))
-    if angle < REST_BEND:
-        return unit(square_to(usual, upper))
-    return unit(bend)
+    if angle > REST_BEND:
+        return unit(bend)
+    if len(row.order) == 3:
+        first, middle = (rot[arm.lower] @ axes[arm.lower][:, "XYZ".index(c)] for c in row.order[:2])
+        if abs(float(middle @ usual)) > 0.7 and abs(float(first @ upper)) < 0.3:
+            # A middle hinge would lock at 90 degrees. The first one bends the limb down, which in a
+            # T-pose is what Eqs. 10 and 13 say.
+            usual = first if float(first @ cross(upper, -up)) >= 0 else -first
+    return unit(square_to(usual, upper))
 
 
 def body_points(body: IkBody, pos: np.ndarray, rot: np.ndarray) -> np.ndarray:

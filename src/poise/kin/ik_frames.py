@@ -14,9 +14,6 @@ from poise.kin.ik_body import IkBody
 from poise.kin.ik_config import IkConfig
 from poise.kin.ik_math import best_rotation, columns, cross, frame_of, norm, square_to, unit
 
-#: Sine of the angle between shin and foot below which the knee's axis gives the foot its roll.
-POINTE = 0.3
-
 
 class Frames:
     """World frames `(T, 3, 3)` of rows from the positions `p (T, P, 3)` of one motion.
@@ -42,7 +39,7 @@ class Frames:
     def _trunk(self) -> None:
         """Pelvis (parent of Eqs. 18, 19, 22) and the row that carries the shoulders (child, Eq. 16)."""
         body, bone = self.body, self._l
-        top = body.spine[-1]
+        top = body.chest
         if self.config.on("trunk_fit"):
             for row in (0, top):
                 self.frames[row] = self._fitted(row)
@@ -50,6 +47,8 @@ class Frames:
         # Eq. 18: x = l_rhip-lhip, y = l_root-rhip x l_root-lhip, z = x x y
         x, y = bone("rhip", "lhip"), cross(bone("root", "rhip"), bone("root", "lhip"))
         self.frames[0] = frame_of("x", x=x, y=y)
+        if top == 0:
+            return
         # Eq. 16: x = l_rcl-lcl, z = l_lowneck-lcl x l_lowneck-rcl, y = z x x
         x, z = bone("rcl", "lcl"), cross(bone("lowneck", "lcl"), bone("lowneck", "rcl"))
         self.frames[top] = frame_of("x", x=x, z=z)
@@ -66,7 +65,7 @@ class Frames:
         """Eqs. 17 and 18: the rows between the pelvis and the lower neck."""
         body, p = self.body, self.p
         chain = (0, *body.spine)
-        low, high = self.frames[0], self.frames[body.spine[-1]]
+        low, high = self.frames[0], self.frames[body.chest]
         for i in range(1, len(chain) - 1):
             along = p[:, chain[i + 1]] - p[:, chain[i]]
             below = p[:, chain[i - 1]] - p[:, chain[i]]
@@ -179,18 +178,15 @@ class Frames:
                 continue
             ankle = roles[f"{side}an"]
             shin = self.frames[roles[f"{side}k"]]
-            # y_c = l_lan-lk, z_c = l_lan-lf
+            # Eq. 21: y_c = l_lan-lk, z_c = l_lan-lf
             y, z = unit(self._l(f"{side}an", f"{side}k")), unit(self._l(f"{side}an", f"{side}f"))
-            x = cross(y, z)
-            if not self.config.on("square_ankle"):
-                # Eq. 21: y_c along the shin, z_c along the foot, x_c = y_c x z_c: not square.
-                self.frames[ankle] = columns(unit(x), y, z)
-                continue
-            # y_c = z_c x x_c instead. On pointe x fades into the knee's axis, which stays square to z.
-            share = np.clip(norm(x) / POINTE, 0.0, 1.0)
-            share = share**2 * (3 - 2 * share)
-            knee = square_to(shin[..., 0], z)
-            self.frames[ankle] = frame_of("z", x=share * unit(x) + (1 - share) * unit(knee), z=z)
+            if self.config.on("square_ankle"):
+                # z_c holds and y_c = z_c x x_c, with x_c the knee's axis made square to z_c: the same as
+                # y_c x z_c for a foot that is bent or turned out, and still defined for one on pointe.
+                self.frames[ankle] = frame_of("z", x=shin[..., 0], z=z)
+            else:
+                # x_c = y_c x z_c, with a shin y_c that is not square to z_c.
+                self.frames[ankle] = columns(unit(cross(y, z)), y, z)
 
 
 @lru_cache(maxsize=32)

@@ -21,12 +21,12 @@ class PolishConfig:
 
     posture: weight (m/rad) that keeps hinge angles; root: weight that keeps the pelvis, per m and rad;
     both against 1 for a target's metre. steps: Gauss-Newton steps per frame at most.
-    stop_mm: the frame is done when all its targets are this near, or no step brings them nearer.
+    stop_mm: a frame is done when all its targets are this near, or three steps brought them no nearer.
     limits: whether the hinges' ranges hold. damping: of each step.
     """
 
     posture: float = 3e-3
-    root: float = 1e-2
+    root: float = 0.2
     steps: int = 12
     stop_mm: float = 0.1
     limits: bool = False
@@ -71,7 +71,9 @@ def polish(
     model = _with_toes(humanoid)
     body = IkBody.of(humanoid)
     tasks = {
-        name: mink.FrameTask(name, _kind(name, body), position_cost=1.0, orientation_cost=0.0)
+        name: mink.FrameTask(
+            name, _kind(name, body), position_cost=1.0, orientation_cost=0.0, lm_damping=1.0
+        )
         for name in goals
     }
     pelvis = body.points[0]
@@ -94,18 +96,18 @@ def polish(
         active = [tasks[n] for n in here]
         error = _errors(state, here, body)
         before.append(error.mean())
-        best, best_q = error.max(), state.q.copy()
+        best, best_q, worse = error.max(), state.q.copy(), 0
         for _ in range(config.steps):
-            if best < config.stop_mm:
+            if best < config.stop_mm or worse > 2:
                 break
             velocity = mink.solve_ik(
                 state, [*active, keep, posture], 1.0, "daqp", damping=config.damping, limits=limits
             )
             state.integrate_inplace(velocity, 1.0)
             error = _errors(state, here, body)
-            if error.max() > 0.99 * best:
-                break
-            best, best_q = error.max(), state.q.copy()
+            worse = worse + 1 if error.max() > 0.99 * best else 0
+            if error.max() < best:
+                best, best_q = error.max(), state.q.copy()
         state.update(best_q)
         after.append(_errors(state, here, body).mean())
         qpos[t] = best_q
