@@ -91,6 +91,7 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
         PoiseError: a rest pose in which nobody stands and no clip, or legs of no length.
     """
     roles.require()
+    _check_hips(roles)
     if clip is not None and world is None:
         world = World.of(clip)
     at_rest = rest_axes(roles)
@@ -109,6 +110,19 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
             "Give a clip on it instead of the skeleton alone",
         )
     return _Builder(roles, local, clip, world, at_rest is not None, evidence).build()
+
+
+def _check_hips(roles: Roles) -> None:
+    """Refuses hips of no width, which face nowhere."""
+    pos = roles.skeleton.rest_positions()
+    left, right = (roles.joint(f"{side}_thigh") or 0 for side in SIDES)
+    if float(np.linalg.norm(pos[left] - pos[right])) < 1e-4:
+        names = roles.skeleton.names
+        raise PoiseError(
+            f"both legs ('{names[left]}' and '{names[right]}') hang on one point, so nothing tells "
+            "where the body faces",
+            roles.skeleton.source.path,
+        )
 
 
 class _Builder:
@@ -133,6 +147,7 @@ class _Builder:
         self.stance = Stances.of(world, 0.0 if clip is None else clip.fps, toes)
 
     def build(self) -> CommonPose:
+        self._check_toes()
         rot = self.quat.clone()
         for j in range(1, len(self.skeleton)):
             rot[j] = quat_mul(rot[self.skeleton.parents[j]], self.local[j])
@@ -198,6 +213,21 @@ class _Builder:
         joint = self.roles.joint(role)
         assert joint is not None
         return joint
+
+    def _check_toes(self) -> None:
+        """Refuses toes that point backwards: then left is right, and every turn would be mirrored."""
+        ahead = []
+        for side in SIDES:
+            foot, toes = self._joint(f"{side}_foot"), self.roles.joint(f"{side}_toes")
+            if toes is not None:
+                line = self.pos[toes] - self.pos[foot]
+                ahead.append(float(line[0] / line.norm().clamp_min(1e-9)))
+        if len(ahead) == 2 and max(ahead) < -0.5:
+            raise PoiseError(
+                "its toes point backwards, so left and right seem to be swapped",
+                self.skeleton.source.path,
+                "State the legs by hand with --map JOINT=right_thigh and so on",
+            )
 
     def _leg(self) -> float:
         total = 0.0

@@ -115,6 +115,10 @@ def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot
             if any(p is None for p in pairs):
                 continue
             chain = [p for p in pairs if p is not None]
+            bones = np.diff(there.pos[[p[1] for p in chain]], axis=0)
+            if np.linalg.norm(bones, axis=-1).min() < 1e-4:
+                # A bone of no length reaches nowhere.
+                continue
             held = [torch.zeros(3, dtype=torch.float64)] * 2
             if label == "foot":
                 held = [torch.tensor(here.treads[k]), torch.tensor(there.treads[k])]
