@@ -302,8 +302,8 @@ class _Builder:
             return quat_rotate_inv(rot[j], pos[toes] - pos[j])
         tip = self._toe(j, side)
         low = 0.0 if tip is None else -float(quat_rotate(rot[j], tip)[2]) / self.leg
-        # The tip of a toe lies on the sole, unless it was made up.
-        ankle = low if 0.03 < low < 0.15 else _ANKLE_HEIGHT
+        # The tip of a toe lies on the sole at most; many were made up higher.
+        ankle = low if _ANKLE_HEIGHT < low < 2 * _ANKLE_HEIGHT else _ANKLE_HEIGHT
         ahead = torch.tensor([_TREAD, 0.0, _TREAD_HEIGHT - ankle], dtype=torch.float64) * self.leg
         return quat_rotate_inv(rot[j], ahead)
 
