@@ -128,16 +128,16 @@ Every pair among nine skeletons, up to {frames} frames of each clip. Made by
 python benchmarks/retarget.py --data FOLDER
 ```
 
-- **bones**: angle between the directions of upper arms, forearms, thighs and shins in source and target, mean
-  over frames and bones, and the largest. Only contacts bend limbs away; without them it is zero.
+- **bones**: angle between the directions of upper arms, forearms, thighs and shins in source and target,
+  mean over frames and bones, and the largest. Only contacts bend limbs away; without them it is zero.
 - **trunk**: angle of the line from hips to shoulders, against its angle while standing.
-- **ends**: distance of hands, feet and head from where the source has them, seen from the hips, in percent of
-  the hips' height. It is there for arms and trunks of other proportions, since directions are kept.
+- **ends**: distance of hands, feet and head from where the source has them, seen from the hips, in
+  percent of the hips' height. Arms and trunks of other proportions cause it, since directions are kept.
 - **slide**: mean horizontal speed of feet in contact, source (at the target's size) → target.
 - **deepest**: the deepest joint or bone tip under the floor, source (at the target's size) → target.
-- **back**: the result moved back onto the first skeleton, against the clip where it began: mean (largest)
-  distance of joints and mean angle of local rotations. What the other skeleton lacks is lost (a bend of the
-  neck in DeepMimic's, which has no head).
+- **back**: the result moved back onto the first skeleton, against the clip where it began: mean
+  (largest) distance of joints and mean angle of local rotations. What the other skeleton lacks is lost
+  (the head's turn against the neck in DeepMimic's, which has one joint for both).
 
 """
 

@@ -80,10 +80,9 @@ def test_pairs_by_hand(files, tmp_path: Path, capsys, refused) -> None:
 def test_mistakes_are_told_in_one_sentence(files, tmp_path: Path, refused) -> None:
     here, there = files
     out = tmp_path / "out.bvh"
+    line = ("retarget", here, "--onto", there, "-o")
     refused("retarget", here, "--onto", tmp_path / "none.bvh", "-o", out)
-    refused(
-        "retarget", here, "--onto", there, "-o", tmp_path / "out.xyz", words=("cannot be written as",)
-    )
+    refused(*line, tmp_path / "out.xyz", words=("cannot be written as",))
     refused(*line, there, words=("written over",))
     refused("retarget", here, "-o", out, words=("--onto",))
     legless = put(tmp_path, "legless.bvh", bvh())

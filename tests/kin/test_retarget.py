@@ -196,10 +196,11 @@ def sway() -> Clip:
     t = torch.linspace(0, 4 * math.pi, clip.frames, dtype=torch.float64)
     root[:, 0], root[:, 1] = 0.05 * torch.sin(t), 0.04 * torch.cos(t)
     root[:, 2] = root[:, 2] - 0.06
-    goals = {
-        n: torch.tensor(stand[names.index(n)]).expand(clip.frames, 3) for n in ("LeftFoot", "RightFoot")
+    stays: dict[int | str, torch.Tensor] = {
+        j: torch.tensor(stand[j]).expand_as(root)
+        for j in (names.index("LeftFoot"), names.index("RightFoot"))
     }
-    held = match_positions(clip.skeleton, rot, root, goals)
+    held = match_positions(clip.skeleton, rot, root, stays)
     return clip.replaced(rot=held.numpy(), root_pos=root.numpy())
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from poise.errors import PoiseError
 from poise.motion import Skeleton, find_roles, read_clip
@@ -284,3 +286,45 @@ def test_wrong_statements_are_refused() -> None:
     for good in ("hips", "spine4", "left_thumb0", "right_upper_arm", "head"):
         assert check_role(good) == good
     assert split_role("left_upper_arm") == ("left", "upper_arm") and split_role("neck2") == ("", "neck")
+
+
+_WORDS = st.sampled_from(
+    [
+        "Left",
+        "right",
+        "l_",
+        "R.",
+        "Hip",
+        "leg",
+        "Foot",
+        "hand",
+        "Arm",
+        "Spine",
+        "1",
+        "02",
+        "Twist",
+        " ",
+        "ü",
+    ]
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.lists(_WORDS, min_size=1, max_size=4).map("".join), min_size=1, max_size=25), st.data()
+)
+def test_any_names_on_any_tree_give_roles_or_none(words: list[str], data: st.DataObject) -> None:
+    names = tuple(f"{w}#{j}" for j, w in enumerate(words))
+    parents = tuple(-1 if j == 0 else data.draw(st.integers(0, j - 1)) for j in range(len(names)))
+    skeleton = Skeleton(names, parents, np.ones((len(names), 3)))
+    roles = find_roles(skeleton)
+    joints = [r.joint for r in roles.rows]
+    assert len(set(joints)) == len(joints) and len({r.role for r in roles.rows}) == len(joints)
+    assert all(0 < r.confidence <= 1 and r.evidence for r in roles.rows)
+    # A thigh carries its shin, and a shin its foot.
+    for side in ("left", "right"):
+        for upper, lower in (("thigh", "shin"), ("shin", "foot")):
+            a, b = roles.joint(f"{side}_{upper}"), roles.joint(f"{side}_{lower}")
+            while a is not None and b is not None and b != a:
+                b = parents[b]
+                assert b >= a
