@@ -20,7 +20,7 @@ from poise.motion.roles import SIDES
 from poise.spatial import forward_kinematics, quat_rotate
 
 #: Time (s) over which a foot goes from its own path to its contact and back.
-BLEND_S = 0.15
+BLEND_S = 0.25
 #: Half the time (s) over which a lift is spread.
 LIFT_S = 0.05
 #: Height (m) over the ground under which a slow toe or wrist touches, and what is slow (m/s).
