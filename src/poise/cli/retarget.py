@@ -79,18 +79,19 @@ def pairs(texts: Sequence[str]) -> dict[str, str]:
 
 
 def show(report: RetargetReport) -> None:
-    """The table of joints and the sentences of the report."""
+    """The table of joints that are moved, and the sentences of the report."""
     joints = report.joints
     source, target = joints.source.skeleton.names, joints.target.skeleton.names
     rows = [
         (
             row.role.replace("_", " ") or "-",
-            ", ".join(source[j] for j in row.source) or "nothing",
+            ", ".join(source[j] for j in row.source),
             target[row.target],
             f"{row.confidence:.1f}",
             row.evidence,
         )
         for row in joints.rows
+        if row.source
     ]
     table("", ("part", "moved by", "joint", "sure", "why"), rows, left=5)
     notes(report.sentences())

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.kin.contacts import contact_labels
 from poise.kin.limbs import shortest_arc
-from poise.kin.standing import World, hinge_axis, identity, mean_pose, pose_positions, rest_axes
+from poise.kin.standing import Stances, World, hinge_axis, identity, mean_pose, pose_positions, rest_axes
 from poise.motion import Clip, Roles, Skeleton
 from poise.motion.roles import SIDES
 from poise.spatial import (
@@ -27,7 +26,7 @@ from poise.spatial import (
 
 #: Where a skeleton has no toes: how far ahead of the ankle it treads, and how high such a point and the
 #: ankle lie above the sole, as shares of the leg.
-_TREAD, _TREAD_HEIGHT, _ANKLE_HEIGHT = 0.16, 0.025, 0.09
+_TREAD, _TREAD_HEIGHT, _ANKLE_HEIGHT = 0.16, 0.025, 0.075
 #: Tilt (rad) between the rest pose's foot and the standing foot of the motion, beyond which the motion
 #: is believed.
 _FOOT_TILT = math.radians(15)
@@ -92,6 +91,7 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
         PoiseError: a rest pose in which nobody stands and no clip, or legs of no length.
     """
     roles.require()
+    _check_hips(roles)
     if clip is not None and world is None:
         world = World.of(clip)
     at_rest = rest_axes(roles)
@@ -112,6 +112,19 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
     return _Builder(roles, local, clip, world, at_rest is not None, evidence).build()
 
 
+def _check_hips(roles: Roles) -> None:
+    """Refuses hips of no width, which face nowhere."""
+    pos = roles.skeleton.rest_positions()
+    left, right = (roles.joint(f"{side}_thigh") or 0 for side in SIDES)
+    if float(np.linalg.norm(pos[left] - pos[right])) < 1e-4:
+        names = roles.skeleton.names
+        raise PoiseError(
+            f"both legs ('{names[left]}' and '{names[right]}') hang on one point, so nothing tells "
+            "where the body faces",
+            roles.skeleton.source.path,
+        )
+
+
 class _Builder:
     """Swings the limbs of a standing pose into their common directions."""
 
@@ -129,9 +142,12 @@ class _Builder:
         self.skeleton = roles.skeleton
         self.pos, self.quat = pose_positions(roles, local)
         self.leg = self._leg()
-        self.standing = self._standing_tilt()
+        feet = [(side, self._joint(f"{side}_foot")) for side in SIDES]
+        toes = {j: self._toe(j, side) for side, j in feet}
+        self.stance = Stances.of(world, 0.0 if clip is None else clip.fps, toes)
 
     def build(self) -> CommonPose:
+        self._check_toes()
         rot = self.quat.clone()
         for j in range(1, len(self.skeleton)):
             rot[j] = quat_mul(rot[self.skeleton.parents[j]], self.local[j])
@@ -198,6 +214,21 @@ class _Builder:
         assert joint is not None
         return joint
 
+    def _check_toes(self) -> None:
+        """Refuses toes that point backwards: then left is right, and every turn would be mirrored."""
+        ahead = []
+        for side in SIDES:
+            foot, toes = self._joint(f"{side}_foot"), self.roles.joint(f"{side}_toes")
+            if toes is not None:
+                line = self.pos[toes] - self.pos[foot]
+                ahead.append(float(line[0] / line.norm().clamp_min(1e-9)))
+        if len(ahead) == 2 and max(ahead) < -0.5:
+            raise PoiseError(
+                "its toes point backwards, so left and right seem to be swapped",
+                self.skeleton.source.path,
+                "State the legs by hand with --map JOINT=right_thigh and so on",
+            )
+
     def _leg(self) -> float:
         total = 0.0
         for side in SIDES:
@@ -249,60 +280,32 @@ class _Builder:
     def _foot(self, j: int, side: str) -> Tensor:
         """The foot's world rotation: flat, and its toe straight ahead."""
         rot, toe = self.quat[j], self._toe(j, side)
-        if toe is None:
+        if toe is None or float(quat_rotate(rot, toe)[:2].norm()) < 0.03 * self.leg:
             return rot
+        if not self.rested:
+            seen = self.stance.mean(j)
+            rot = rot if seen is None else seen
+        z, y = torch.eye(3, dtype=torch.float64)[[2, 1]]
         ahead = quat_rotate(rot, toe)
-        if float(ahead[:2].norm()) < 0.03 * self.leg:
-            return rot
-        z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         rot = quat_mul(axis_angle_to_quat(z, -torch.atan2(ahead[1], ahead[0])), rot)
-        tilt = float(torch.atan2(ahead[2], ahead[:2].norm()))
-        stood = self.standing
-        if stood is not None and (not self.rested or abs(stood - tilt) > _FOOT_TILT):
-            y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        tilt = torch.atan2(ahead[2], ahead[:2].norm())
+        stood = self.stance.tilt()
+        if stood is not None and (not self.rested or abs(stood - float(tilt)) > _FOOT_TILT):
             # A turn about +y by a positive angle lowers what points along +x.
-            rot = quat_mul(axis_angle_to_quat(y, torch.tensor(tilt - stood, dtype=torch.float64)), rot)
+            rot = quat_mul(axis_angle_to_quat(y, tilt - stood), rot)
         return rot
-
-    def _standing_tilt(self) -> float | None:
-        """How far (rad) the line from ankle to toe rises, the median while a foot stands."""
-        if self.clip is None or self.world is None:
-            return None
-        found = []
-        pos, quat = self.world
-        for side in SIDES:
-            j = self._joint(f"{side}_foot")
-            toe = self._toe(j, side)
-            if toe is None:
-                continue
-            line = quat_rotate(quat[:, j], toe.expand(len(pos), 3))
-            points = torch.stack((pos[:, j], pos[:, j] + line), 1)
-            grounds = points[..., 2].quantile(0.1, dim=0)
-            stands = [
-                contact_labels(points[:, k : k + 1], self.clip.fps, 0.03, 0.35, float(grounds[k]))[:, 0]
-                for k in (0, 1)
-            ]
-            flat = line[stands[0] & stands[1]]
-            found.append(torch.atan2(flat[:, 2], flat[:, :2].norm(dim=-1)))
-        tilts = torch.cat(found) if found else torch.zeros(0)
-        return float(tilts.median()) if len(tilts) >= 5 else None
 
     def _tread(self, pos: Tensor, rot: Tensor, side: str) -> Tensor:
         """The point on which a foot stands and rolls, in the foot's frame."""
         j, toes = self._joint(f"{side}_foot"), self.roles.joint(f"{side}_toes")
         if toes is not None and float((pos[toes] - pos[j]).norm()) > 0.03 * self.leg:
             return quat_rotate_inv(rot[j], pos[toes] - pos[j])
-        high = self._ankle_height(j) - _TREAD_HEIGHT * self.leg
-        ahead = torch.tensor([_TREAD * self.leg, 0.0, -max(high, 0.0)], dtype=torch.float64)
+        tip = self._toe(j, side)
+        low = 0.0 if tip is None else -float(quat_rotate(rot[j], tip)[2]) / self.leg
+        # The tip of a toe lies on the sole at most; many were made up higher.
+        ankle = low if _ANKLE_HEIGHT < low < 2 * _ANKLE_HEIGHT else _ANKLE_HEIGHT
+        ahead = torch.tensor([_TREAD, 0.0, _TREAD_HEIGHT - ankle], dtype=torch.float64) * self.leg
         return quat_rotate_inv(rot[j], ahead)
-
-    def _ankle_height(self, j: int) -> float:
-        """Height (m) of a standing ankle over the floor of the clip, or what is usual."""
-        usual = _ANKLE_HEIGHT * self.leg
-        if self.world is None:
-            return usual
-        low = float(self.world.pos[:, j, 2].quantile(0.2))
-        return low if 0.4 * usual < low < 1.6 * usual else usual
 
 
 def _way(side: str, kind: str) -> Tensor:

@@ -20,7 +20,7 @@ from poise.motion.roles import SIDES
 from poise.spatial import forward_kinematics, quat_rotate
 
 #: Time (s) over which a foot goes from its own path to its contact and back.
-BLEND_S = 0.15
+BLEND_S = 0.25
 #: Half the time (s) over which a lift is spread.
 LIFT_S = 0.05
 #: Height (m) over the ground under which a slow toe or wrist touches, and what is slow (m/s).
@@ -115,6 +115,10 @@ def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot
             if any(p is None for p in pairs):
                 continue
             chain = [p for p in pairs if p is not None]
+            bones = np.diff(there.pos[[p[1] for p in chain]], axis=0)
+            if np.linalg.norm(bones, axis=-1).min() < 1e-4:
+                # A bone of no length reaches nowhere.
+                continue
             held = [torch.zeros(3, dtype=torch.float64)] * 2
             if label == "foot":
                 held = [torch.tensor(here.treads[k]), torch.tensor(there.treads[k])]
@@ -150,8 +154,8 @@ def plant(
 
     While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
     after scaling: what stood still stands still. Limbs that would then be under the floor by more than
-    in the source are lifted, and where the trunk is, all of it. The limbs are solved by two bones in
-    closed form; feet and hands keep their turn.
+    in the source are lifted; where trunk, knees or elbows are, or a limb does not reach, the whole body
+    is. The limbs are solved by two bones in closed form; feet and hands keep their turn.
     """
     skeleton = joints.target.skeleton
     offsets = torch.tensor(skeleton.offsets)
@@ -167,10 +171,10 @@ def plant(
         return torch.tensor(np.maximum(hull, 0.0))
 
     if clear:
-        limbs = {j for foot in feet for j in hanging(skeleton, foot.limb.mid)}
+        ends = {j for foot in feet for j in hanging(skeleton, foot.target)}
         pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
         up = torch.zeros_like(root)
-        up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - limbs)
+        up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
         root = root + up
     pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
     goals: dict[int | str, Tensor] = {}
@@ -187,7 +191,13 @@ def plant(
             goal = goal + up
         goals[foot.target] = goal
     by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
-    return match_positions(skeleton, rot, root, goals, by_end), root
+    rot = match_positions(skeleton, rot, root, goals, by_end)
+    if clear:
+        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        up = torch.zeros_like(root)
+        up[:, 2] = lift(pos, quat, set(range(len(skeleton))))
+        root = root + up
+    return rot, root
 
 
 def contact_weight(contact: Tensor, fps: float) -> Tensor:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.errors import PoiseError
 from poise.kin.common_pose import CommonPose, common_pose
 from poise.kin.plant import Scale, feet_of, plant, source_contacts
 from poise.kin.retarget_report import RetargetReport, measure
@@ -46,6 +47,7 @@ def retarget(
     onto: Skeleton | Clip,
     mapping: Mapping[str, str] | None = None,
     config: RetargetConfig | None = None,
+    example: Clip | None = None,
 ) -> tuple[Clip, RetargetReport]:
     """The motion of `clip` on another human skeleton.
 
@@ -59,6 +61,8 @@ def retarget(
         onto: the skeleton to move, or a clip on it, which also tells how it stands where its rest pose
             does not.
         mapping: joints of the source with the joint that each moves; the others are guessed.
+        example: another clip on the source's skeleton, by default `clip` itself, that tells how the
+            source stands; hand in the same one for all clips that must come out alike.
 
     Returns:
         the clip on the other skeleton, same name, rate and length, and what was mapped and measured.
@@ -69,11 +73,11 @@ def retarget(
     """
     began = time.perf_counter()
     config = config or RetargetConfig()
-    target, example = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
+    target, shown = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
     joints = map_joints(clip.skeleton, target, mapping)
     world = World.of(clip)
-    here = common_pose(joints.source, clip, world)
-    there = here if _same(clip.skeleton, target) else _other_pose(joints, clip, example)
+    here = common_pose(joints.source, clip, world) if example is None else _pose(joints.source, example)
+    there = here if _same(clip.skeleton, target) else _other_pose(joints, clip, shown)
     scale = Scale.between(world, clip.fps, joints, here, there, config.scale)
     rot, root = transfer(world, joints, here, there, scale)
     feet = feet_of(joints, here, there)
@@ -94,6 +98,12 @@ def retarget(
 
 def _same(a: Skeleton, b: Skeleton) -> bool:
     return a.names == b.names and a.parents == b.parents and np.array_equal(a.offsets, b.offsets)
+
+
+def _pose(roles: Roles, example: Clip) -> CommonPose:
+    if not _same(roles.skeleton, example.skeleton):
+        raise PoiseError("the example is on another skeleton than the source", example.name)
+    return common_pose(roles, example)
 
 
 def _other_pose(joints: JointMap, clip: Clip, example: Clip | None) -> CommonPose:

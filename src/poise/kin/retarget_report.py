@@ -97,11 +97,13 @@ class RetargetReport:
             f"The deepest joint is {self.depth_max_mm[1]:.0f} mm under the ground "
             f"({self.depth_max_mm[0]:.0f} in the source)."
         )
-        for names, what in ((joints.still(), "Nothing moves"), (joints.unused(), "Nothing uses")):
+        for names, whose, what in (
+            (joints.still(), "target", "follow what carries them"),
+            (joints.unused(), "source", "move nothing"),
+        ):
             if names:
                 more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-                whose = "target" if what == "Nothing moves" else "source"
-                out.append(f"{what} {', '.join(names[:6])}{more} of the {whose}.")
+                out.append(f"{', '.join(names[:6])}{more} of the {whose} {what}.")
         return out
 
 
@@ -166,6 +168,8 @@ def _bones(joints: JointMap, source: Tensor, target: Tensor) -> list[tuple[str, 
             if top is None or tip is None:
                 continue
             lines = source[:, tip[0]] - source[:, top[0]], target[:, tip[1]] - target[:, top[1]]
+            if min(float(line.norm(dim=-1).min()) for line in lines) < 1e-4:
+                continue
             out.append((f"{side} {kind.replace('_', ' ')}", _angle(*lines)))
     return out
 

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.kin.contacts import contact_labels
 from poise.kin.limbs import shortest_arc
 from poise.motion import Clip, Roles
 from poise.motion.info import sampled
 from poise.motion.roles import SIDES
 from poise.spatial import (
+    axis_angle_to_quat,
     forward_kinematics,
     matrix_to_quat,
     normalize,
     quat_conj,
     quat_mul,
+    quat_rotate,
     quat_rotate_inv,
 )
 
@@ -28,6 +33,8 @@ _LIKE_STANDING = math.cos(math.radians(50))
 _UPRIGHT = math.cos(math.radians(35))
 #: A hinge is known when its bends of over `_BENT` (sine) share one axis: length of their mean unit axis.
 _BENT, _ONE_AXIS = 0.3, 0.9
+#: Frames from which something is known.
+_ENOUGH = 5
 
 
 def pose_positions(roles: Roles, local: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,9 +112,8 @@ def mean_pose(roles: Roles, clip: Clip, world: World) -> Tensor:
     if int(chosen.sum()) < max(2, len(frames) // 50):
         # Hardly ever upright: the most upright tenth.
         chosen = up[:, 2] >= up[:, 2].quantile(0.9)
-    local = torch.stack(
-        [_mean(torch.tensor(clip.rot[:, j])[frames][chosen]) for j in range(len(clip.skeleton))]
-    )
+    seen = torch.tensor(clip.rot)[frames][chosen]
+    local = torch.stack([_mean(seen[:, j]) for j in range(len(clip.skeleton))])
     hips = roles.joint("hips") or 0
     vertical = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(int(chosen.sum()), 3)
     heading = facing(left[chosen], vertical)
@@ -142,8 +148,51 @@ def hinge_axis(world: World, limb: tuple[int, int, int]) -> Tensor | None:
     upper, lower = pos[:, limb[1]] - pos[:, limb[0]], pos[:, limb[2]] - pos[:, limb[1]]
     bend = torch.linalg.cross(normalize(upper), normalize(lower))
     bent = bend.norm(dim=-1) > _BENT
-    if int(bent.sum()) < 5:
+    if int(bent.sum()) < _ENOUGH:
         return None
     axes = quat_rotate_inv(quat[bent, limb[0]], normalize(bend[bent]))
     mean = axes.mean(0)
     return normalize(mean) if float(mean.norm()) > _ONE_AXIS else None
+
+
+@dataclass(frozen=True)
+class Stances:
+    """How feet are turned while they stand.
+
+    rot: per foot joint `(N, 4)` wxyz in the world, the toe turned straight ahead (+x). tilts: `(M)` rad,
+    how far the lines from ankle to toe rise in these moments, all feet.
+    """
+
+    rot: dict[int, Tensor]
+    tilts: Tensor
+
+    @staticmethod
+    def of(world: World | None, fps: float, toes: Mapping[int, Tensor | None]) -> Stances:
+        """The moments in which ankle and toe are low and slow; `toes` in the frames of their feet."""
+        rot: dict[int, Tensor] = {}
+        tilts = [torch.zeros(0, dtype=torch.float64)]
+        for j, toe in toes.items():
+            if world is None or toe is None:
+                continue
+            pos, quat = world.pos[:, j], world.quat[:, j]
+            line = quat_rotate(quat, toe.expand_as(pos))
+            points = torch.stack((pos, pos + line), 1)
+            low = points[..., 2].quantile(0.1, dim=0)
+            stands = [
+                contact_labels(points[:, [k]], fps, 0.03, 0.35, float(low[k]))[:, 0] for k in (0, 1)
+            ]
+            flat = stands[0] & stands[1]
+            x, y, z = line[flat].unbind(-1)
+            up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(x), 3)
+            rot[j] = quat_mul(axis_angle_to_quat(up, -torch.atan2(y, x)), quat[flat])
+            tilts.append(torch.atan2(z, torch.hypot(x, y)))
+        return Stances(rot, torch.cat(tilts))
+
+    def mean(self, foot: int) -> Tensor | None:
+        """`(4)` wxyz, the mean rotation of a standing foot, None where it hardly ever stands."""
+        seen = self.rot.get(foot)
+        return None if seen is None or len(seen) < _ENOUGH else _mean(seen)
+
+    def tilt(self) -> float | None:
+        """The median tilt of all standing feet, None where they hardly ever stand."""
+        return float(self.tilts.median()) if len(self.tilts) >= _ENOUGH else None

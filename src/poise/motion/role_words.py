@@ -106,13 +106,13 @@ class NameWords:
     """What a joint's name says.
 
     side: "left", "right" or "". core: its words joined, without side, prefix and numbers. tokens: the
-    same words apart. index: its last number, or None. helper: it is no part of the body.
+    same words apart. number: its last number as it is written, or "". helper: it is no part of the body.
     """
 
     side: str
     core: str
     tokens: tuple[str, ...]
-    index: int | None
+    number: str
     helper: bool
 
     def score(self, kind: str) -> float:
@@ -124,8 +124,8 @@ class NameWords:
         """Which finger the name says, or ""."""
         if self.helper:
             return ""
-        if self.core == "finger" and self.index is not None:
-            first = self.index // 10 if self.index >= 10 else self.index
+        if self.core == "finger" and self.number:
+            first = int(self.number[0])
             return _BIPED_FINGERS[first] if first < 5 else "fingers"
         found = (FINGERS[t] for t in self.tokens if t in FINGERS)
         return next(found, "fingers" if self.core == "fingerbase" else "")
@@ -135,11 +135,13 @@ class NameWords:
 def name_words(name: str) -> NameWords:
     """The words in a joint's name: "mixamorig:LeftUpLeg" is left and upleg, "lfemur" left and femur."""
     text = re.split(r"[:|]", name)[-1]
-    text = re.sub(r"^(mixamorig|character)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
+    text = re.sub(r"^(mixamorig|character|cc_base)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
+    # Character Creator calls its necks so; they are no twist bones.
+    text = re.sub(r"^NeckTwist", "Neck", text)
     raw = [t.lower() for t in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
     if len(raw) > 1 and raw[0] in ("joint", "m", "f"):
         raw = raw[1:]
-    numbers = [int(t) for t in raw if t.isdigit()]
+    numbers = [t for t in raw if t.isdigit()]
     side, tokens = "", []
     for token in (t for t in raw if not t.isdigit()):
         found, rest = _side_of(token)
@@ -147,8 +149,8 @@ def name_words(name: str) -> NameWords:
         tokens += [rest] if rest else []
     bare = [t for t in tokens if t not in _NOISE]
     core = "".join(bare)
-    helper = core in _HELPERS or any(t in _HELPERS for t in tokens) or not bare
-    return NameWords(side, core, tuple(bare), numbers[-1] if numbers else None, helper)
+    helper = core in _HELPERS or any(t in _HELPERS for t in tokens)
+    return NameWords(side, core, tuple(bare), numbers[-1] if numbers else "", helper)
 
 
 def _side_of(token: str) -> tuple[str, str]:
