@@ -8,6 +8,7 @@ from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
 from poise.kin.hinges import chain_angles, chain_quat
+from poise.kin.stance import Stance, relaxed_stance
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "FitReport",
     "GroundFit",
     "Kinematics",
+    "Stance",
     "chain_angles",
     "chain_quat",
     "clean_clip",
@@ -31,4 +33,5 @@ __all__ = [
     "lowest_height",
     "qpos_to_clip",
     "qpos_velocity",
+    "relaxed_stance",
 ]
