@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from poise.body import find_anatomy, generate_table, make_humanoid
-from poise.body.parts import plain_name
+from poise.body.naming import plain_name
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 from toy_human import human

@@ -57,7 +57,7 @@ def generate_table(
     """The parameters of a humanoid that moves like `skeleton`.
 
     Args:
-        skeleton: any human skeleton whose hands and feet can be told by name.
+        skeleton: any human skeleton whose hands and feet can be told by name or shape.
         config: mass, preset, gains, overrides.
         clips: motions of this skeleton; they tell the neutral pose (where identity rotations are no
             pose of a human) and how the soles lie.
@@ -66,7 +66,7 @@ def generate_table(
         PoiseError: unknown anatomy, zero-length legs, unknown override.
     """
     config = config or BodyConfig()
-    anatomy = find_anatomy(skeleton)
+    anatomy = find_anatomy(skeleton, clips)
     cmu = config.preset == "cmu-rfc" or (config.preset == "auto" and is_cmu(skeleton))
     if cmu:
         anatomy = anatomy.without(skeleton.names.index(n) for n in presets.CMU_MERGED)

@@ -16,8 +16,8 @@ from poise.body.table import BodyRow
 from poise.errors import PoiseError
 from poise.spatial import quat_to_matrix
 
-#: Angles of the relaxed pose: knees and elbows, rad; arms away from the trunk, degrees (the first of these
-#: at which they touch nothing).
+#: Angles of the relaxed pose: knees and elbows, rad; arms away from the trunk, degrees (the first of
+#: these at which they touch nothing).
 KNEE, ELBOW, ARMS_OUT = math.radians(4.0), math.radians(12.0), (8.0, 14.0, 20.0, 30.0)
 #: Tilt of a sole (degrees) beyond which a pose is no standing pose.
 LEVEL_DEG = 5.0
