@@ -14,6 +14,8 @@ from poise.motion import Clip, Skeleton, trim
 UNEQUAL = 0.15
 #: Upper arm over forearm, and thigh over shin (Winter 2009, table 4.1): 0.186 / 0.146, 0.245 / 0.246.
 ARM_RATIO, LEG_RATIO = 1.27, 1.0
+#: Distance of the hips over the leg's length, and of the shoulders over the arm's, at least.
+HIP_WIDTH, SHOULDER_WIDTH = 0.1, 0.4
 
 
 @dataclass(frozen=True)
@@ -32,20 +34,18 @@ class Limbs:
 def find_limbs(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Limbs | None:
     """The legs and arms of a human tree, or None where it has no two pairs of equal limbs.
 
-    A pair of limbs are two sibling subtrees of the same length and number of joints. The two longest
+    A pair of limbs are two sibling subtrees whose longest ways down have equal bones. The two longest
     pairs that do not lie in one another are legs and arms; the legs are those whose ends are lower in
     the first frame of the first clip, else in the rest pose. Left and right follow from the toes.
     """
     pose = trim(clips[0], 0, 2).positions()[0] if clips else skeleton.rest_positions()
     lines = {j: _line(skeleton, j) for j in range(len(skeleton))}
-    lengths = {j: _length(skeleton, line) for j, line in lines.items()}
     pairs = []
     for parent in range(len(skeleton)):
         for a, b in itertools.combinations(skeleton.children(parent), 2):
-            long = max(lengths[a], lengths[b])
-            alike = long > 0 and abs(lengths[a] - lengths[b]) <= UNEQUAL * long
-            if alike and len(lines[a]) == len(lines[b]) >= 3:
-                pairs.append((long, a, b))
+            one, two = _bones(skeleton, lines[a]), _bones(skeleton, lines[b])
+            if len(one) == len(two) >= 2 and np.abs(one - two).max() <= UNEQUAL * one.sum():
+                pairs.append((float(one.sum()), a, b))
     pairs.sort(reverse=True)
     outer = [p for p in pairs if not any(_inside(skeleton, p[1], q[1:]) for q in pairs if q is not p)]
     if len(outer) < 2:
@@ -61,13 +61,15 @@ def find_limbs(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Limbs | None:
         why = "they hang nearest to the root"
     else:
         why = "their ends are the lowest"
-    legs = [_leg(lines[j], pose) for j in low[1:]]
-    arms = [_arm(skeleton, lines[j]) for j in high[1:]]
+    legs = _limb([lines[j] for j in low[1:]], pose, LEG_RATIO, HIP_WIDTH, True)
+    reach = [_to_wrist(skeleton, lines[j]) for j in high[1:]]
+    least = min(map(len, reach))
+    arms = _limb([line[:least] for line in reach], pose, ARM_RATIO, SHOULDER_WIDTH, False)
     left, side_why = _left_first(skeleton, legs, lines, low[1:], pose)
     order = (0, 1) if left else (1, 0)
     # The arm that is on the left leg's side is the left one.
     across = pose[legs[order[0]][0]] - pose[legs[order[1]][0]]
-    arm_left = (pose[arms[0][0]] - pose[arms[1][0]]) @ across > 0
+    arm_left = (pose[list(arms[0][:2])] - pose[list(arms[1][:2])]).sum(0) @ across > 0
     arm_order = (0, 1) if arm_left else (1, 0)
     evidence = (
         f"No names tell the limbs, so {names[low[1]]} and {names[low[2]]} were taken for the legs, "
@@ -121,8 +123,9 @@ def _depth(skeleton: Skeleton, joint: int) -> int:
     return out
 
 
-def _length(skeleton: Skeleton, line: Sequence[int]) -> float:
-    return float(sum(np.linalg.norm(skeleton.offsets[j]) for j in line[1:]))
+def _bones(skeleton: Skeleton, line: Sequence[int]) -> np.ndarray:
+    """Lengths (m) of the bones of a way down, the one above its first joint left out."""
+    return np.linalg.norm(skeleton.offsets[list(line[1:])], axis=-1)
 
 
 def _line(skeleton: Skeleton, joint: int) -> list[int]:
@@ -130,52 +133,58 @@ def _line(skeleton: Skeleton, joint: int) -> list[int]:
     below = [_line(skeleton, c) for c in skeleton.children(joint)]
     if not below:
         return [joint]
-    offsets = skeleton.offsets
-    return [joint, *max(below, key=lambda w: _length(skeleton, w) + np.linalg.norm(offsets[w[0]]))]
+    # The number of joints counts where skin meshes of no length hang beside the end.
+    return [joint, *max(below, key=lambda w: (round(_reach(skeleton, w), 6), len(w)))]
 
 
-def _leg(line: Sequence[int], pose: np.ndarray) -> tuple[int, int, int]:
-    """Hip, knee and ankle on a way from the hip to the toes.
+def _reach(skeleton: Skeleton, line: Sequence[int]) -> float:
+    return float(np.linalg.norm(skeleton.offsets[line[0]]) + _bones(skeleton, line).sum())
 
-    Equal thigh and shin, the longest such pair, and no more behind the ankle than a foot.
+
+def _limb(
+    lines: Sequence[Sequence[int]], pose: np.ndarray, ratio: float, width: float, upright: bool
+) -> list[tuple[int, int, int]]:
+    """The three joints of both limbs of a pair, at the same places of their ways from the trunk.
+
+    Of all triples the one whose upper and lower bone have the human ratio and make the most of the way;
+    triples whose first joints stand closer than `width` of both bones, as those of collar bones and hip
+    helpers do, come last.
     """
+    at = [
+        np.cumsum([0.0, *(np.linalg.norm(pose[b] - pose[a]) for a, b in itertools.pairwise(line))])
+        for line in lines
+    ]
 
     def cost(way: tuple[int, int, int]) -> float:
-        thigh, shin = (float(np.linalg.norm(pose[b] - pose[a])) for a, b in itertools.pairwise(way))
-        if min(thigh, shin) < 1e-6:
-            return np.inf
-        whole = float(sum(np.linalg.norm(pose[b] - pose[a]) for a, b in itertools.pairwise(line)))
-        # The straight way of both counts, so that a helper on the way to the hip is left out.
-        lean = pose[way[0]] - pose[way[2]]
-        upright = abs(lean[2]) / max(float(np.linalg.norm(lean)), 1e-9)
-        foot = 0.0 if way[2] == line[-1] else -0.3
-        return abs(np.log(thigh / shin / LEG_RATIO)) - 2 * (thigh + shin) / whole - upright + foot
+        out = 0.0
+        for line, along in zip(lines, at, strict=True):
+            upper, lower = along[way[1]] - along[way[0]], along[way[2]] - along[way[1]]
+            if min(upper, lower) < 1e-6:
+                return np.inf
+            out += 2 * abs(np.log(upper / lower / ratio)) - (upper + lower) / along[-1]
+            lean = pose[line[way[0]]] - pose[line[way[2]]]
+            out -= abs(lean[2]) / max(float(np.linalg.norm(lean)), 1e-9) if upright else 0.0
+            # A leg that stands ends in a foot.
+            out -= 0.3 if upright and way[2] < len(line) - 1 else 0.0
+            apart = np.linalg.norm(pose[lines[0][way[0]]] - pose[lines[1][way[0]]])
+            out += 2.0 if apart < width * (upper + lower) else 0.0
+        return out
 
-    return min(itertools.combinations(line, 3), key=cost)
+    best = min(itertools.combinations(range(len(lines[0])), 3), key=cost)
+    return [(line[best[0]], line[best[1]], line[best[2]]) for line in lines]
 
 
-def _arm(skeleton: Skeleton, line: Sequence[int]) -> tuple[int, int, int]:
-    """Shoulder, elbow and wrist on a way from the collar bone to a finger tip.
-
-    The wrist is no later than the first joint that bears several fingers.
-    """
-
-    def fingers(joint: int) -> int:
-        # A leaf beside the limb is a twist bone or a helper.
-        return sum(bool(skeleton.children(c)) for c in skeleton.children(joint))
-
-    forks = [i for i, j in enumerate(line) if i >= 2 and fingers(j) > 1]
-    line = line[: forks[0] + 1] if forks else line
-    at = np.cumsum([0.0, *(np.linalg.norm(skeleton.offsets[j]) for j in line[1:])])
-
-    def cost(way: tuple[int, int, int]) -> float:
-        upper, fore = at[way[1]] - at[way[0]], at[way[2]] - at[way[1]]
-        if min(upper, fore) < 1e-6:
-            return np.inf
-        return 2 * abs(np.log(upper / fore / ARM_RATIO)) - (upper + fore) / max(at[-1], 1e-9)
-
-    a, b, c = min(itertools.combinations(range(len(line)), 3), key=cost)
-    return line[a], line[b], line[c]
+def _to_wrist(skeleton: Skeleton, line: Sequence[int]) -> list[int]:
+    """A way from the collar bone, no farther than the first joint that bears several fingers."""
+    for i in range(2, len(line) - 1):
+        on = skeleton.offsets[line[i + 1]]
+        for c in skeleton.children(line[i]):
+            beside = skeleton.offsets[c]
+            size = np.linalg.norm(on) * np.linalg.norm(beside)
+            # What hangs on the line itself is a twist bone, and what has no length a mesh.
+            if c != line[i + 1] and size > 1e-9 and on @ beside < 0.97 * size:
+                return list(line[: i + 1])
+    return list(line)
 
 
 def _left_first(
