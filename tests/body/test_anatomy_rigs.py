@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from poise.body import find_anatomy
-from poise.body.naming import is_head, is_helper, plain_name
 from rigs import STYLES, Rig, rig
 
 PARTS = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "shin", "foot")
@@ -68,36 +67,3 @@ def test_a_long_spine_keeps_five_bodies_and_its_chest():
     # The longest bones remain.
     kept = {skeleton.names[j] for j in anatomy.of("spine")}
     assert {"Spine3", "Spine7"} <= kept
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("J_Bip_L_UpperLeg", ("left", "upperleg")),
-        ("Bip01 R Thigh", ("right", "thigh")),
-        ("lShldrBend", ("left", "shldrbend")),
-        ("DEF-thigh.L.001", ("left", "def-thigh")),
-        ("Armature|L_UpLeg", ("left", "upleg")),
-        ("mixamorig1:RightHand", ("right", "hand")),
-        ("左足", ("left", "足")),
-        ("lumbar", ("", "lumbar")),
-        ("ribcage", ("", "ribcage")),
-    ],
-)
-def test_more_sides_are_told_from_names(name, expected):
-    assert plain_name(name) == expected
-
-
-def test_helpers_are_told_from_joints():
-    helpers = (
-        "ik_foot_l",
-        "upperarm_twist_01_l",
-        "LeftArmRoll",
-        "L_Talus_RIGMESH",
-        "Head_End",
-        "VB foot",
-    )
-    assert all(map(is_helper, helpers))
-    assert not any(map(is_helper, ("LeftFoot", "Spike", "bend", "Bip01", "Weekend", "LeftShoulder")))
-    assert is_head("CC_Base_Head") and is_head("Bip01 Head") and is_head("head")
-    assert not is_head("HeadTop_End") and not is_head("forehead") and not is_head("LeftHead")

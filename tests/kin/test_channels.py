@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from poise.body import find_anatomy, generate_table
+from poise.body import BodyTable, find_anatomy, generate_table
 from poise.kin import clip_to_qpos, qpos_to_clip
 from poise.kin.fk import Kinematics
+from poise.motion import Clip
 from poise.spatial import quat_angle, quat_conj, quat_mul
 from rigs import Rig, rig
 
@@ -26,7 +27,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return quat_angle(quat_mul(quat_conj(torch.tensor(a)), torch.tensor(b))).numpy()
 
 
-def made(variant: tuple) -> tuple[Rig, object, object]:
+def made(variant: tuple) -> tuple[Rig, Clip, BodyTable]:
     style, pose, twist, fingers, helpers = variant
     one = rig(style, pose, twist, fingers, helpers)
     clip = one.clip(seed=3)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from poise.body.naming import first_named, is_head, is_helper, is_neck, limb_named
 from poise.body.topology import find_limbs, head_line
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
+from poise.motion.role_words import name_words
+from poise.motion.roles import Roles, find_roles
 
 #: Bodies of the trunk and the neck at most; where a skeleton has more joints there, the shortest bones
 #: ride on their parents, since a long chain of servos is soft.
@@ -103,73 +104,68 @@ def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
     Raises:
         PoiseError: where a foot or a hand can be told neither by name nor by shape.
     """
-    legs, arms, ends = _limbs_by_name(skeleton)
+    roles = find_roles(skeleton)
+    legs, arms = _limbs(roles, ("thigh", "shin", "foot")), _limbs(roles, _ARM)
     evidence: tuple[str, ...] = ()
     pose: np.ndarray | None = None
     if len(legs) + len(arms) < 4:
         shape = find_limbs(skeleton, clips)
         if shape is None:
-            raise _missing(skeleton, ends, legs, arms)
+            raise _missing(roles, legs, arms)
         legs, arms, evidence, pose = shape.legs, shape.arms, shape.evidence, shape.pose
     pelvis = _common(skeleton, legs["left"][2], legs["right"][2])
     chest = _common(skeleton, arms["left"][2], arms["right"][2])
     # Where the hips and the spine hang side by side, the joint that carries both is the pelvis.
     pelvis = _common(skeleton, pelvis, chest)
     kinds: dict[int, tuple[str, str]] = {pelvis: ("pelvis", "")}
-    spine = [j for j in _path(skeleton, pelvis, chest) if j == chest or not is_helper(skeleton.names[j])]
+    spine = [j for j in _path(skeleton, pelvis, chest) if j == chest or not _helper(skeleton, j)]
     for j in _longest(skeleton, spine, MOST_SPINE):
         kinds[j] = ("spine", "")
     toes: list[tuple[str, int]] = []
-    for side in ("left", "right"):
+    for side in _SIDES:
         for line, names in ((legs[side], ("thigh", "shin", "foot")), (arms[side], _ARM)):
             kinds |= {j: (kind, side) for j, kind in zip(line, names, strict=True)}
-        above = [
-            j for j in _path(skeleton, chest, arms[side][0])[:-1] if not is_helper(skeleton.names[j])
-        ]
+        above = [j for j in _path(skeleton, chest, arms[side][0])[:-1] if not _helper(skeleton, j)]
         if above:
             kinds[above[-1]] = ("clavicle", side)
-        below = [c for c in skeleton.children(legs[side][2]) if not is_helper(skeleton.names[c])]
+        below = [c for c in skeleton.children(legs[side][2]) if not _helper(skeleton, c)]
         if below:
             # A heel bone or the like may hang beside the toes.
             named = [c for c in below if any(w in skeleton.names[c].lower() for w in ("toe", "ball"))]
             toes.append((side, (named or below)[0]))
-    kinds |= _neck_and_head(skeleton, chest, kinds, pose)
+    kinds |= _neck_and_head(roles, chest, kinds, pose)
     parts = tuple(Part(j, *kinds[j]) for j in _depth_first(skeleton) if j in kinds)
     return Anatomy(parts, tuple(toes), evidence)
 
 
+_SIDES = ("left", "right")
 _ARM = ("upper_arm", "forearm", "hand")
 _Lines = dict[str, tuple[int, int, int]]
 
 
-def _limbs_by_name(skeleton: Skeleton) -> tuple[_Lines, _Lines, dict[str, int | None]]:
-    """Legs and arms by side as far as names tell them, and the feet and hands that names tell."""
-    ends = {
-        f"{side} {kind}": first_named(skeleton, kind, side)
-        for side in ("left", "right")
-        for kind in ("foot", "hand")
-    }
-    legs: _Lines = {}
-    arms: _Lines = {}
-    if any(j is None for j in ends.values()):
-        return legs, arms, ends
-    at = {label: j for label, j in ends.items() if j is not None}
-    chest = _common(skeleton, at["left hand"], at["right hand"])
-    pelvis = _common(skeleton, _common(skeleton, at["left foot"], at["right foot"]), chest)
-    for side in ("left", "right"):
-        leg = limb_named(
-            skeleton, _path(skeleton, pelvis, at[f"{side} foot"]), ("thigh", "shin", "foot")
-        )
-        arm = limb_named(skeleton, _path(skeleton, chest, at[f"{side} hand"]), _ARM)
-        if leg:
-            legs[side] = leg
-        if arm:
-            arms[side] = arm
-    return legs, arms, ends
+def _helper(skeleton: Skeleton, joint: int) -> bool:
+    """Whether a joint's name says that it helps the rig or its skin: twist bones, IK targets, meshes."""
+    words = name_words(skeleton.names[joint])
+    # A name without a word ("bone07") says nothing.
+    return words.helper and bool(words.tokens)
 
 
-def _missing(skeleton: Skeleton, ends: dict[str, int | None], legs: _Lines, arms: _Lines) -> PoiseError:
+def _limbs(roles: Roles, kinds: tuple[str, str, str]) -> _Lines:
+    """The three joints of a limb by side, for the sides on which all of them are known."""
+    out: _Lines = {}
+    for side in _SIDES:
+        a, b, c = (roles.joint(f"{side}_{kind}") for kind in kinds)
+        if a is not None and b is not None and c is not None:
+            out[side] = (a, b, c)
+    return out
+
+
+def _missing(roles: Roles, legs: _Lines, arms: _Lines) -> PoiseError:
     """What keeps this skeleton from being a human's."""
+    skeleton = roles.skeleton
+    ends = {
+        f"{side} {kind}": roles.joint(f"{side}_{kind}") for kind in ("foot", "hand") for side in _SIDES
+    }
     for label, joint in ends.items():
         if joint is None:
             name = "".join(word.capitalize() for word in label.split())
@@ -179,11 +175,11 @@ def _missing(skeleton: Skeleton, ends: dict[str, int | None], legs: _Lines, arms
                 f"Name the joint '{name}' or similar",
             )
     for what, found, end in (("leg", legs, "foot"), ("arm", arms, "hand")):
-        for side in ("left", "right"):
-            joint = ends[f"{side} {end}"]
+        both = [ends[f"{side} {end}"] for side in _SIDES]
+        for side, joint in zip(_SIDES, both, strict=True):
             if side not in found and joint is not None:
-                other = ends[f"{'right' if side == 'left' else 'left'} {end}"]
-                line = _path(skeleton, _common(skeleton, joint, other or joint), joint)
+                top = _common(skeleton, both[0] or 0, both[1] or 0)
+                line = _path(skeleton, top, joint)
                 return PoiseError(
                     f"the {side} {what} has {len(line)} joints "
                     f"({', '.join(skeleton.names[j] for j in line)}) and needs at least 3",
@@ -204,16 +200,16 @@ def _longest(skeleton: Skeleton, line: Sequence[int], most: int) -> list[int]:
 
 
 def _neck_and_head(
-    skeleton: Skeleton, chest: int, kinds: dict[int, tuple[str, str]], pose: np.ndarray | None
+    roles: Roles, chest: int, kinds: dict[int, tuple[str, str]], pose: np.ndarray | None
 ) -> dict[int, tuple[str, str]]:
     """Necks and head above the chest: by name, else (told by shape) the highest central branch."""
-    above = [j for j in range(len(skeleton)) if j not in kinds and chest in _ancestors(skeleton, j)]
-    names = skeleton.names
-    necks = [j for j in above if is_neck(names[j])]
-    heads = [j for j in above if is_head(names[j])]
+    skeleton = roles.skeleton
+    necks = [j for j in roles.chain("neck") if j not in kinds and chest in _ancestors(skeleton, j)]
+    head = roles.joint("head")
+    heads = [head] if head is not None and chest in _ancestors(skeleton, head) else []
     if pose is not None and not necks and not heads:
         limbs = [j for j, (kind, _) in kinds.items() if kind in _ARM]
         line = head_line(skeleton, chest, limbs, pose)
         necks, heads = line[:1], line[1:2]
     out = {j: ("neck", "") for j in _longest(skeleton, necks, MOST_NECK)}
-    return out | {j: ("head", "") for j in heads[:1]}
+    return out | {j: ("head", "") for j in heads}

@@ -151,7 +151,7 @@ def _limb(
     helpers do, come last.
     """
     at = [
-        np.cumsum([0.0, *(np.linalg.norm(pose[b] - pose[a]) for a, b in itertools.pairwise(line))])
+        np.append(0.0, np.linalg.norm(np.diff(pose[list(line)], axis=0), axis=-1).cumsum())
         for line in lines
     ]
 

@@ -104,7 +104,9 @@ class NameWords:
 def name_words(name: str) -> NameWords:
     """The words in a joint's name: "mixamorig:LeftUpLeg" is ("left", "upleg"), "lfemur" ("left", "femur")."""
     text = re.split(r"[:|]", name)[-1]
-    text = re.sub(r"^(mixamorig|character)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
+    text = re.sub(r"^(mixamorig|character|cc_base)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
+    # Character Creator calls its necks so; they are no twist bones.
+    text = re.sub(r"^NeckTwist", "Neck", text)
     raw = [t.lower() for t in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
     if len(raw) > 1 and raw[0] in ("joint", "m", "f"):
         raw = raw[1:]
