@@ -21,6 +21,9 @@ from poise.spatial import quat_to_matrix
 KNEE, ELBOW, ARMS_OUT = math.radians(4.0), math.radians(12.0), (8.0, 14.0, 20.0, 30.0)
 #: Tilt of a sole (degrees) beyond which a pose is no standing pose.
 LEVEL_DEG = 5.0
+#: Where the centre of mass stands between the ankles (0) and the middle of the soles (1). A person's is
+#: 2 to 5 cm ahead of the ankles; servos give way forward by as much again at 1.
+AHEAD = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,20 +47,20 @@ def relaxed_stance(humanoid: Humanoid) -> Stance:
     """The pose in which this humanoid stands at ease.
 
     Least squares over the root's turn and all hinges within their ranges: legs straight but for `KNEE`,
-    soles level, level with each other and pointing ahead, pelvis and shoulders square, trunk and head
-    upright, arms hanging, other turns near the neutral pose; and, weighted most, the centre of mass over
-    the middle of the soles.
+    soles level, abreast, as far apart as the hips and pointing ahead, pelvis and shoulders square,
+    trunk and head upright, arms hanging, other turns near the neutral pose; and, weighted most, the
+    centre of mass over the soles, a little ahead of the ankles (`AHEAD`).
 
     Raises:
         PoiseError: no foot with a sole, or no such pose within the joint ranges.
     """
-    best = None
-    for out in ARMS_OUT:
-        solver = _Solver(humanoid, math.radians(out))
-        best = solver.solve()
+    solver = _Solver(humanoid)
+    best = solver.solve()
+    for out in ARMS_OUT[1:]:
         if not solver.arms_touch():
             break
-    assert best is not None
+        solver.arms_out = math.radians(out)
+        best = solver.solve()
     if best.margin_m <= 0 or best.tilt_deg > LEVEL_DEG:
         raise PoiseError(
             f"no pose within the joint ranges stands: the soles tilt by {best.tilt_deg:.0f} degrees and "
@@ -101,10 +104,13 @@ def sole_corners(row: BodyRow) -> np.ndarray:
 class _Solver:
     """The least-squares problem of one stance. Unknowns: root rotation vector, then hinges."""
 
-    def __init__(self, humanoid: Humanoid, arms_out: float) -> None:
+    def __init__(self, humanoid: Humanoid) -> None:
         self.model, self.rows = humanoid.model, humanoid.table.rows
         self.data = mujoco.MjData(self.model)
-        self.height, self.arms_out = humanoid.table.height_m, arms_out
+        self.first: dict[tuple[str, str], int] = {}
+        for i, row in enumerate(self.rows):
+            self.first.setdefault((row.kind, row.side), i)
+        self.height, self.arms_out = humanoid.table.height_m, math.radians(ARMS_OUT[0])
         self.feet = {self.rows[i].side: i for i in humanoid.feet}
         if set(self.feet) != {"left", "right"}:
             raise PoiseError("the body needs a left and a right foot to stand")
@@ -117,10 +123,12 @@ class _Solver:
         limits = [limit for row in self.rows for limit in row.ranges]
         self.low, self.high = np.array(limits).reshape(-1, 2).T
         self.start = self._upright()
+        #: The solution, from which the next one starts.
+        self.found = np.concatenate((np.zeros(3), np.clip(np.zeros(len(limits)), self.low, self.high)))
 
     def _one(self, kind: str, side: str = "") -> int | None:
-        found = [i for i, r in enumerate(self.rows) if r.kind == kind and (not side or r.side == side)]
-        return found[0] if found else None
+        """The first row of a kind and side."""
+        return self.first.get((kind, side))
 
     def _pose(self, x: np.ndarray) -> None:
         self.data.qpos[:3] = 0.0
@@ -179,8 +187,9 @@ class _Solver:
         for side, sign in (("left", 1.0), ("right", -1.0)):
             thigh, shin, foot = (one(k, side) for k in ("thigh", "shin", "foot"))
             # The knee goes forward by as much as the shin comes back.
-            out.append(to(thigh, shin) - _down(KNEE / 2, 0.0))
-            out.append(to(shin, foot) - _down(-KNEE / 2, 0.0))
+            bend = _down(-KNEE / 2, 0.0) - _down(KNEE / 2, 0.0)
+            out.append(to(thigh, foot) - _down(0.0, 0.0))
+            out.append(2.0 * (to(shin, foot) - to(thigh, shin) - bend))
             arm, fore, hand = (one(k, side) for k in ("upper_arm", "forearm", "hand"))
             out.append(to(arm, fore) - _down(0.0, sign * self.arms_out))
             out.append(0.7 * (to(fore, hand) - _down(ELBOW, sign * self.arms_out / 2)))
@@ -193,8 +202,13 @@ class _Solver:
             out.append(0.5 * (to(neck, head) - z))
         points = self._sole_points()
         middle = np.mean([p.mean(0) for p in points.values()], 0)
+        ankles = np.mean([self._at(i) for i in self.feet.values()], 0)
+        middle[:2] = ankles[:2] + AHEAD * (middle - ankles)[:2]
         apart = points["left"][:, 2].mean() - points["right"][:, 2].mean()
-        out.append(np.array([20.0 * apart / self.height]))
+        out.append(np.array([200.0 * apart / self.height]))
+        span = self._at(self.feet["left"]) - self._at(self.feet["right"])
+        hips_apart = np.linalg.norm(self._at(one("thigh", "left")) - self._at(one("thigh", "right")))
+        out.append(np.array([span[0], max(0.0, hips_apart - span[1])]) * 20.0 / self.height)
         out.append(20.0 * (self.data.subtree_com[1] - middle)[:2] / self.height)
         out.append(0.05 * x[3:])
         return np.concatenate([np.atleast_1d(v) for v in out])
@@ -203,9 +217,10 @@ class _Solver:
         count = len(self.low)
         low, high = np.full(3 + count, -np.inf), np.full(3 + count, np.inf)
         low[3:], high[3:] = self.low - 1e-9, self.high + 1e-9
-        start = np.concatenate((np.zeros(3), np.clip(np.zeros(count), self.low, self.high)))
-        found = least_squares(self.residuals, start, bounds=(low, high), max_nfev=80)
-        self._pose(found.x)
+        self.found = least_squares(
+            self.residuals, self.found, bounds=(low, high), max_nfev=60, ftol=1e-6, xtol=1e-6
+        ).x
+        self._pose(self.found)
         points = self._sole_points()
         every = np.concatenate(list(points.values()))
         self.data.qpos[:3] -= (*np.mean([p.mean(0) for p in points.values()], 0)[:2], every[:, 2].min())
