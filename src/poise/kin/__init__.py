@@ -8,6 +8,9 @@ from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
 from poise.kin.hinges import chain_angles, chain_quat
+from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
+from poise.kin.retarget import RetargetConfig, retarget
+from poise.kin.retarget_report import RetargetReport
 from poise.kin.stance import Stance, relaxed_stance
 from poise.kin.velocity import qpos_velocity
 
@@ -18,7 +21,11 @@ __all__ = [
     "FitReport",
     "GroundFit",
     "Kinematics",
+    "Limb",
+    "RetargetConfig",
+    "RetargetReport",
     "Stance",
+    "TwoBone",
     "chain_angles",
     "chain_quat",
     "clean_clip",
@@ -30,8 +37,13 @@ __all__ = [
     "find_faults",
     "fit_ground",
     "fit_humanoid",
+    "limb_of",
     "lowest_height",
+    "match_positions",
     "qpos_to_clip",
     "qpos_velocity",
     "relaxed_stance",
+    "retarget",
+    "shortest_arc",
+    "two_bone",
 ]

@@ -127,7 +127,7 @@ def fit_ground(
         lift = max(-float(np.median(stance)), lift - 2 * SINK_M)
     reach = max(1, round(0.1 * fps))
     # The mirror image of a clearance: a running minimum, so that no frame is lowered beyond its excess.
-    settle = np.maximum(-_smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
+    settle = np.maximum(-smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
     low_now = low + lift - settle
     clear = _clearance(np.maximum(-low_now - sink_m, 0.0), reach, cyclic)
     out = np.array(qpos)
@@ -153,10 +153,10 @@ def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
 
 def _clearance(depth: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
     """The smooth lift `(T,)` that covers `depth (T,)`, both in m."""
-    return np.maximum(_smooth_hull(depth, reach, cyclic), 0.0) * float(depth.max() > 1e-4)
+    return np.maximum(smooth_hull(depth, reach, cyclic), 0.0) * float(depth.max() > 1e-4)
 
 
-def _smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
+def smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
     """The running maximum of `values (T,)` over +-reach frames, averaged over as many."""
     if cyclic:
         # The last frame is the first one again, so it counts once.

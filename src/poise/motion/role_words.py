@@ -18,7 +18,14 @@ _WORDS: dict[str, dict[str, float]] = {
     },
     "neck": {"neck": 1, "lowerneck": 1, "upperneck": 1, "neckbase": 1, "necklower": 1, "neckupper": 1},
     "head": {"head": 1, "skull": 1},
-    "clavicle": {"clavicle": 1, "collar": 1, "collarbone": 1, "clav": 1, "scapula": 0.9, "shoulder": 0.8},
+    "clavicle": {
+        "clavicle": 1,
+        "collar": 1,
+        "collarbone": 1,
+        "clav": 1,
+        "scapula": 0.9,
+        "shoulder": 0.8,
+    },
     "upper_arm": {
         **{"upperarm": 1, "arm": 1, "humerus": 1, "shldr": 1, "uparm": 1, "shoulder": 0.8, "bicep": 1},
         **{"shldrbend": 1, "armupper": 1},
@@ -56,11 +63,35 @@ _BIPED_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 #: Words of joints that carry no part of the body: tips, twist bones, control rigs, faces, clothes.
 _HELPERS = frozenset(
     (
-        *("end", "nub", "tip", "top", "site", "effector", "rigmesh", "mesh", "twist", "roll", "ik", "fk"),
+        *(
+            "end",
+            "nub",
+            "tip",
+            "top",
+            "site",
+            "effector",
+            "rigmesh",
+            "mesh",
+            "twist",
+            "roll",
+            "ik",
+            "fk",
+        ),
         *("pole", "target", "ctrl", "control", "helper", "sec", "adj", "eye", "jaw", "hair", "skirt"),
         *("breast", "bust", "tongue", "brow", "eyebrow", "lip", "cheek", "ear", "nose", "weapon", "gun"),
         *("prop", "attach", "socket", "cloth", "tail", "hat", "holster", "corrective", "correctiveroot"),
-        *("mch", "org", "interaction", "center", "hipjoint", "buttock", "lid", "eyelid", "face", "teeth"),
+        *(
+            "mch",
+            "org",
+            "interaction",
+            "center",
+            "hipjoint",
+            "buttock",
+            "lid",
+            "eyelid",
+            "face",
+            "teeth",
+        ),
     )
 )
 #: Words that say nothing about the part.
@@ -75,13 +106,13 @@ class NameWords:
     """What a joint's name says.
 
     side: "left", "right" or "". core: its words joined, without side, prefix and numbers. tokens: the
-    same words apart. index: its last number, or None. helper: it is no part of the body.
+    same words apart. number: its last number as it is written, or "". helper: it is no part of the body.
     """
 
     side: str
     core: str
     tokens: tuple[str, ...]
-    index: int | None
+    number: str
     helper: bool
 
     def score(self, kind: str) -> float:
@@ -93,8 +124,8 @@ class NameWords:
         """Which finger the name says, or ""."""
         if self.helper:
             return ""
-        if self.core == "finger" and self.index is not None:
-            first = self.index // 10 if self.index >= 10 else self.index
+        if self.core == "finger" and self.number:
+            first = int(self.number[0])
             return _BIPED_FINGERS[first] if first < 5 else "fingers"
         found = (FINGERS[t] for t in self.tokens if t in FINGERS)
         return next(found, "fingers" if self.core == "fingerbase" else "")
@@ -102,7 +133,7 @@ class NameWords:
 
 @cache
 def name_words(name: str) -> NameWords:
-    """The words in a joint's name: "mixamorig:LeftUpLeg" is ("left", "upleg"), "lfemur" ("left", "femur")."""
+    """The words in a joint's name: "mixamorig:LeftUpLeg" is left and upleg, "lfemur" left and femur."""
     text = re.split(r"[:|]", name)[-1]
     text = re.sub(r"^(mixamorig|character|cc_base)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
     # Character Creator calls its necks so; they are no twist bones.
@@ -110,7 +141,7 @@ def name_words(name: str) -> NameWords:
     raw = [t.lower() for t in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
     if len(raw) > 1 and raw[0] in ("joint", "m", "f"):
         raw = raw[1:]
-    numbers = [int(t) for t in raw if t.isdigit()]
+    numbers = [t for t in raw if t.isdigit()]
     side, tokens = "", []
     for token in (t for t in raw if not t.isdigit()):
         found, rest = _side_of(token)
@@ -118,8 +149,8 @@ def name_words(name: str) -> NameWords:
         tokens += [rest] if rest else []
     bare = [t for t in tokens if t not in _NOISE]
     core = "".join(bare)
-    helper = core in _HELPERS or any(t in _HELPERS for t in tokens) or not bare
-    return NameWords(side, core, tuple(bare), numbers[-1] if numbers else None, helper)
+    helper = core in _HELPERS or any(t in _HELPERS for t in tokens)
+    return NameWords(side, core, tuple(bare), numbers[-1] if numbers else "", helper)
 
 
 def _side_of(token: str) -> tuple[str, str]:
@@ -147,7 +178,8 @@ _SMPL_SIDED = "Hip Knee Ankle Foot Collar Shoulder Elbow Wrist"
 CONVENTIONS: dict[str, frozenset[str]] = {
     "Mixamo or MotionBuilder": _both(_SIDED, f"{_ARM} {_UPLEG} ToeBase")
     | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
-    "LAFAN1": _both(_SIDED, f"{_ARM} {_UPLEG} Toe") | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
+    "LAFAN1": _both(_SIDED, f"{_ARM} {_UPLEG} Toe")
+    | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
     "CMU (ASF)": _both(
         ("l{}", "r{}"),
         "hipjoint femur tibia foot toes clavicle humerus radius wrist hand fingers thumb",
@@ -169,9 +201,7 @@ CONVENTIONS: dict[str, frozenset[str]] = {
     | {"Pelvis", "Spine1", "Spine2", "Spine3", "Neck", "Head"},
     "SMPL-X": _both(("left_{}", "right_{}"), _SMPL_SIDED.lower())
     | {"pelvis", "spine1", "spine2", "spine3", "neck", "head"},
-    "Unreal mannequin": _both(
-        ("{}_l", "{}_r"), "clavicle upperarm lowerarm hand thigh calf foot ball"
-    )
+    "Unreal mannequin": _both(("{}_l", "{}_r"), "clavicle upperarm lowerarm hand thigh calf foot ball")
     | {"root", "pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"},
     "VRM (VRoid)": _both(
         ("J_Bip_L_{}", "J_Bip_R_{}"), "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase"

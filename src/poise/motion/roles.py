@@ -82,7 +82,7 @@ class Roles:
         return tuple(role for role in needed if role not in have)
 
     def require(self, needed: tuple[str, ...] = NEEDED) -> None:
-        """Raises a PoiseError that names the missing parts, those found, and how to name them by hand."""
+        """Raises a PoiseError that names what is missing, what was found and how to state the rest."""
         lost = self.missing(needed)
         if not lost:
             return
@@ -117,9 +117,9 @@ def check_role(role: str) -> str:
 def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> Roles:
     """The parts that the joints of a human skeleton play.
 
-    Names say most; of names that can be read in several ways ("LeftShoulder" is a clavicle for Mixamo and
-    an upper arm for Xsens) the reading is taken that makes most of the whole limb. What carries both legs
-    is the pelvis, what lies between it and the arms the spine.
+    Names say most; of names that can be read in several ways ("LeftShoulder" is a clavicle for Mixamo
+    and an upper arm for Xsens) the reading is taken that makes most of the whole limb. What carries both
+    legs is the pelvis, what lies between it and the arms the spine.
 
     Args:
         stated: roles known beforehand, by joint name; they overrule all guesses.
@@ -291,7 +291,7 @@ class _Finder:
         return next((r.role for r in self.found.values() if r.joint == joint), "")
 
     def _above(self, joint: int, top: int) -> int | None:
-        """The next joint between `joint` and `top` that could be a part: a bone's length away, no helper."""
+        """The next joint between `joint` and `top` that could be a part: a bone away, no helper."""
         length = self.lengths[joint]
         j = self.skeleton.parents[joint]
         while j not in (top, -1):

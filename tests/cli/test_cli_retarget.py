@@ -1,0 +1,102 @@
+"""`poise retarget`: files in, a file on the other skeleton out, mistakes in one sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_clips import bvh, put
+
+from poise.cli.main import main
+from poise.cli.retarget import pairs
+from poise.errors import PoiseError
+from poise.motion import Clip, Skeleton, read_clip, write_clip
+from toy_human import human, swing
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    """A walk, and the file of a bigger person whose joints are called otherwise."""
+    clip = swing(seconds=1.0, speed=1.0)
+    here, there = tmp_path / "walk.bvh", tmp_path / "big.bvh"
+    write_clip(clip, here)
+    names = {"LeftArm": "LeftUpperArm", "RightArm": "RightUpperArm", "Hips": "pelvis", "Neck": "neck_01"}
+    big = human(1.1)
+    skeleton = Skeleton(tuple(names.get(n, n) for n in big.names), big.parents, big.offsets, big.ends)
+    still = np.zeros((3, len(big), 4))
+    still[..., 0] = 1.0
+    write_clip(Clip(skeleton, np.tile((0.0, 0.0, 1.0), (3, 1)), still, 30.0), there)
+    return here, there
+
+
+def test_a_clip_goes_onto_the_skeleton_of_another_file(files, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out.bvh"
+    assert main(["retarget", str(files[0]), "--onto", str(files[1]), "-o", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "LeftUpperArm" in said and "the name 'LeftUpLeg' says so" in said
+    assert "Steps are scaled by" in said and "out.bvh: 31 frames at 30 fps, 19 joints" in said
+    made, source, target = (read_clip(p) for p in (out, *files))
+    assert made.skeleton.names == target.skeleton.names
+    np.testing.assert_allclose(made.skeleton.offsets, target.skeleton.offsets, atol=1e-6)
+    assert made.frames == source.frames
+    # What was written is what was made: thighs point where they pointed.
+    for side in ("Left", "Right"):
+        lines = [
+            c.positions()[:, c.skeleton.index(f"{side}Leg")]
+            - c.positions()[:, c.skeleton.index(f"{side}UpLeg")]
+            for c in (made, source)
+        ]
+        units = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in lines]
+        assert np.degrees(np.arccos(np.clip((units[0] * units[1]).sum(-1), -1, 1))).max() < 3.0
+
+
+def test_the_report_can_be_json_alone(files, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out.bvh"
+    argv = ["retarget", str(files[0]), "--onto", str(files[1]), "-o", str(out), "--json"]
+    assert main(argv) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["scale"] == pytest.approx(1.1, abs=0.03)
+    assert {"direction_deg", "slide_mm_s", "depth_max_mm", "end_percent", "mapping"} <= set(facts)
+
+
+def test_pairs_by_hand(files, tmp_path: Path, capsys, refused) -> None:
+    here, there = files
+    out = tmp_path / "out.bvh"
+    line = ["retarget", here, "--onto", there, "-o", out]
+    assert main([*map(str, line), "--map", "LeftArm=LeftUpperArm", "--map", "Head=Head"]) == 0
+    capsys.readouterr()
+    out.unlink()
+    refused(*line, "--map", "LeftArm=LeftUperArm", words=("Did you mean 'LeftUpperArm'",))
+    refused(*line, "--map", "LeftArm", words=("--map needs JOINT=JOINT, got 'LeftArm'",))
+    turned = ("--map", "LeftUpLeg=LeftLeg", "--map", "LeftLeg=LeftUpLeg")
+    refused(*line, *turned, words=("turns the hierarchy round",))
+    assert pairs(("a=b", "c = d")) == {"a": "b", "c": "d"}
+    with pytest.raises(PoiseError, match="gives 'a' both 'b' and 'c'"):
+        pairs(("a=b", "a=c"))
+
+
+def test_mistakes_are_told_in_one_sentence(files, tmp_path: Path, refused) -> None:
+    here, there = files
+    out = tmp_path / "out.bvh"
+    line = ("retarget", here, "--onto", there, "-o")
+    refused("retarget", here, "--onto", tmp_path / "none.bvh", "-o", out)
+    refused(*line, tmp_path / "out.xyz", words=("cannot be written as",))
+    refused(*line, there, words=("written over",))
+    refused("retarget", here, "-o", out, words=("--onto",))
+    legless = put(tmp_path, "legless.bvh", bvh())
+    words = ("no joint was found for left_thigh", "left_foot=LeftFoot", "--map")
+    refused("retarget", here, "--onto", legless, "-o", out, words=words)
+
+
+def test_bandais_root_survives_the_file(data_dir, tmp_path: Path, capsys) -> None:
+    source = data_dir / "cmu_amc/02/02_03.amc"
+    target = data_dir / "other/bandai_bvh/dataset-2_walk_active_005.bvh"
+    out = tmp_path / "out.bvh"
+    assert main(["retarget", str(source), "--onto", str(target), "-o", str(out)]) == 0
+    made = read_clip(out)
+    from poise.kin import retarget
+
+    wanted, _ = retarget(read_clip(source), read_clip(target))
+    assert np.abs(made.positions() - wanted.positions()).max() < 1e-3
