@@ -34,6 +34,7 @@ class BodyConfig:
         All four, with the torque limits, follow the body's size (`Strength`).
     margin: rad, how far joint ranges reach beyond the reference motion.
     overrides: ("lfoot.kp", 400.0) pairs, see `BodyTable.overridden`.
+    mjcf: a file with a body of the user's own in place of a generated one, see `read_mjcf`.
     """
 
     mass_kg: float | None = None
@@ -43,12 +44,15 @@ class BodyConfig:
     friction: float = 1.0
     margin: float = 0.1745
     overrides: tuple[tuple[str, float], ...] = ()
+    mjcf: str | None = None
 
     def __post_init__(self) -> None:
         if self.preset not in ("auto", "cmu-rfc", "generic"):
             raise PoiseError(f"body preset must be auto, cmu-rfc or generic, got '{self.preset}'")
         if self.mass_kg is not None and not 2.0 <= self.mass_kg <= 5000.0:
             raise PoiseError(f"the mass must lie between 2 and 5000 kg, got {self.mass_kg:g}")
+        if self.mass_kg is not None and self.mjcf is not None:
+            raise PoiseError("a body of your own has its own mass; state one or the other", self.mjcf)
 
 
 def generate_table(

@@ -7,7 +7,7 @@ capsules, boxes and spheres. What does not fit is refused in a sentence, what wa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -20,6 +20,7 @@ from poise.body.scaling import Strength
 from poise.body.table import BodyRow, BodyTable, Geom
 from poise.errors import PoiseError
 from poise.motion import Skeleton
+from poise.motion.roles import find_roles
 
 _FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
 _KINDS = {int(mujoco.mjtJoint.mjJNT_BALL): "ball", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
@@ -33,6 +34,9 @@ _BOXED = {
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
     int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
 }
+#: How far (m) the hinges of one body may lie apart, and how far (degrees) from right angles, to be set
+#: right with a note.
+APART_M, SKEW_DEG = 0.06, 35.0
 #: Numbers for hinges of bodies that are no known part, such as toes.
 _OTHER = PartNumbers(0.0, 0.0, 100.0, 50.0, 3)
 
@@ -59,7 +63,7 @@ def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
 
     Raises:
         PoiseError: a file that MuJoCo cannot read (its own message with the line), no free root, ball or
-            slide joints, hinges of one body that are not at right angles or do not meet, no human tree.
+            slide joints, hinges of one body far from right angles or from one another, no human tree.
     """
     path = Path(path)
     if not path.is_file():
@@ -118,10 +122,22 @@ class _Reader:
         if not hinges:
             return
         anchors, axes = self.data.xanchor[hinges], self.data.xaxis[hinges]
-        if np.linalg.norm(anchors - anchors[0], axis=-1).max() > 1e-3:
-            raise PoiseError(f"the hinges of body '{name}' do not meet in one point", self.path)
-        if np.abs(axes @ axes.T - np.eye(len(hinges))).max() > 0.02:
-            raise PoiseError(f"the hinges of body '{name}' are not at right angles", self.path)
+        apart = float(np.linalg.norm(anchors - anchors[0], axis=-1).max())
+        if apart > APART_M:
+            raise PoiseError(
+                f"the hinges of body '{name}' lie {apart * 1000:.0f} mm apart and cannot be one joint",
+                self.path,
+            )
+        skew = math.degrees(math.asin(min(1.0, np.abs(axes @ axes.T - np.eye(len(hinges))).max())))
+        if skew > SKEW_DEG:
+            raise PoiseError(
+                f"the hinges of body '{name}' are {skew:.0f} degrees off right angles", self.path
+            )
+        if apart > 1e-3 or skew > 1.0:
+            self.notes.append(
+                f"The hinges of body '{name}', {apart * 1000:.0f} mm apart and {skew:.0f} degrees off "
+                "right angles, were set at right angles through the first one's place."
+            )
 
     def _name(self, body: int) -> str:
         return self.model.body(body).name or f"body{body}"
@@ -139,8 +155,24 @@ class _Reader:
         offsets = np.array(
             [o - origins[p] if p >= 0 else 0 * o for o, p in zip(origins, parents, strict=True)]
         )
-        made = Skeleton(tuple(self._name(b) for b in self.bodies), parents, offsets)
-        return made.with_source(path=self.path)
+        names = [self._name(b) for b in self.bodies]
+        made = Skeleton(tuple(names), parents, offsets).with_source(path=self.path)
+        roles = find_roles(made)
+        for side in ("left", "right"):
+            forearm = roles.joint(f"{side}_forearm")
+            if forearm is None or roles.joint(f"{side}_hand") is not None:
+                continue
+            # Many bodies end in the forearm; the hand's joint then has no body and marks its tip.
+            body = self.bodies[forearm]
+            middle = np.mean([np.array(g.pos) for g in self._geoms(body, 1.0)], 0)
+            made = replace(
+                made,
+                names=(*made.names, f"{side}_hand"),
+                parents=(*made.parents, forearm),
+                offsets=np.concatenate((made.offsets, [2.0 * middle])),
+            )
+            self.notes.append(f"There is no {side} hand; the end of '{self._name(body)}' stands for it.")
+        return made
 
     def table(self, skeleton: Skeleton, damping: float) -> BodyTable:
         """The rows; `find_anatomy` raises where the tree is no human's."""
@@ -170,7 +202,7 @@ class _Reader:
                 BodyRow(
                     name=skeleton.names[i],
                     joint=i,
-                    kind=part.kind if part else "other",
+                    kind=part.kind if part else "pelvis" if not i else "other",
                     side=part.side if part else "",
                     parent=skeleton.parents[i],
                     pos=_three(skeleton.offsets[i]),
@@ -186,6 +218,10 @@ class _Reader:
                     geoms=self._geoms(b, height),
                 )
             )
+        if self.model.jnt_stiffness[[j for b in self.bodies for j in self._joints(b)]].any():
+            self.notes.append("Springs in its joints are left out.")
+        if self.model.neq or self.model.ntendon:
+            self.notes.append("Tendons and equality constraints are left out.")
         if self._added:
             self.notes.append(f"Position servos were added to {self._added} of the hinges.")
         return BodyTable(tuple(rows), height, contact_exclusions=self._exclusions())
@@ -262,6 +298,10 @@ def _three(v: np.ndarray) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
 
 
+def _four(q: np.ndarray) -> tuple[float, float, float, float]:
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+
+
 def _axes(axes: np.ndarray) -> tuple[str, tuple[float, float, float, float]]:
     """Letters of orthogonal hinge axes `(n, 3)` and the frame (wxyz) in which they are letters."""
     if not len(axes):
@@ -280,4 +320,4 @@ def _axes(axes: np.ndarray) -> tuple[str, tuple[float, float, float, float]]:
         matrix, letters = np.stack((first, -third, second), 1), "XZY"
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, matrix.reshape(-1))
-    return letters, (float(quat[0]), float(quat[1]), float(quat[2]), float(quat[3]))
+    return letters, _four(quat)
