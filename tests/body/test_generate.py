@@ -178,7 +178,7 @@ def test_wrong_overrides_are_told(changes, message):
 
 
 def test_wrong_settings_and_skeletons_are_told():
-    with pytest.raises(PoiseError, match=r"between 2 and 500 kg, got 0\.5"):
+    with pytest.raises(PoiseError, match=r"between 2 and 5000 kg, got 0\.5"):
         BodyConfig(mass_kg=0.5)
     with pytest.raises(PoiseError, match="preset must be auto, cmu-rfc or generic"):
         BodyConfig(preset="robot")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from poise.body import find_anatomy, generate_table, make_humanoid
-from poise.body.parts import plain_name
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 from toy_human import human
@@ -167,27 +166,6 @@ def test_every_dialect_has_all_parts(dialect):
     for side, toe in anatomy.toes:
         assert skeleton.parents[toe] == anatomy.of("foot", side)[0]
         assert "toe" in skeleton.names[toe].lower()
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("LeftUpLeg", ("left", "upleg")),
-        ("right_hip", ("right", "hip")),
-        ("lfemur", ("left", "femur")),
-        ("rShldr", ("right", "shldr")),
-        ("Hand_L", ("left", "hand")),
-        ("mixamorig:RightFoot", ("right", "foot")),
-        ("Character1_LeftHand", ("left", "hand")),
-        ("Bip01_L_Foot", ("left", "foot")),
-        ("lowerback", ("", "lowerback")),
-        ("root", ("", "root")),
-        ("LowerNeck", ("", "lowerneck")),
-        ("ribs", ("", "ribs")),
-    ],
-)
-def test_sides_are_told_from_names(name, expected):
-    assert plain_name(name) == expected
 
 
 def test_parts_are_depth_first_whatever_the_skeletons_order():

@@ -2,6 +2,7 @@
 
 from poise.body.generate import BodyConfig, generate_table
 from poise.body.humanoid import Humanoid, make_humanoid, make_spec
+from poise.body.mjcf import MjcfBody, read_mjcf
 from poise.body.parts import Anatomy, Part, find_anatomy
 from poise.body.table import BodyRow, BodyTable, Geom
 
@@ -12,9 +13,11 @@ __all__ = [
     "BodyTable",
     "Geom",
     "Humanoid",
+    "MjcfBody",
     "Part",
     "find_anatomy",
     "generate_table",
     "make_humanoid",
     "make_spec",
+    "read_mjcf",
 ]

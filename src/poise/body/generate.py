@@ -11,6 +11,7 @@ import torch
 from poise.body import presets
 from poise.body.parts import Anatomy, Part, find_anatomy
 from poise.body.presets import PARTS
+from poise.body.scaling import Strength, default_mass, length_factor
 from poise.body.shapes import Ruler, geoms_of
 from poise.body.table import BodyRow, BodyTable
 from poise.errors import PoiseError
@@ -24,14 +25,16 @@ _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 class BodyConfig:
     """What a user may state about the body that is generated.
 
-    mass_kg: total mass; None is body mass index 22 at the skeleton's height.
+    mass_kg: total mass; None is `default_mass`: body mass index 22 at an adult's height.
     preset: "auto" takes "cmu-rfc" (38 DoF, 20 bodies, Residual Force Control) for a CMU ASF
         skeleton and "generic" for all others.
     damping: joint damping kd as a fraction of kp, in seconds. The paper's 0.2 kp stops a jump
         (`kd * speed` exceeds the torque limit); 0.02 is stable at 60 Hz and leaves the strength.
     armature: rotor inertia added to every hinge at `RFC_MASS_KG`, kg m^2.
+        All four, with the torque limits, follow the body's size (`Strength`).
     margin: rad, how far joint ranges reach beyond the reference motion.
     overrides: ("lfoot.kp", 400.0) pairs, see `BodyTable.overridden`.
+    mjcf: a file with a body of the user's own in place of a generated one, see `read_mjcf`.
     """
 
     mass_kg: float | None = None
@@ -41,12 +44,15 @@ class BodyConfig:
     friction: float = 1.0
     margin: float = 0.1745
     overrides: tuple[tuple[str, float], ...] = ()
+    mjcf: str | None = None
 
     def __post_init__(self) -> None:
         if self.preset not in ("auto", "cmu-rfc", "generic"):
             raise PoiseError(f"body preset must be auto, cmu-rfc or generic, got '{self.preset}'")
-        if self.mass_kg is not None and not 2.0 <= self.mass_kg <= 500.0:
-            raise PoiseError(f"the mass must lie between 2 and 500 kg, got {self.mass_kg:g}")
+        if self.mass_kg is not None and not 2.0 <= self.mass_kg <= 5000.0:
+            raise PoiseError(f"the mass must lie between 2 and 5000 kg, got {self.mass_kg:g}")
+        if self.mass_kg is not None and self.mjcf is not None:
+            raise PoiseError("a body of your own has its own mass; state one or the other", self.mjcf)
 
 
 def generate_table(
@@ -55,7 +61,7 @@ def generate_table(
     """The parameters of a humanoid that moves like `skeleton`.
 
     Args:
-        skeleton: any human skeleton whose hands and feet can be told by name.
+        skeleton: any human skeleton whose hands and feet can be told by name or shape.
         config: mass, preset, gains, overrides.
         clips: motions of this skeleton; they tell the neutral pose (where identity rotations are no
             pose of a human) and how the soles lie.
@@ -64,7 +70,7 @@ def generate_table(
         PoiseError: unknown anatomy, zero-length legs, unknown override.
     """
     config = config or BodyConfig()
-    anatomy = find_anatomy(skeleton)
+    anatomy = find_anatomy(skeleton, clips)
     cmu = config.preset == "cmu-rfc" or (config.preset == "auto" and is_cmu(skeleton))
     if cmu:
         anatomy = anatomy.without(skeleton.names.index(n) for n in presets.CMU_MERGED)
@@ -72,9 +78,9 @@ def generate_table(
     kept = [p.joint for p in anatomy.parts]
     links = {j: _link(skeleton, kept, neutral, j) for j in kept}
     ruler = Ruler.measure(skeleton, anatomy, links, clips)
-    mass = config.mass_kg or presets.BODY_MASS_INDEX * ruler.height**2
+    mass = config.mass_kg or default_mass(ruler.height)
     fractions = _mass_fractions(anatomy, ruler)
-    scale = mass / presets.RFC_MASS_KG
+    strength = Strength.of(mass, ruler.height)
     rows: list[BodyRow] = []
     for part in anatomy.parts:
         numbers = PARTS[part.kind]
@@ -93,10 +99,10 @@ def generate_table(
                 frame=frame,
                 ranges=_ranges(skeleton, part, order),
                 mass=fractions[part.joint] * mass,
-                kp=numbers.kp * scale,
-                kd=numbers.kp * scale * config.damping,
-                torque=numbers.torque * scale,
-                armature=config.armature * scale,
+                kp=numbers.kp * strength.torque,
+                kd=numbers.kp * strength.torque * config.damping * strength.time,
+                torque=numbers.torque * strength.torque,
+                armature=config.armature * strength.inertia,
                 geoms=geoms_of(part, ruler),
             )
         )
@@ -193,7 +199,8 @@ def _mass_fractions(anatomy: Anatomy, ruler: Ruler) -> dict[int, float]:
     raw: dict[int, float] = {}
     for part in anatomy.parts:
         group = anatomy.of(part.kind) if not part.side else (part.joint,)
-        lengths = {j: max(float(np.linalg.norm(ruler.tips[j])), 0.02) for j in group}
+        shortest = 0.02 * length_factor(ruler.height)
+        lengths = {j: max(float(np.linalg.norm(ruler.tips[j])), shortest) for j in group}
         raw[part.joint] = PARTS[part.kind].mass * lengths[part.joint] / sum(lengths.values())
     if not anatomy.of("head") and anatomy.of("neck"):
         raw[anatomy.of("neck")[-1]] += PARTS["head"].mass

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from poise.errors import PoiseError
-from poise.motion import Skeleton
+import numpy as np
 
-_FOOT = ("foot", "ankle", "talus")
-_HAND = ("hand", "wrist")
-_HEAD = ("head",)
-_NECK = ("neck",)
-_CORES = (
-    *("femur", "tibia", "foot", "toes", "toe", "clavicle", "humerus", "radius", "wrist", "hand"),
-    *("fingers", "thumb", "hipjoint", "hip", "knee", "ankle", "shoulder", "elbow", "collar", "shldr"),
-    *("forearm", "thigh", "shin", "buttock", "arm", "leg", "upleg", "upperarm", "lowerarm", "upperleg"),
-    *("lowerleg", "calf", "toebase", "fingerbase"),
-)
+from poise.body.topology import find_limbs, head_line
+from poise.errors import PoiseError
+from poise.motion import Clip, Skeleton
+from poise.motion.role_words import name_words
+from poise.motion.roles import Roles, find_roles
+
+#: Bodies of the trunk and the neck at most; where a skeleton has more joints there, the shortest bones
+#: ride on their parents, since a long chain of servos is soft.
+MOST_SPINE, MOST_NECK = 5, 2
 
 
 @dataclass(frozen=True)
@@ -39,11 +36,12 @@ class Anatomy:
     """The parts found in a skeleton; joints that are no part ride rigidly on their nearest ancestor.
 
     parts: depth first, as MuJoCo numbers bodies; the first is the pelvis. toes: first joint below each
-    foot, by side, where there is one.
+    foot, by side, where there is one. evidence: what was told by shape instead of by name, in sentences.
     """
 
     parts: tuple[Part, ...]
     toes: tuple[tuple[str, int], ...]
+    evidence: tuple[str, ...] = ()
 
     def without(self, joints: Iterable[int]) -> Anatomy:
         """The anatomy with some joints riding rigidly on their ancestors."""
@@ -54,23 +52,18 @@ class Anatomy:
         """Joint indices of one kind (and side)."""
         return tuple(p.joint for p in self.parts if p.kind == kind and (not side or p.side == side))
 
+    def riders(self, skeleton: Skeleton) -> dict[int, int]:
+        """Every joint without a body of its own, and the joint of the body that it rides on.
 
-def plain_name(name: str) -> tuple[str, str]:
-    """The side ("left", "right", "") and the bare lower-case part of a joint's name."""
-    text = re.sub(r"^(character\d*_|.*:)", "", name.lower())
-    for side in ("left", "right"):
-        if side in text:
-            return side, text.replace(side, "").strip("_. ")
-    match = re.match(r"^(.*)[_.]([lr])$", text) or None
-    if match:
-        return {"l": "left", "r": "right"}[match.group(2)], match.group(1)
-    match = re.match(r"^.+[_. ]([lr])[_. ](.+)$", text)
-    if match:
-        return {"l": "left", "r": "right"}[match.group(1)], match.group(2)
-    match = re.match(r"^([lr])[_.]?(.+)$", text)
-    if match and any(match.group(2).rstrip("0123456789") == core for core in _CORES):
-        return {"l": "left", "r": "right"}[match.group(1)], match.group(2)
-    return "", text
+        Joints above the pelvis ride on the pelvis.
+        """
+        own = {p.joint for p in self.parts}
+        out: dict[int, int] = {}
+        for j in range(len(skeleton)):
+            line = [a for a in _ancestors(skeleton, j) if a in own]
+            if j not in own:
+                out[j] = line[0] if line else self.parts[0].joint
+        return out
 
 
 def _path(skeleton: Skeleton, top: int, bottom: int) -> list[int]:
@@ -101,68 +94,122 @@ def _common(skeleton: Skeleton, a: int, b: int) -> int:
     return next(j for j in _ancestors(skeleton, b) if j in line)
 
 
-def _first(skeleton: Skeleton, words: tuple[str, ...], side: str) -> int | None:
-    """The joint nearest the root whose bare name holds one of `words` and is of that side."""
-    for j, name in enumerate(skeleton.names):
-        found, core = plain_name(name)
-        if found == side and "rigmesh" not in core and any(w in core for w in words):
-            return j
-    return None
+def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
+    """The body parts of a human skeleton: by its joints' names, else by its shape.
 
-
-def find_anatomy(skeleton: Skeleton) -> Anatomy:
-    """The body parts of a human skeleton.
+    Args:
+        skeleton: any human tree. clips: motions of it; their first frame shows how it stands, for
+            skeletons whose names say nothing and whose rest pose is folded.
 
     Raises:
-        PoiseError: where a foot or a hand cannot be told from the joints' names.
+        PoiseError: where a foot or a hand can be told neither by name nor by shape.
     """
-    ends: dict[str, int] = {}
-    for side in ("left", "right"):
-        for label, words in (("foot", _FOOT), ("hand", _HAND)):
-            joint = _first(skeleton, words, side)
-            if joint is None:
-                raise PoiseError(
-                    f"no {side} {label} was found among the joints {', '.join(skeleton.names)}",
-                    skeleton.source.path,
-                    f"Name the joint '{side.capitalize()}{label.capitalize()}' or similar",
-                )
-            ends[f"{side} {label}"] = joint
-    pelvis = _common(skeleton, ends["left foot"], ends["right foot"])
-    chest = _common(skeleton, ends["left hand"], ends["right hand"])
+    roles = find_roles(skeleton)
+    legs, arms = _limbs(roles, ("thigh", "shin", "foot")), _limbs(roles, _ARM)
+    evidence: tuple[str, ...] = ()
+    pose: np.ndarray | None = None
+    if len(legs) + len(arms) < 4:
+        shape = find_limbs(skeleton, clips)
+        if shape is None:
+            raise _missing(roles, legs, arms)
+        legs, arms, evidence, pose = shape.legs, shape.arms, shape.evidence, shape.pose
+    pelvis = _common(skeleton, legs["left"][2], legs["right"][2])
+    chest = _common(skeleton, arms["left"][2], arms["right"][2])
     # Where the hips and the spine hang side by side, the joint that carries both is the pelvis.
     pelvis = _common(skeleton, pelvis, chest)
     kinds: dict[int, tuple[str, str]] = {pelvis: ("pelvis", "")}
-    for j in _path(skeleton, pelvis, chest):
+    spine = [j for j in _path(skeleton, pelvis, chest) if j == chest or not _helper(skeleton, j)]
+    for j in _longest(skeleton, spine, MOST_SPINE):
         kinds[j] = ("spine", "")
     toes: list[tuple[str, int]] = []
-    for side in ("left", "right"):
-        foot, hand = ends[f"{side} foot"], ends[f"{side} hand"]
-        leg, arm = _path(skeleton, pelvis, foot), _path(skeleton, chest, hand)
-        if len(leg) < 3 or len(arm) < 3:
-            short, line = ("leg", leg) if len(leg) < 3 else ("arm", arm)
-            raise PoiseError(
-                f"the {side} {short} has {len(line)} joints "
-                f"({', '.join(skeleton.names[j] for j in line)}) and needs at least 3",
-                skeleton.source.path,
-            )
-        kinds[leg[-3]], kinds[leg[-2]], kinds[foot] = ("thigh", side), ("shin", side), ("foot", side)
-        kinds[arm[-3]], kinds[arm[-2]], kinds[hand] = (
-            ("upper_arm", side),
-            ("forearm", side),
-            ("hand", side),
-        )
-        if len(arm) > 3:
-            kinds[arm[-4]] = ("clavicle", side)
-        below = [c for c in skeleton.children(foot) if "rigmesh" not in skeleton.names[c].lower()]
+    for side in _SIDES:
+        for line, names in ((legs[side], ("thigh", "shin", "foot")), (arms[side], _ARM)):
+            kinds |= {j: (kind, side) for j, kind in zip(line, names, strict=True)}
+        above = [j for j in _path(skeleton, chest, arms[side][0])[:-1] if not _helper(skeleton, j)]
+        if above:
+            kinds[above[-1]] = ("clavicle", side)
+        below = [c for c in skeleton.children(legs[side][2]) if not _helper(skeleton, c)]
         if below:
-            toes.append((side, below[0]))
-    for j, name in enumerate(skeleton.names):
-        side, core = plain_name(name)
-        if j in kinds or side or chest not in _ancestors(skeleton, j):
-            continue
-        if any(w in core for w in _NECK) and "rigmesh" not in core:
-            kinds[j] = ("neck", "")
-        elif core in _HEAD:
-            kinds[j] = ("head", "")
+            # A heel bone or the like may hang beside the toes.
+            named = [c for c in below if any(w in skeleton.names[c].lower() for w in ("toe", "ball"))]
+            toes.append((side, (named or below)[0]))
+    kinds |= _neck_and_head(roles, chest, kinds, pose)
     parts = tuple(Part(j, *kinds[j]) for j in _depth_first(skeleton) if j in kinds)
-    return Anatomy(parts, tuple(toes))
+    return Anatomy(parts, tuple(toes), evidence)
+
+
+_SIDES = ("left", "right")
+_ARM = ("upper_arm", "forearm", "hand")
+_Lines = dict[str, tuple[int, int, int]]
+
+
+def _helper(skeleton: Skeleton, joint: int) -> bool:
+    """Whether a joint's name says that it helps the rig or its skin: twist bones, IK targets, meshes."""
+    words = name_words(skeleton.names[joint])
+    # A name without a word ("bone07") says nothing.
+    return words.helper and bool(words.tokens)
+
+
+def _limbs(roles: Roles, kinds: tuple[str, str, str]) -> _Lines:
+    """The three joints of a limb by side, for the sides on which all of them are known."""
+    out: _Lines = {}
+    for side in _SIDES:
+        a, b, c = (roles.joint(f"{side}_{kind}") for kind in kinds)
+        if a is not None and b is not None and c is not None:
+            out[side] = (a, b, c)
+    return out
+
+
+def _missing(roles: Roles, legs: _Lines, arms: _Lines) -> PoiseError:
+    """What keeps this skeleton from being a human's."""
+    skeleton = roles.skeleton
+    ends = {
+        f"{side} {kind}": roles.joint(f"{side}_{kind}") for kind in ("foot", "hand") for side in _SIDES
+    }
+    for label, joint in ends.items():
+        if joint is None:
+            name = "".join(word.capitalize() for word in label.split())
+            return PoiseError(
+                f"no {label} was found among the joints {', '.join(skeleton.names)}",
+                skeleton.source.path,
+                f"Name the joint '{name}' or similar",
+            )
+    for what, found, end in (("leg", legs, "foot"), ("arm", arms, "hand")):
+        both = [ends[f"{side} {end}"] for side in _SIDES]
+        for side, joint in zip(_SIDES, both, strict=True):
+            if side not in found and joint is not None:
+                top = _common(skeleton, both[0] or 0, both[1] or 0)
+                line = _path(skeleton, top, joint)
+                return PoiseError(
+                    f"the {side} {what} has {len(line)} joints "
+                    f"({', '.join(skeleton.names[j] for j in line)}) and needs at least 3",
+                    skeleton.source.path,
+                )
+    return PoiseError("the skeleton is no human's", skeleton.source.path)
+
+
+def _longest(skeleton: Skeleton, line: Sequence[int], most: int) -> list[int]:
+    """At most `most` joints of a chain: those with the shortest bones above them ride on their parents.
+
+    The last joint stays, since limbs hang on it.
+    """
+    kept = list(line)
+    while len(kept) > most:
+        kept.remove(min(kept[:-1], key=lambda j: float(np.linalg.norm(skeleton.offsets[j]))))
+    return kept
+
+
+def _neck_and_head(
+    roles: Roles, chest: int, kinds: dict[int, tuple[str, str]], pose: np.ndarray | None
+) -> dict[int, tuple[str, str]]:
+    """Necks and head above the chest: by name, else (told by shape) the highest central branch."""
+    skeleton = roles.skeleton
+    necks = [j for j in roles.chain("neck") if j not in kinds and chest in _ancestors(skeleton, j)]
+    head = roles.joint("head")
+    heads = [head] if head is not None and chest in _ancestors(skeleton, head) else []
+    if pose is not None and not necks and not heads:
+        limbs = [j for j, (kind, _) in kinds.items() if kind in _ARM]
+        line = head_line(skeleton, chest, limbs, pose)
+        necks, heads = line[:1], line[1:2]
+    out = {j: ("neck", "") for j in _longest(skeleton, necks, MOST_NECK)}
+    return out | {j: ("head", "") for j in heads}

@@ -3,7 +3,7 @@
 Masses are fractions of the whole body (Winter 2009, table 4.1; the trunk's 0.497 is shared by the
 pelvis 0.142 and the spine). Radii are fractions of the standing height. Gains are those of the
 Residual Force Control humanoid (kp in N m/rad, torque limits 50 to 200 N m for a body of 31 kg) and
-scale with the mass, so that a heavier character moves alike.
+scale with the body, so that every character moves alike (`scaling.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 RFC_MASS_KG = 31.0
 #: Standing height over the length of thigh and shin together (Winter: 0.245 + 0.246).
 HEIGHT_PER_LEG = 1.0 / 0.491
-#: Default mass: body mass index 22.
+#: Default mass of an adult: body mass index 22 (`scaling.default_mass`).
 BODY_MASS_INDEX = 22.0
 
 

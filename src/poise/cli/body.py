@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import notes, say_json, table
 from poise.cli.options import Body, Reading
+
+if TYPE_CHECKING:
+    from poise.body import BodyConfig
+    from poise.motion import Clip
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     config = options.body.config()
     from poise.kin import fit_humanoid
 
-    humanoid, _, report = fit_humanoid(options.reading.read(options.clip), config)
+    clip = options.reading.read(options.clip)
+    humanoid, _, report = fit_humanoid(clip, config)
     rows = humanoid.table.describe()
     if options.json:
         facts = {"height_m": humanoid.table.height_m, "mass_kg": humanoid.mass}
@@ -42,8 +47,22 @@ def run(options: Options, argv: Sequence[str]) -> int:
     )
     columns = ("body", "part", "parent", "hinges", "shape", "kg", "kp", "kd", "N m", "range, degrees")
     table(title, columns, [_row(r) for r in rows], left=5)
-    notes(report.sentences())
+    notes([*_made(clip, config), *report.sentences()])
     return 0
+
+
+def _made(clip: Clip, config: BodyConfig) -> list[str]:
+    """How the joints became bodies, in sentences."""
+    from poise.body import find_anatomy, read_mjcf
+
+    if config.mjcf is not None:
+        return list(read_mjcf(config.mjcf, config.damping).notes)
+    anatomy = find_anatomy(clip.skeleton, [clip])
+    names = clip.skeleton.names
+    riders = [f"{names[j]} on {names[on]}" for j, on in anatomy.riders(clip.skeleton).items()]
+    more = f" and {len(riders) - 4} more" if len(riders) > 4 else ""
+    rode = f"Without a body of their own, with their own channels kept: {', '.join(riders[:4])}{more}."
+    return [*anatomy.evidence, *([rode] if riders else [])]
 
 
 def _row(r: dict[str, Any]) -> list[str]:

@@ -57,6 +57,8 @@ class Body:
 
     mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
     """Total mass; by default that of body mass index 22 at the clip's height."""
+    body: Annotated[Path | None, arg(metavar="FILE.xml", help_behavior_hint="")] = None
+    """A body of your own in MJCF in place of a generated one; the clip is retargeted onto it."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")] = ()
     """One value of the body, such as lfoot.kp=400 or thigh.torque=250."""
 
@@ -64,7 +66,8 @@ class Body:
         """The settings of the body generator."""
         from poise.body import BodyConfig
 
-        return BodyConfig(mass_kg=self.mass, overrides=tuple(map(override, self.set)))
+        own = None if self.body is None else str(self.body)
+        return BodyConfig(mass_kg=self.mass, overrides=tuple(map(override, self.set)), mjcf=own)
 
 
 def check_device(name: str) -> None:

@@ -16,6 +16,7 @@ from poise.kin.ik_polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
 from poise.kin.retarget import RetargetConfig, retarget
 from poise.kin.retarget_report import RetargetReport
+from poise.kin.stance import Stance, relaxed_stance
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "Polished",
     "RetargetConfig",
     "RetargetReport",
+    "Stance",
     "TwoBone",
     "analytic_ik",
     "chain_angles",
@@ -55,6 +57,7 @@ __all__ = [
     "polish",
     "qpos_to_clip",
     "qpos_velocity",
+    "relaxed_stance",
     "retarget",
     "shortest_arc",
     "two_bone",

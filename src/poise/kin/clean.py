@@ -72,7 +72,7 @@ def clean_clip(clip: Clip, anatomy: Anatomy | None = None) -> tuple[Clip, CleanR
     First feet and hands are turned back (`unflip`), then speeds that no human joint reaches are
     interpolated (`limit_speeds`), so that what remains of the jumps goes too.
     """
-    anatomy = anatomy or find_anatomy(clip.skeleton)
+    anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
     turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy))

@@ -19,6 +19,7 @@ from poise.kin.cycle import Cycle, join_cycle
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
 from poise.kin.ground import GroundFit, clip_flights, fit_ground, lowest_height
+from poise.kin.own_body import on_own_body
 from poise.motion import Clip, ClipLibrary, resample
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 
@@ -105,7 +106,8 @@ def fit_humanoid(
     """A humanoid that can reach every frame of the library.
 
     Args:
-        library: clips of one hierarchy; the body is made from the first one's bone lengths.
+        library: clips of one hierarchy; the body is made from the first one's bone lengths, or read
+            from `config.mjcf`, onto which the clips are then retargeted.
         config: see `BodyConfig`. rate_hz: the control rate at which the clips are sampled.
 
     Returns:
@@ -114,10 +116,11 @@ def fit_humanoid(
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
+    library, own = on_own_body(library, config)
     repaired = [clean_clip(c) for c in library]
     clips = [resample(c, rate_hz) for c, _ in repaired]
-    table = generate_table(clips[0].skeleton, config, clips)
-    table = _choose_orders(table, clips)
+    # A body of the user's own keeps its hinges as they are.
+    table = own or _choose_orders(generate_table(clips[0].skeleton, config, clips), clips)
     motions = [clip_to_qpos(c, table) for c in clips]
     for clip, q in zip(clips, motions, strict=True):
         if not np.isfinite(q).all():

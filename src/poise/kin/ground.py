@@ -103,7 +103,7 @@ def _lowest(geom, pos: Tensor, quat: Tensor) -> Tensor:
 
 
 def fit_ground(
-    qpos: np.ndarray, table: BodyTable, fps: float, cyclic: bool = False
+    qpos: np.ndarray, table: BodyTable, fps: float, cyclic: bool = False, sink_m: float = SINK_M
 ) -> tuple[np.ndarray, GroundFit]:
     """The motion set on the floor z = 0, and by how much it was moved.
 
@@ -112,19 +112,25 @@ def fit_ground(
     that the tenth percentile of the lowest points sinks by twice `SINK_M`; a clip in which no foot
     stands has that percentile set on the floor.
     A body that still hovers higher than `HOVER_M` for more than 0.2 s, neither in flight nor `ALOFT_M`
-    high, is lowered there. Parts that sink in by more than `SINK_M`, such as the toes of a rigid foot at
-    push-off, are lifted out frame by frame. Both follow the running extreme of the excess over 0.1 s
+    high, is lowered there. Parts that sink in by more than `sink_m`, such as the toes of a rigid foot at
+    push-off, are lifted out frame by frame (a replay without physics asks for less than the training,
+    whose contacts push such parts out). Both follow the running extreme of the excess over 0.1 s
     smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed.
     """
     state = Kinematics(table)(torch.tensor(qpos))
-    fit = fit_heights(table, state.pos, state.quat, fps, cyclic)
+    fit = fit_heights(table, state.pos, state.quat, fps, cyclic, sink_m)
     out = np.array(qpos)
     out[:, 2] += fit.lift_m - fit.settle_m + fit.clear_m
     return out, fit
 
 
 def fit_heights(
-    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, cyclic: bool = False
+    table: BodyTable,
+    pos: Tensor,
+    quat: Tensor,
+    fps: float,
+    cyclic: bool = False,
+    sink_m: float = SINK_M,
 ) -> GroundFit:
     """How a motion with body poses `pos (T, B, 3)` m and `quat (T, B, 4)` would be set on the floor.
 
@@ -141,7 +147,7 @@ def fit_heights(
     # The mirror image of a clearance: a running minimum, so that no frame is lowered beyond its excess.
     settle = np.maximum(-smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
     low_now = low + lift - settle
-    clear = _clearance(np.maximum(-low_now - SINK_M, 0.0), reach, cyclic)
+    clear = _clearance(np.maximum(-low_now - sink_m, 0.0), reach, cyclic)
     after = low_now + clear
     return GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
 

@@ -1,0 +1,323 @@
+"""Bring your own body: a humanoid in MJCF becomes a skeleton and a body table.
+
+The file's tree, places, hinges, ranges, masses, gains and torque limits are kept; its shapes become
+capsules, boxes and spheres. What does not fit is refused in a sentence, what was changed is noted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from poise.body import presets
+from poise.body.parts import find_anatomy
+from poise.body.presets import PARTS, PartNumbers
+from poise.body.scaling import Strength
+from poise.body.table import BodyRow, BodyTable, Geom
+from poise.errors import PoiseError
+from poise.motion import Skeleton
+from poise.motion.roles import find_roles
+
+_FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
+_KINDS = {int(mujoco.mjtJoint.mjJNT_BALL): "ball", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
+_SHAPES = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+}
+_BOXED = {
+    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
+}
+#: How far (m) the hinges of one body may lie apart, and how far (degrees) from right angles, to be set
+#: right with a note.
+APART_M, SKEW_DEG = 0.06, 35.0
+#: Numbers for hinges of bodies that are no known part, such as toes.
+_OTHER = PartNumbers(0.0, 0.0, 100.0, 50.0, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class MjcfBody:
+    """A body from a file.
+
+    skeleton: one joint per body, at its hinges' anchor, standing at identity as the file's default pose
+    does. table: its rows, in the same order and of the same names. notes: what was changed or added.
+    """
+
+    skeleton: Skeleton
+    table: BodyTable
+    notes: tuple[str, ...]
+
+
+def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
+    """The humanoid in an MJCF file.
+
+    Args:
+        path: the file; what it includes (meshes) is read as MuJoCo does.
+        damping: joint damping as a fraction of kp in seconds where a hinge has none.
+
+    Raises:
+        PoiseError: a file that MuJoCo cannot read (its own message with the line), no free root, ball or
+            slide joints, hinges of one body far from right angles or from one another, no human tree.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PoiseError("there is no such file", str(path))
+    try:
+        model = mujoco.MjSpec.from_file(str(path)).compile()
+    except (ValueError, OSError) as problem:
+        raise PoiseError(f"MuJoCo cannot read it: {_one_line(problem)}", str(path)) from None
+    reader = _Reader(model, str(path))
+    skeleton = reader.skeleton()
+    return MjcfBody(skeleton, reader.table(skeleton, damping), tuple(reader.notes))
+
+
+def _one_line(problem: Exception) -> str:
+    return " ".join(str(problem).split()).removeprefix("Error: ")
+
+
+class _Reader:
+    """One compiled model in its default pose."""
+
+    def __init__(self, model: mujoco.MjModel, path: str) -> None:
+        self.model, self.path, self.notes = model, path, []
+        self.data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self.data)
+        root = self._root()
+        self.bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] == root]
+        for b in self.bodies:
+            self._check_joints(b)
+
+    def _root(self) -> int:
+        free = [int(self.model.jnt_bodyid[j]) for j in np.flatnonzero(self.model.jnt_type == _FREE)]
+        if not free:
+            raise PoiseError(
+                "it has no free root", self.path, "Give the pelvis a <freejoint/> so that it can move"
+            )
+        # Of several free bodies (balls, boxes) the character is the one with most bodies below it.
+        return max(free, key=lambda b: int((self.model.body_rootid == b).sum()))
+
+    def _joints(self, body: int) -> list[int]:
+        first = self.model.body_jntadr[body]
+        every = range(first, first + self.model.body_jntnum[body]) if first >= 0 else range(0)
+        return [j for j in every if self.model.jnt_type[j] != _FREE]
+
+    def _check_joints(self, body: int) -> None:
+        name, hinges = self._name(body), self._joints(body)
+        for j in hinges:
+            kind = _KINDS.get(int(self.model.jnt_type[j]))
+            if kind:
+                raise PoiseError(
+                    f"joint '{self.model.joint(j).name}' of body '{name}' is a {kind} joint",
+                    self.path,
+                    "Use up to three hinges at right angles in its place",
+                )
+        if len(hinges) > 3:
+            raise PoiseError(f"body '{name}' has {len(hinges)} hinges, at most 3 can be used", self.path)
+        if not hinges:
+            return
+        anchors, axes = self.data.xanchor[hinges], self.data.xaxis[hinges]
+        apart = float(np.linalg.norm(anchors - anchors[0], axis=-1).max())
+        if apart > APART_M:
+            raise PoiseError(
+                f"the hinges of body '{name}' lie {apart * 1000:.0f} mm apart and cannot be one joint",
+                self.path,
+            )
+        skew = math.degrees(math.asin(min(1.0, np.abs(axes @ axes.T - np.eye(len(hinges))).max())))
+        if skew > SKEW_DEG:
+            raise PoiseError(
+                f"the hinges of body '{name}' are {skew:.0f} degrees off right angles", self.path
+            )
+        if apart > 1e-3 or skew > 1.0:
+            self.notes.append(
+                f"The hinges of body '{name}', {apart * 1000:.0f} mm apart and {skew:.0f} degrees off "
+                "right angles, were set at right angles through the first one's place."
+            )
+
+    def _name(self, body: int) -> str:
+        return self.model.body(body).name or f"body{body}"
+
+    def _origin(self, body: int) -> np.ndarray:
+        """Where a body's joint is in the default pose, m."""
+        hinges = self._joints(body)
+        return self.data.xanchor[hinges[0]] if hinges else self.data.xpos[body]
+
+    def skeleton(self) -> Skeleton:
+        """The tree as a skeleton whose frames are the world's in the default pose."""
+        at = {b: i for i, b in enumerate(self.bodies)}
+        parents = tuple(at.get(int(self.model.body_parentid[b]), -1) for b in self.bodies)
+        origins = np.array([self._origin(b) for b in self.bodies])
+        offsets = np.array(
+            [o - origins[p] if p >= 0 else 0 * o for o, p in zip(origins, parents, strict=True)]
+        )
+        names = [self._name(b) for b in self.bodies]
+        made = Skeleton(tuple(names), parents, offsets).with_source(path=self.path)
+        roles = find_roles(made)
+        for side in ("left", "right"):
+            forearm = roles.joint(f"{side}_forearm")
+            if forearm is None or roles.joint(f"{side}_hand") is not None:
+                continue
+            # Many bodies end in the forearm; the hand's joint then has no body and marks its tip.
+            body = self.bodies[forearm]
+            middle = np.mean([np.array(g.pos) for g in self._geoms(body, 1.0)], 0)
+            made = replace(
+                made,
+                names=(*made.names, f"{side}_hand"),
+                parents=(*made.parents, forearm),
+                offsets=np.concatenate((made.offsets, [2.0 * middle])),
+            )
+            self.notes.append(f"There is no {side} hand; the end of '{self._name(body)}' stands for it.")
+        return made
+
+    def table(self, skeleton: Skeleton, damping: float) -> BodyTable:
+        """The rows; `find_anatomy` raises where the tree is no human's."""
+        parts = {p.joint: p for p in find_anatomy(skeleton).parts}
+        rest = skeleton.rest_positions()
+        side = {p.kind: p.joint for p in parts.values() if p.side == "left"}
+        leg = sum(
+            float(np.linalg.norm(rest[side[a]] - rest[side[b]]))
+            for a, b in (("thigh", "shin"), ("shin", "foot"))
+        )
+        height = leg * presets.HEIGHT_PER_LEG
+        mass = float(self.model.body_mass[self.bodies].sum())
+        strength = Strength.of(mass, height)
+        rows: list[BodyRow] = []
+        for i, b in enumerate(self.bodies):
+            part, hinges = parts.get(i), self._joints(b)
+            numbers = PARTS[part.kind] if part else _OTHER
+            if part and part.kind == "pelvis" and i:
+                raise PoiseError(
+                    f"the pelvis '{self._name(b)}' is not the body with the free joint", self.path
+                )
+            order, frame = _axes(self.data.xaxis[hinges])
+            kp, torque = self._gains(hinges, numbers, strength)
+            own_damping = max((float(self.model.dof_damping[self._dof(j)]) for j in hinges), default=0.0)
+            armature = max((float(self.model.dof_armature[self._dof(j)]) for j in hinges), default=0.0)
+            rows.append(
+                BodyRow(
+                    name=skeleton.names[i],
+                    joint=i,
+                    kind=part.kind if part else "pelvis" if not i else "other",
+                    side=part.side if part else "",
+                    parent=skeleton.parents[i],
+                    pos=_three(skeleton.offsets[i]),
+                    quat=(1.0, 0.0, 0.0, 0.0),
+                    order=order,
+                    frame=frame,
+                    ranges=tuple(self._range(j) for j in hinges),
+                    mass=float(self.model.body_mass[b]),
+                    kp=kp,
+                    kd=own_damping or kp * damping * strength.time,
+                    torque=torque,
+                    armature=armature or 0.01 * strength.inertia,
+                    geoms=self._geoms(b, height),
+                )
+            )
+        if self.model.jnt_stiffness[[j for b in self.bodies for j in self._joints(b)]].any():
+            self.notes.append("Springs in its joints are left out.")
+        if self.model.neq or self.model.ntendon:
+            self.notes.append("Tendons and equality constraints are left out.")
+        if self._added:
+            self.notes.append(f"Position servos were added to {self._added} of the hinges.")
+        return BodyTable(tuple(rows), height, contact_exclusions=self._exclusions())
+
+    _added = 0
+
+    def _dof(self, joint: int) -> int:
+        return int(self.model.jnt_dofadr[joint])
+
+    def _range(self, joint: int) -> tuple[float, float]:
+        if not self.model.jnt_limited[joint]:
+            return -math.pi, math.pi
+        zero = float(self.model.qpos0[self.model.jnt_qposadr[joint]])
+        low, high = (float(v) - zero for v in self.model.jnt_range[joint])
+        return low, high
+
+    def _gains(self, hinges: list[int], numbers: PartNumbers, strength: Strength) -> tuple[float, float]:
+        """kp and torque limit of a body: the largest among its hinges', else those of its part."""
+        model = self.model
+        kps, torques = [], []
+        for j in hinges:
+            mine = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (
+                model.actuator_trnid[:, 0] == j
+            )
+            for a in np.flatnonzero(mine):
+                gain, gear = float(model.actuator_gainprm[a, 0]), abs(float(model.actuator_gear[a, 0]))
+                servo = model.actuator_biasprm[a, 1] < 0
+                if servo:
+                    kps.append(gain * gear**2)
+                limits = model.actuator_forcerange[a] * gear
+                if not model.actuator_forcelimited[a] and not servo and model.actuator_ctrllimited[a]:
+                    limits = model.actuator_ctrlrange[a] * gain * gear
+                if np.abs(limits).max() > 0:
+                    torques.append(float(np.abs(limits).max()))
+            self._added += not mine.any() or not (model.actuator_biasprm[mine, 1] < 0).any()
+        kp = max(kps, default=numbers.kp * strength.torque)
+        return kp, max(torques, default=numbers.torque * strength.torque)
+
+    def _geoms(self, body: int, height: float) -> tuple[Geom, ...]:
+        """The shapes that collide (all where none does) in the frame of the default pose."""
+        model, data, origin = self.model, self.data, self._origin(body)
+        every = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
+        colliding = [g for g in every if model.geom_contype[g] or model.geom_conaffinity[g]]
+        out = []
+        for g in colliding or every:
+            kind, size = _SHAPES.get(int(model.geom_type[g])), model.geom_size[g].copy()
+            turn, quat = data.geom_xmat[g].reshape(3, 3), np.zeros(4)
+            pos = data.geom_xpos[g] - origin
+            if kind is None:
+                what = _BOXED.get(int(model.geom_type[g]))
+                if what is None:
+                    continue
+                # The box around it, in its own axes.
+                kind, size = "box", np.maximum(model.geom_aabb[g, 3:], 1e-3)
+                pos = pos + turn @ model.geom_aabb[g, :3]
+                self.notes.append(f"A {what} of body '{self._name(body)}' became the box around it.")
+            mujoco.mju_mat2Quat(quat, turn.reshape(-1))
+            out.append(
+                Geom(kind, tuple(map(float, size)), tuple(map(float, pos)), tuple(map(float, quat)))
+            )
+        if not out:
+            out.append(Geom("sphere", (0.01 * height, 0.0, 0.0), _three(data.xipos[body] - origin)))
+            self.notes.append(f"Body '{self._name(body)}' has no shape; it got a small sphere.")
+        return tuple(out)
+
+    def _exclusions(self) -> tuple[tuple[str, str], ...]:
+        pairs = ((int(s) >> 16, int(s) & 0xFFFF) for s in self.model.exclude_signature)
+        return tuple(
+            (self._name(a), self._name(b)) for a, b in pairs if a in self.bodies and b in self.bodies
+        )
+
+
+def _three(v: np.ndarray) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def _four(q: np.ndarray) -> tuple[float, float, float, float]:
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+
+
+def _axes(axes: np.ndarray) -> tuple[str, tuple[float, float, float, float]]:
+    """Letters of orthogonal hinge axes `(n, 3)` and the frame (wxyz) in which they are letters."""
+    if not len(axes):
+        return "", (1.0, 0.0, 0.0, 0.0)
+    nearest = [int(np.abs(a).argmax()) for a in axes]
+    if all(a[i] > 0.9999 for a, i in zip(axes, nearest, strict=True)):
+        return "".join("XYZ"[i] for i in nearest), (1.0, 0.0, 0.0, 0.0)
+    first = axes[0] / np.linalg.norm(axes[0])
+    other = axes[1] if len(axes) > 1 else np.eye(3)[int(np.abs(first).argmin())]
+    second = other - (other @ first) * first
+    second = second / np.linalg.norm(second)
+    third, letters = np.cross(first, second), "XYZ"[: len(axes)]
+    matrix = np.stack((first, second, third), 1)
+    if len(axes) == 3 and axes[2] @ third < 0:
+        # A left-handed triple: its second axis is the frame's Z, its third the frame's Y.
+        matrix, letters = np.stack((first, -third, second), 1), "XZY"
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, matrix.reshape(-1))
+    return letters, _four(quat)
