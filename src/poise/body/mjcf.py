@@ -277,11 +277,9 @@ class _Reader:
                 # The box around it, in its own axes.
                 kind, size = "box", np.maximum(model.geom_aabb[g, 3:], 1e-3)
                 pos = pos + turn @ model.geom_aabb[g, :3]
-                self.notes.append(f"A {what} of body '{self._name(body)}' became the box around it.")
+                self.notes.append(f"The {what} of body '{self._name(body)}' became the box around it.")
             mujoco.mju_mat2Quat(quat, turn.reshape(-1))
-            out.append(
-                Geom(kind, tuple(map(float, size)), tuple(map(float, pos)), tuple(map(float, quat)))
-            )
+            out.append(Geom(kind, _three(size), _three(pos), _four(quat)))
         if not out:
             out.append(Geom("sphere", (0.01 * height, 0.0, 0.0), _three(data.xipos[body] - origin)))
             self.notes.append(f"Body '{self._name(body)}' has no shape; it got a small sphere.")
