@@ -16,6 +16,8 @@ from poise.motion.io.gltf_read import read_gltf
 from poise.motion.io.gltf_write import write_gltf
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.text import read_head, shown
+from poise.motion.io.usd_read import read_usd
+from poise.motion.io.usd_write import write_usd
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,10 @@ def _looks_like_gltf(head: bytes) -> bool:
     return head[:4] == b"glTF" or (head[:1] == b"{" and b'"asset"' in head and b'"version"' in head)
 
 
+def _looks_like_usd(head: bytes) -> bool:
+    return head.startswith((b"PXR-USDC", b"#usda"))
+
+
 def _refuse_asf(path: Path, options: Options) -> Clip:
     raise PoiseError(
         "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
@@ -65,11 +71,12 @@ READERS = (
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
+    Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
 )
 _READABLE = (
     "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), "
-    "glTF (.glb, .gltf)"
+    "glTF (.glb, .gltf), USD (.usd, .usda, .usdc)"
 )
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
@@ -91,8 +98,6 @@ _NOT_YET = {
     ".mot": "OpenSim",
     ".csv": "CSV",
     ".h5": "HDF5",
-    ".usd": "USD",
-    ".usda": "USD",
     ".vmd": "VMD",
 }
 
@@ -155,11 +160,14 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
     ".bvh": write_bvh,
     ".glb": write_gltf,
     ".gltf": write_gltf,
+    ".usd": write_usd,
+    ".usda": write_usd,
+    ".usdc": write_usd,
 }
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh` and `write_gltf`.
+    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_gltf`, `write_usd`.
 
     Raises:
         PoiseError: an unknown suffix (the known ones are listed) or a folder that cannot be written.
