@@ -270,7 +270,10 @@ def test_deepmimic_refusals(tmp_path: Path, case: str) -> None:
     assert refusal(put(tmp_path, "a.txt", text)) == message
 
 
-READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json)"
+READABLE = (
+    "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json), "
+    "glTF (.glb, .gltf), USD (.usd, .usda, .usdc)"
+)
 
 
 def test_files_that_are_no_motion(tmp_path: Path) -> None:
@@ -281,7 +284,7 @@ def test_files_that_are_no_motion(tmp_path: Path) -> None:
         refusal(put(tmp_path, "a.fbx", b"Kaydara FBX Binary  \0"))
         == f": FBX files are not read yet. {READABLE}"
     )
-    for suffix, name in ((".c3d", "C3D"), (".glb", "glTF"), (".pkl", "pickle")):
+    for suffix, name in ((".c3d", "C3D"), (".vmd", "VMD"), (".pkl", "pickle")):
         path = put(tmp_path, f"a{suffix}", b"\1P\2\3")
         assert refusal(path) == f": {name} files are not read yet. {READABLE}"
     path = put(tmp_path, "a.xyz", "hello")

@@ -43,7 +43,9 @@ def clock(
         rate = own
     else:
         rate = _guessed_rate(list(inputs), start, notes)
-    count = int(np.floor((end - start) * rate * (1 + 1e-9) + 0.02)) + 1
+    # Times are float32 numbers; the last frame may lie that much before its place.
+    noise = 2 * float(np.spacing(np.float32(max(abs(start), abs(end)))))
+    count = int(np.floor((end - start + noise) * rate + 0.02)) + 1
     if count * len(tracks) > MAX_POSES:
         raise PoiseError(
             f"{end - start:.6g} s at {rate:.6g} frames per second are {count} frames, too many to read",
@@ -56,8 +58,8 @@ def clock(
     nearest = np.where(
         np.abs(keys[near] - when) < np.abs(keys[near - 1] - when), keys[near], keys[near - 1]
     )
-    slack = _SAME_TIME / rate + 2 * float(np.spacing(np.float32(max(abs(start), abs(end)))))
-    return np.where(np.abs(nearest - when) <= slack, nearest, when), rate
+    same = np.abs(nearest - when) <= _SAME_TIME / rate + noise
+    return np.where(same, nearest, when), rate
 
 
 def number_of(value: object) -> float | None:

@@ -15,7 +15,6 @@ from poise.motion.io.gltf_tracks import Take, choose_take
 from poise.motion.io.gltf_tree import Tree, choose_joints, read_tree
 from poise.motion.io.nodes import base_of, checked_unit, even, rigid_bones, unique_names
 from poise.motion.io.raw import Options, RawMotion, assemble
-from poise.motion.io.text import MAX_JOINTS
 
 _EVEN_SCALE = 1e-2
 
@@ -37,8 +36,6 @@ def read_gltf(path: Path, options: Options) -> Clip:
     moving = take.nodes("translation", "rotation", varying=True)
     joints = choose_joints(tree, file, targeted, moving, notes)
     joints = _without_still_roots(tree, joints, take, moving)
-    if len(joints) > MAX_JOINTS:
-        raise PoiseError(f"it has {len(joints)} joints, more than the {MAX_JOINTS} allowed", path)
     raw = _raw_motion(file, tree, take, joints, options, notes)
     return assemble(raw, options)
 
