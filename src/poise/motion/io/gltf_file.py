@@ -22,7 +22,7 @@ _JSON, _BIN = 0x4E4F534A, 0x004E4942
 MAX_OBJECTS = 100_000
 """Documents with more nodes or accessors than this are refused."""
 MAX_CHANNELS = 10_000
-"""The same for the channels of one animation: three for each of the joints that are allowed, and more."""
+"""The same for the channels of one animation: up to three for each joint, and some more."""
 MAX_ELEMENTS = 40_000_000
 """Files whose accessors ask for more elements than this, all together, are refused."""
 MAX_EMBEDDED_BYTES = 4 * MAX_FILE_BYTES // 3 + 64
