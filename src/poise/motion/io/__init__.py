@@ -1,4 +1,4 @@
-"""Motion files: BVH and glTF (read and write), ASF/AMC, DeepMimic; all conversion to metres and Z up."""
+"""Motion files: BVH, glTF and USD in and out, ASF/AMC, DeepMimic; all conversion to metres, Z up."""
 
 from poise.motion.io.bvh_write import write_bvh
 from poise.motion.io.formats import READERS, WRITERS, read_clip, write_clip

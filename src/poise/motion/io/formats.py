@@ -35,6 +35,8 @@ from poise.motion.io.raw import Options, check_options
 from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
 from poise.motion.io.trc import looks_like_trc, read_trc
+from poise.motion.io.usd_read import read_usd
+from poise.motion.io.usd_write import write_usd
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,10 @@ def _looks_like_gltf(head: bytes) -> bool:
     return head[:4] == b"glTF" or (head[:1] == b"{" and b'"asset"' in head and b'"version"' in head)
 
 
+def _looks_like_usd(head: bytes) -> bool:
+    return head.startswith((b"PXR-USDC", b"#usda"))
+
+
 def _refuse_asf(path: Path, options: Options) -> Clip:
     raise PoiseError(
         "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
@@ -88,6 +94,7 @@ READERS = (
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
+    Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL or Poise", (".npz",), looks_like_npz, read_npz),
     Reader("pickled SMPL or poselib", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
@@ -112,8 +119,6 @@ _MAGIC = (
 _NOT_YET = {
     ".fbx": "FBX",
     ".h5": "HDF5",
-    ".usd": "USD",
-    ".usda": "USD",
     ".vmd": "VMD",
 }
 
@@ -184,11 +189,14 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
     ".csv": write_csv,
     ".glb": write_gltf,
     ".gltf": write_gltf,
+    ".usd": write_usd,
+    ".usda": write_usd,
+    ".usdc": write_usd,
 }
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_csv`, `write_gltf`.
+    """Writes a clip in the format of the file's suffix; see `write_bvh` and the like.
 
     `.npz`: a clip that came from the SMPL family is written with the keys of AMASS, any other as
     Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the one or the other.

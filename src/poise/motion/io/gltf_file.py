@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 MAX_OBJECTS = 100_000
-"""Documents with more nodes, accessors or channels than this are refused."""
+"""Documents with more nodes or accessors than this are refused."""
+MAX_CHANNELS = 10_000
+"""The same for the channels of one animation: up to three for each joint, and some more."""
 MAX_ELEMENTS = 40_000_000
 """Files whose accessors ask for more elements than this, all together, are refused."""
 MAX_EMBEDDED_BYTES = 4 * MAX_FILE_BYTES // 3 + 64
@@ -173,8 +175,10 @@ def _check_parts(content: dict[str, Any], path: Path) -> list[str | None]:
             held = animation.setdefault(part, [])
             if not isinstance(held, list):
                 raise PoiseError(f"the {part} of animation {i} are no list", path)
-            if len(held) > MAX_OBJECTS:
-                raise PoiseError(f"animation {i} has more than {MAX_OBJECTS} {part}", path)
+            if len(held) > MAX_CHANNELS:
+                raise PoiseError(
+                    f"animation {i} has {len(held)} {part}, more than the {MAX_CHANNELS} allowed", path
+                )
     uris = [buffer.pop("uri", None) for buffer in content["buffers"]]
     for i, uri in enumerate(uris):
         if uri is not None and not isinstance(uri, str):

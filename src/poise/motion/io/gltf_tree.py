@@ -11,8 +11,11 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.io.gltf_accessor import index_of
 from poise.motion.io.gltf_file import GltfFile
-from poise.motion.io.text import MAX_VALUE, shown
+from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, shown
 from poise.spatial import matrix_to_quat
+
+MAX_DEPTH = 1000
+"""Deeper node trees are refused."""
 
 _SHEAR = 1e-3
 
@@ -22,13 +25,14 @@ class Tree:
     """All nodes of a file in its units: local transforms T R S of the rest pose.
 
     names: `N` names as written, made up where there is none. parents: -1 for roots.
-    children: in file order. place `(N, 3)`, turn `(N, 4)` wxyz, scale `(N, 3)`.
-    solid: nodes that carry a mesh or a camera.
+    children: in file order. tops: the scene root above each node.
+    place `(N, 3)`, turn `(N, 4)` wxyz, scale `(N, 3)`. solid: nodes that carry a mesh or a camera.
     """
 
     names: list[str]
     parents: list[int]
     children: list[list[int]]
+    tops: list[int]
     place: np.ndarray
     turn: np.ndarray
     scale: np.ndarray
@@ -56,7 +60,7 @@ def read_tree(file: GltfFile) -> Tree:
     if not nodes:
         raise PoiseError("the file has no nodes, so there is nothing that could move", file.path)
     names = [_name(node.name, i, file) for i, node in enumerate(nodes)]
-    parents, children = _links(file, names)
+    parents, children, tops = _links(file, names)
     place, turn, scale = (np.zeros((len(nodes), 3)), np.zeros((len(nodes), 4)), np.ones((len(nodes), 3)))
     turn[:, 0] = 1.0
     for i, node in enumerate(nodes):
@@ -75,7 +79,7 @@ def read_tree(file: GltfFile) -> Tree:
                 raise PoiseError("its rotation is a quaternion of no length", where)
             turn[i] = np.array((w, x, y, z)) / norm
     solid = [node.mesh is not None or node.camera is not None for node in nodes]
-    return Tree(names, parents, children, place, turn, scale, solid)
+    return Tree(names, parents, children, tops, place, turn, scale, solid)
 
 
 def _name(value: object, index: int, file: GltfFile) -> str:
@@ -86,7 +90,8 @@ def _name(value: object, index: int, file: GltfFile) -> str:
     return value
 
 
-def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]]]:
+def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]], list[int]]:
+    """Parents, children and the scene root of each node."""
     nodes = file.doc.nodes
     parents = [-1] * len(nodes)
     children: list[list[int]] = []
@@ -103,12 +108,17 @@ def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]]
             children[i].append(child)
     # With one parent each, a node that no root reaches lies on a cycle or below one.
     reached = [i for i, parent in enumerate(parents) if parent < 0]
+    tops, depth = list(range(len(nodes))), [0] * len(nodes)
     for i in reached:
         reached += children[i]
+        for child in children[i]:
+            tops[child], depth[child] = tops[i], depth[i] + 1
     if len(reached) < len(nodes):
         lost = next(iter(set(range(len(nodes))) - set(reached)))
         raise PoiseError(f"the nodes around '{names[lost]}' form a cycle", file.path)
-    return parents, children
+    if max(depth) > MAX_DEPTH:
+        raise PoiseError(f"its nodes are nested {max(depth)} deep, more than any body's", file.path)
+    return parents, children, tops
 
 
 def _vector(value: object, size: int, what: str, where: str) -> np.ndarray:
@@ -147,6 +157,7 @@ def choose_joints(
     """
     skin = _skin_joints(tree, file, targeted)
     wanted = set(skin) if skin else _biggest_tree(tree, targeted, notes)
+    _check_count(len(wanted), file)
     for node in list(wanted):
         above = tree.line(node)[:-1]
         first = next((a for a in above if a in moving), None)
@@ -159,10 +170,16 @@ def choose_joints(
     root = lines[0][depth - 1]
     if not skin:
         joints |= _hanging_on(tree, joints)
+    _check_count(len(joints), file)
     order = [j for j in skin if j in joints]
     if len(order) == len(joints) and _parents_first(tree, order, root):
         return order
     return [node for node in tree.below(root) if node in joints]
+
+
+def _check_count(count: int, file: GltfFile) -> None:
+    if count > MAX_JOINTS:
+        raise PoiseError(f"it has {count} joints, more than the {MAX_JOINTS} allowed", file.path)
 
 
 def _skin_joints(tree: Tree, file: GltfFile, targeted: set[int]) -> list[int]:
@@ -189,7 +206,7 @@ def _biggest_tree(tree: Tree, targeted: set[int], notes: list[str]) -> set[int]:
     """The targeted nodes under the scene root that has most of them (cameras have their own)."""
     groups: dict[int, set[int]] = {}
     for node in targeted:
-        groups.setdefault(tree.line(node)[0], set()).add(node)
+        groups.setdefault(tree.tops[node], set()).add(node)
     best = max(groups.values(), key=len)
     others = sorted(tree.names[n] for n in targeted - best)
     if others:
@@ -203,7 +220,7 @@ def _one_tree(tree: Tree, wanted: set[int], notes: list[str]) -> set[int]:
     """The wanted nodes under the scene root that has most of them."""
     groups: dict[int, set[int]] = {}
     for node in wanted:
-        groups.setdefault(tree.line(node)[0], set()).add(node)
+        groups.setdefault(tree.tops[node], set()).add(node)
     best = max(groups.values(), key=len)
     if len(groups) > 1:
         notes.append(f"{len(wanted) - len(best)} joints that hang on no common node were left out")
@@ -221,12 +238,14 @@ def _shared_depth(lines: Sequence[list[int]]) -> int:
 
 
 def _hanging_on(tree: Tree, joints: Iterable[int]) -> set[int]:
-    """Nodes below the joints that have neither a mesh nor anything with one below them."""
+    """What hangs on the joints, down to nodes that carry a mesh or a camera."""
     out: set[int] = set()
-    for joint in joints:
-        for node in tree.below(joint):
-            if not any(tree.solid[n] for n in tree.below(node)):
-                out.add(node)
+    stack = [child for joint in joints for child in tree.children[joint]]
+    while stack:
+        node = stack.pop()
+        if node not in out and not tree.solid[node]:
+            out.add(node)
+            stack += tree.children[node]
     return out
 
 

@@ -14,14 +14,12 @@ import torch
 from poise.motion.clip import Clip
 from poise.motion.io.bvh_write import write_whole
 from poise.motion.io.gltf_mesh import bone_figure
-from poise.motion.io.gltf_read import Base, base_of
+from poise.motion.io.nodes import base_of, place_of_travel, tips_from_z_up
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.spatial import (
-    forward_kinematics,
     normalize,
     quat_conj,
     quat_mul,
-    quat_rotate_inv,
     quat_to_matrix,
     unwrap_quats,
 )
@@ -88,10 +86,10 @@ def _plan(clip: Clip) -> _Plan:
     base = base_of([(p, q, s) for _, p, q, s in above])
     paths = {0: root_pos}
     if kept.get("still") is not None and source.travel_joint in skeleton.names:
-        paths = _with_travel(clip, offsets, root_pos, rot, np.array(kept["still"]))
-    paths[0] = _below(base, paths[0])
+        paths = place_of_travel(skeleton, offsets, root_pos, rot, np.array(kept["still"]))
+    paths[0] = base.down(paths[0])
     rot[:, 0] = quat_mul(quat_conj(torch.tensor(base.turn)).expand(len(rot), 4), rot[:, 0])
-    factor = np.full(count, base.factor * float(np.cbrt(np.prod(base.scale))))
+    factor = np.full(count, base.below())
     for j, parent in enumerate(skeleton.parents):
         if parent >= 0:
             factor[j] = factor[parent] * scale[parent]
@@ -121,28 +119,6 @@ def _kept(clip: Clip) -> dict[str, Any]:
     kept = json.loads(text) if text else {}
     fits = len(kept.get("rest", ())) == len(clip.skeleton) == len(kept.get("scale", ()))
     return kept if fits else {}
-
-
-def _below(base: Base, pos: np.ndarray) -> np.ndarray:
-    """World places in the frame of the node above the root: the inverse of `Base`."""
-    q = torch.tensor(base.turn).expand(len(pos), 4)
-    return quat_rotate_inv(q, torch.tensor(pos - base.place)).numpy() / (base.factor * base.scale)
-
-
-def _with_travel(
-    clip: Clip, offsets: np.ndarray, root_pos: np.ndarray, rot: torch.Tensor, still: np.ndarray
-) -> dict[int, np.ndarray]:
-    """The root where it stood, and the path of the joint that travels in its stead."""
-    names, parents = clip.skeleton.names, clip.skeleton.parents
-    travel = names.index(str(clip.skeleton.source.travel_joint))
-    stays = torch.tensor(still).expand(len(rot), 3)
-    bones = torch.tensor(offsets)
-    base, quat = forward_kinematics(parents, bones, stays, rot)
-    pos, _ = forward_kinematics(parents, bones, torch.tensor(root_pos), rot)
-    up = parents[travel]
-    # p_travel = R_parent^-1 (x_travel - x_parent), with the parent where a still root puts it.
-    path = quat_rotate_inv(quat[:, up], pos[:, travel] - base[:, up])
-    return {0: stays.numpy().copy(), travel: path.numpy()}
 
 
 class _Buffer:
@@ -227,8 +203,8 @@ def _add_nodes(doc: Any, clip: Clip, plan: _Plan) -> None:
             )
         )
     tips: dict[int, list[list[float]]] = {}
-    for j, tip in skeleton.ends:
-        tips.setdefault(j, []).append(_floats(vectors_from_z_up(np.array(tip), plan.axis) / plan.unit_m))
+    for j, tip in tips_from_z_up(skeleton, plan.axis, plan.unit_m):
+        tips.setdefault(j, []).append(_floats(tip))
     for j, name in enumerate(skeleton.names):
         node = Node(
             name=name,
@@ -275,7 +251,7 @@ def _add_figure(out: _Buffer, clip: Clip, plan: _Plan, first: int) -> None:
     matrices = out.add(inverse.transpose(0, 2, 1).reshape(-1, 16), "MAT4")
     doc.skins.append(Skin(name="Poise", joints=joints, skeleton=first, inverseBindMatrices=matrices))
     tips = []
-    for j, tip in skeleton.ends:
+    for j, tip in tips_from_z_up(skeleton, plan.axis, plan.unit_m):
         # Tips are rigid parts of their joints and know no scale.
         turn = rest[j, :3, :3] / np.linalg.norm(rest[j, :3, :3], axis=0)
         tips.append(

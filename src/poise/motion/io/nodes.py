@@ -1,0 +1,252 @@
+"""Animated nodes with places, turns and scales (glTF, USD) as rigid bones and one root path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from poise.motion.info import body_height, sampled
+from poise.motion.io.guess import guess_unit, guess_up
+from poise.motion.io.raw import Options, vectors_from_z_up
+from poise.motion.io.text import shown
+from poise.motion.skeleton import Skeleton
+from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
+
+# As for BVH: a joint whose place stays within this share of the skeleton's size is rigid.
+_RIGID_SHARE = 6e-4
+_TRAVEL_SHARE = 20 * _RIGID_SHARE
+_HUMAN_M = (0.3, 4.0)
+
+
+@dataclass(frozen=True)
+class Base:
+    """What lies above the root joint: p_world = place + R factor (scale * p), R = `turn` (wxyz)."""
+
+    place: np.ndarray
+    turn: np.ndarray
+    factor: float
+    scale: np.ndarray
+
+    def down(self, pos: np.ndarray) -> np.ndarray:
+        """World places `(T, 3)` in the frame of the node above the root."""
+        q = torch.tensor(self.turn).expand(len(pos), 4)
+        return quat_rotate_inv(q, torch.tensor(pos - self.place)).numpy() / (self.factor * self.scale)
+
+    def below(self) -> float:
+        """The scale that reaches what hangs on the root joint."""
+        return self.factor * even(self.scale)
+
+
+@dataclass(frozen=True)
+class Bones:
+    """Rigid bones in the file's units: offsets `(J, 3)`, root_pos `(T, 3)`, rot `(T, J, 4)` wxyz.
+
+    travel: the joint that carries the travel instead of the root, or with it. still: the root's place
+    where it stands still. strays: `(joint, largest distance)` of bones that did not stay rigid.
+    """
+
+    offsets: np.ndarray
+    root_pos: np.ndarray
+    rot: np.ndarray
+    travel: int | None
+    still: list[float] | None
+    strays: tuple[tuple[str, float], ...]
+
+
+def even(scale: np.ndarray) -> float:
+    """The one factor nearest to a scale `(3,)`: its geometric mean."""
+    return float(np.cbrt(np.prod(scale)))
+
+
+def base_of(nodes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Base:
+    """The combined transform of nested nodes `(place, turn, scale)`, outermost first.
+
+    Even scales combine exactly; of an uneven one the mean reaches beyond the node's children.
+    """
+    out = Base(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 1.0, np.ones(3))
+    for place, turn, scale in nodes:
+        out = Base(
+            out.place + _turned(out.turn, out.factor * out.scale * place),
+            quat_mul(torch.tensor(out.turn), torch.tensor(turn)).numpy(),
+            out.below(),
+            np.array(scale, dtype=np.float64),
+        )
+    return out
+
+
+def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors `v (..., 3)` turned by one rotation."""
+    return quat_rotate(torch.tensor(q).expand(*v.shape[:-1], 4), torch.tensor(v)).numpy()
+
+
+def rigid_bones(
+    names: Sequence[str],
+    parents: Sequence[int],
+    place: Sequence[np.ndarray],
+    turn: Sequence[np.ndarray],
+    scale: Sequence[np.ndarray],
+    base: Base,
+    notes: list[str],
+) -> Bones:
+    """Bones of constant length from joints' local transforms.
+
+    Args:
+        place, turn: per joint `(T, 3)` and `(T, 4)` wxyz, or one row where it is constant.
+        scale: `(3,)` per joint, constant. base: what lies above the root.
+    """
+    frames = max(len(x) for x in (*place, *turn))
+    factor = [base.below()]
+    offsets = np.zeros((len(parents), 3))
+    paths: dict[int, np.ndarray] = {}
+    for j, up in enumerate(parents[1:], 1):
+        factor.append(factor[up] * even(scale[up]))
+        paths[j] = factor[up] * scale[up] * place[j]
+        offsets[j] = np.median(paths[j], axis=0)
+    rot = np.stack([np.broadcast_to(q, (frames, 4)) for q in turn], 1)
+    rot[:, 0] = quat_mul(torch.tensor(base.turn).expand(frames, 4), torch.tensor(rot[:, 0])).numpy()
+    root_pos = base.place + _turned(base.turn, base.factor * base.scale * place[0])
+    root_pos = np.array(np.broadcast_to(root_pos, (frames, 3)))
+    size = float(np.linalg.norm(offsets[1:], axis=-1).sum()) / 4 + 1e-12
+    travel = _travel_joint(parents, offsets, paths, root_pos, size)
+    still = None
+    if travel is not None:
+        moves = np.abs(root_pos - root_pos[0]).max() > _RIGID_SHARE * size
+        still = None if moves else root_pos[0].tolist()
+        root, hips = names[0], names[travel]
+        notes.append(
+            f"Both the root '{root}' and '{hips}' travel; the path of both became the root's"
+            if moves
+            else f"The root '{root}' stands still: the travel of '{hips}' became the root's path"
+        )
+        offsets[travel] = 0.0
+        root_pos = _lifted(parents, offsets, root_pos, rot, travel, paths.pop(travel))
+    strays = ((j, float(np.linalg.norm(p - offsets[j], axis=-1).max())) for j, p in paths.items())
+    loose = tuple((names[j], stray) for j, stray in strays if stray > _RIGID_SHARE * size)
+    return Bones(offsets, root_pos, rot, travel, still, loose)
+
+
+def _travel_joint(
+    parents: Sequence[int],
+    offsets: np.ndarray,
+    paths: dict[int, np.ndarray],
+    root_pos: np.ndarray,
+    size: float,
+) -> int | None:
+    """The joint near the root that moves against its parent and carries more than half of all joints.
+
+    Below a root that moves itself, it is sought only as long as joints have a single child; further
+    bones stay rigid and what moves is told as a stray.
+    """
+    weight = [1] * len(parents)
+    for j in range(len(parents) - 1, 0, -1):
+        weight[parents[j]] += weight[j]
+    still = np.abs(root_pos - root_pos[0]).max() <= _RIGID_SHARE * size
+    joint, only = 0, True
+    while True:
+        heavy = [j for j, p in enumerate(parents) if p == joint and 2 * weight[j] > weight[0]]
+        only = only and parents.count(joint) == 1
+        if not heavy or not (only or still):
+            return None
+        joint = heavy[0]
+        slack = (_RIGID_SHARE if only else _TRAVEL_SHARE) * size
+        if np.linalg.norm(paths[joint] - offsets[joint], axis=-1).max() > slack:
+            return joint
+
+
+def _lifted(
+    parents: Sequence[int],
+    offsets: np.ndarray,
+    root_pos: np.ndarray,
+    rot: np.ndarray,
+    joint: int,
+    path: np.ndarray,
+) -> np.ndarray:
+    """The root's path with a joint's own travel added: p_root + R_parent p_joint(t)."""
+    _, quat = forward_kinematics(
+        parents, torch.tensor(offsets), torch.tensor(root_pos), torch.tensor(rot)
+    )
+    moved = quat_rotate(quat[:, parents[joint]], torch.tensor(path).expand(len(rot), 3))
+    return root_pos + moved.numpy()
+
+
+def place_of_travel(
+    skeleton: Skeleton, offsets: np.ndarray, root_pos: np.ndarray, rot: torch.Tensor, still: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Local paths on the way back: the root where it stood, and the joint that travels in its stead."""
+    travel = skeleton.names.index(str(skeleton.source.travel_joint))
+    stays = torch.tensor(still).expand(len(rot), 3)
+    bones = torch.tensor(offsets)
+    base, quat = forward_kinematics(skeleton.parents, bones, stays, rot)
+    pos, _ = forward_kinematics(skeleton.parents, bones, torch.tensor(root_pos), rot)
+    up = skeleton.parents[travel]
+    # p_travel = R_parent^-1 (x_travel - x_parent), with the parent where a still root puts it.
+    path = quat_rotate_inv(quat[:, up], pos[:, travel] - base[:, up])
+    return {0: stays.numpy().copy(), travel: path.numpy()}
+
+
+def unique_names(names: Sequence[str], notes: list[str]) -> tuple[str, ...]:
+    """The names, with a number added to those that appear again."""
+    out: list[str] = []
+    seen: set[str] = set()
+    for name in names:
+        made, k = name, 2
+        while made in seen or (made != name and made in names):
+            made, k = f"{name}_{k}", k + 1
+        if made != name:
+            notes.append(
+                f"The joint name {shown(name)} appears twice; the later one is called {shown(made)}"
+            )
+        seen.add(made)
+        out.append(made)
+    return tuple(out)
+
+
+def checked_unit(
+    form: str,
+    stated: float,
+    up_axis: str,
+    names: Sequence[str],
+    parents: Sequence[int],
+    bones: Bones,
+    options: Options,
+    path: object,
+    notes: list[str],
+) -> float:
+    """Metres in one unit as the format states it, unless the body would then be no human's size.
+
+    Such a unit is guessed anew from the body's height, and told. So is a vertical against which the
+    body stands; it is kept.
+    """
+    if len(bones.rot) < 2 or not np.abs(bones.offsets).max() > 0:
+        return stated
+    at = sampled(len(bones.rot))
+    pos = forward_kinematics(
+        parents,
+        torch.tensor(bones.offsets),
+        torch.tensor(bones.root_pos[at]),
+        torch.tensor(bones.rot[at]),
+    )[0].numpy()
+    up = guess_up(names, pos, pos[0])
+    if options.up_axis is None and up.value != up_axis and "uncertain" not in up.note:
+        notes.append(
+            f"The {form} file has {up_axis} up and was read so, but the body stands along {up.value}; "
+            f"if it should stand upright, override with --up {up.value}"
+        )
+    height, how = body_height(names, parents, bones.offsets, pos)
+    size = height * stated
+    if options.unit_m is not None or not height > 0 or _HUMAN_M[0] <= size <= _HUMAN_M[1]:
+        return stated
+    unit = float(guess_unit(height, how, None, path).value)  # type: ignore[arg-type]
+    notes.append(
+        f"In the unit of the {form} file the person would be {size:.4g} m tall: one unit is taken as "
+        f"{unit:.6g} m, which makes it {height * unit:.2f} m ({how})"
+    )
+    return unit
+
+
+def tips_from_z_up(skeleton: Skeleton, up_axis: str, unit_m: float) -> list[tuple[int, np.ndarray]]:
+    """Bone tips `(joint, (3,))` in the joints' frames, in the file's unit and axes."""
+    return [(j, vectors_from_z_up(np.array(tip), up_axis) / unit_m) for j, tip in skeleton.ends]
