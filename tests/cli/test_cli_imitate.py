@@ -47,6 +47,27 @@ def test_imitate_writes_everything(trained: Path, capsys: pytest.CaptureFixture[
     assert facts["frames"] == 16 and facts["fps"] == pytest.approx(30, rel=1e-4)
 
 
+def test_the_motion_goes_into_the_file_that_was_named(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "moved.glb"
+    assert main(["imitate", str(clip), "-o", str(out), *MINIATURE, "--iterations", "1"]) == 0
+    assert {p.name for p in tmp_path.glob("moved*")} == {"moved.glb", "moved"}
+    assert {p.name for p in (tmp_path / "moved").iterdir()} == {"score.json", "report.html", "run"}
+    assert str(out) in capsys.readouterr().out
+    assert main(["info", "--json", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["format"] == "gltf"
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_any_work(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["imitate", str(clip), "-o", str(tmp_path / "moved.fbx")]) == 2
+    assert "cannot be written as '.fbx'" in capsys.readouterr().err and not list(tmp_path.glob("moved*"))
+    assert main(["imitate", str(clip), "-o", str(clip)]) == 2
+    assert "written over itself" in capsys.readouterr().err
+
+
 def test_resume_goes_on(
     trained: Path, clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

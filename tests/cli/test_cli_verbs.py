@@ -83,8 +83,8 @@ def test_tyros_frames_become_one_sentence(encoding: str, monkeypatch: pytest.Mon
         return str(problem.value)
 
     see = ". See poise imitate --help"
-    assert said("a.bvh") == "poise imitate needs -o DIR, --out DIR" + see
-    assert said() == "poise imitate needs CLIP and -o DIR, --out DIR" + see
+    assert said("a.bvh") == "poise imitate needs -o DIR|FILE, --out DIR|FILE" + see
+    assert said() == "poise imitate needs CLIP and -o DIR|FILE, --out DIR|FILE" + see
     near = "unrecognized options: --minuts, 3. Did you mean --minutes? See poise imitate --help"
     assert said("a.bvh", "-o", "out", "--minuts", "3") == near
     known = "invalid choice 'Q' for argument '--up'. Known: Y, Z"

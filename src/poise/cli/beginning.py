@@ -34,8 +34,8 @@ def beginning(first: First | None = None) -> Beginning:
     return Beginning(expert, cloned_round, first, failed)
 
 
-def first_delivery(imitation: Imitation, out: Path) -> First:
-    """Writes the clone's motion, score and report into `out`; training then goes on and better it."""
+def first_delivery(imitation: Imitation, out: Path, motion: Path | None = None) -> First:
+    """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
 
     def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
         from poise.recipes.deliver import deliver
@@ -44,7 +44,7 @@ def first_delivery(imitation: Imitation, out: Path) -> First:
 
         meta = {"seconds": start.seconds, "samples": start.samples}
         evaluation = evaluate(imitation, policy, meta, most=FIRST_STARTS)
-        paths = deliver(imitation, evaluation, out, {})
+        paths = deliver(imitation, evaluation, out, {}, motion)
         tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
 
     return deliver_first

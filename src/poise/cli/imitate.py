@@ -15,17 +15,19 @@ from poise.cli.options import Body, Reading, Training
 from poise.cli.progress import working
 from poise.cli.results import print_card
 from poise.cli.training import Job, command_line
+from poise.errors import PoiseError
 
 
 @dataclass(frozen=True)
 class Options:
-    """Give one clip a body: train, simulate every start frame, write simulated.bvh, score.json,
+    """Give one clip a body: train, simulate every start frame, write the motion, score.json,
     report.html and the run itself."""
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
-    """The folder of the results."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
+    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
+    into a folder of its name."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
@@ -35,12 +37,13 @@ def run(options: Options, argv: Sequence[str]) -> int:
     """Trains, evaluates, delivers; Ctrl-C during training saves and evaluates nothing."""
     o = options
     again = command_line("imitate", argv)
-    job = Job((o.clip,), o.out, o.out / "run", o.training, o.body, o.reading, again)
+    out, motion = _places(o)
+    job = Job((o.clip,), out, out / "run", o.training, o.body, o.reading, again)
     from poise.learn.parallel import joined
 
     with joined() as comm:
         imitation = job.start(comm)
-        result = job.train(imitation, comm, first_delivery(imitation, o.out))
+        result = job.train(imitation, comm, first_delivery(imitation, out, motion))
     if result.interrupted:
         return job.stopped("Stopped; the training so far is saved.")
     if comm.rank:
@@ -52,10 +55,22 @@ def run(options: Options, argv: Sequence[str]) -> int:
         with working("simulating every start frame"):
             trained, device = trained_policy(job.run, imitation), o.training.device
             evaluation = evaluate(imitation, *trained, device=device)
-            paths = deliver(imitation, evaluation, o.out, learning_curve(job.run))
+            paths = deliver(imitation, evaluation, out, learning_curve(job.run), motion)
     except KeyboardInterrupt:
         return job.stopped("Stopped in the evaluation; the training is saved.")
     print_card(evaluation.card)
     for path in (*paths.values(), job.run):
         say(str(path))
     return 0
+
+
+def _places(o: Options) -> tuple[Path, Path | None]:
+    """The folder of the results, and the file of the motion where one was named."""
+    if not o.out.suffix or o.out.is_dir():
+        return o.out, None
+    from poise.motion.io import check_writable
+
+    check_writable(o.out)
+    if o.out.exists() and o.clip.exists() and o.out.samefile(o.clip):
+        raise PoiseError("the clip would be written over itself", o.out, "Give -o another name")
+    return o.out.with_suffix(""), o.out

@@ -34,6 +34,8 @@ class Reading:
     """Metres in one unit of the file: 0.01 for centimetres."""
     up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
     """The file's vertical."""
+    take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
+    """Which animation of a file that holds several (glTF, USD); by default the longest."""
     allow_pickle: bool = False
     """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
@@ -48,6 +50,7 @@ class Reading:
             unit_m=self.unit,
             up_axis=self.up,
             allow_pickle=self.allow_pickle,
+            take=self.take,
         )
 
 

@@ -10,7 +10,7 @@ from poise import __version__
 from poise.eval import write_score
 from poise.kin import lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
-from poise.motion.io import write_clip
+from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.session import Evaluation
 from poise.view import Report, Shape, Track, write_report
@@ -45,19 +45,27 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
 
 
 def deliver(
-    imitation: Imitation, evaluation: Evaluation, out: Path, curve: dict[str, np.ndarray]
+    imitation: Imitation,
+    evaluation: Evaluation,
+    out: Path,
+    curve: dict[str, np.ndarray],
+    motion: Path | None = None,
 ) -> dict[str, Path]:
-    """Writes `simulated.bvh`, `score.json` and `report.html` into `out`; returns their paths.
+    """Writes the motion, `score.json` and `report.html` into `out`; returns their paths.
 
-    A library gets one `simulated_<clip>.bvh` per clip; the report shows the first clip.
+    The motion is `simulated.bvh`, or has the suffix of its source's format, see `home_suffix`. A library
+    gets one `simulated_<clip>` file per clip; the report shows the first clip.
+
+    motion: the file for a single clip's motion, in the format of its suffix, in place of that in `out`.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
     for k, recording in enumerate(evaluation.recordings):
         single = len(evaluation.recordings) == 1
         name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
-        paths[name] = out / f"{name}.bvh"
-        write_clip(simulated_clip(imitation, evaluation, k), paths[name])
+        clip = simulated_clip(imitation, evaluation, k)
+        paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"
+        write_clip(clip, paths[name])
     paths["score"] = write_score(evaluation.card, out / "score.json")
     paths["report"] = out / "report.html"
     write_report(make_report(imitation, evaluation, curve), paths["report"])

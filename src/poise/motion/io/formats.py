@@ -35,7 +35,7 @@ from poise.motion.io.raw import Options, check_options
 from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
 from poise.motion.io.trc import looks_like_trc, read_trc
-from poise.motion.io.usd_read import read_usd
+from poise.motion.io.usd_read import pxr_package, read_usd
 from poise.motion.io.usd_write import write_usd
 
 
@@ -205,6 +205,28 @@ def write_clip(clip: Clip, path: str | Path) -> None:
         PoiseError: an unknown suffix (the known ones are listed) or a folder that cannot be written.
     """
     path = Path(path)
+    _writer(path)(clip, path)
+
+
+#: Suffix of the format in which a motion goes back to where it came from, where it is not BVH.
+_HOME = {"gltf": ".glb", "usd": ".usda", "smpl": ".npz"}
+
+
+def home_suffix(clip: Clip) -> str:
+    """The suffix of the format that keeps most of the file a clip came from.
+
+    ".glb" for glTF, ".usda" for USD, ".npz" for AMASS, ".bvh" for all others.
+    """
+    return _HOME.get(clip.skeleton.source.format, ".bvh")
+
+
+def check_writable(path: Path) -> None:
+    """Refuses a file whose suffix names no format that can be written here, before any work is done."""
+    if _writer(path) is write_usd:
+        pxr_package()
+
+
+def _writer(path: Path) -> Callable[[Clip, Path], None]:
     writer = WRITERS.get(path.suffix.lower())
     if writer is None:
         raise PoiseError(
@@ -212,4 +234,4 @@ def write_clip(clip: Clip, path: str | Path) -> None:
             path,
             f"Suffixes that can be written: {', '.join(WRITERS)}",
         )
-    writer(clip, path)
+    return writer
