@@ -27,6 +27,8 @@ def drop_spikes(positions: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarr
         off = np.linalg.norm(positions[:, k] - _running_median(positions[:, k], _HALF_WINDOW), axis=-1)
         usual = _running_median(off[:, None], max(_HALF_WINDOW, round(0.5 * fps)))[:, 0]
         spikes[:, k] = off > np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
+    # At the ends nothing tells a spike from a step.
+    spikes[:_HALF_WINDOW] = spikes[-_HALF_WINDOW:] = False
     out = positions.copy()
     out[spikes] = np.nan
     return out, spikes
