@@ -147,9 +147,8 @@ def require(data: Mapping[str, Any], keys: Sequence[str], path: Path, what: str)
     """Refuses data that lack some of `keys`, with what is there and what was perhaps meant."""
     missing = [k for k in keys if k not in data]
     if missing:
-        plural = "s" if len(missing) > 1 else ""
-        hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It holds no arrays"
-        raise PoiseError(f"{what} needs the array{plural} {listed(missing)}", path, hint)
+        hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It is empty"
+        raise PoiseError(f"{what} lacks {listed(missing)}", path, hint)
 
 
 def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path) -> np.ndarray:
@@ -162,8 +161,9 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
         b in (None, a) for a, b in zip(value.shape, shape, strict=False)
     )
     if not fits:
-        wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise PoiseError(f"it has the shape {value.shape}, not ({wanted})", where)
+        wanted = " x ".join("any" if n is None else str(n) for n in shape)
+        found = " x ".join(map(str, value.shape)) or "()"
+        raise PoiseError(f"it has the shape {found}, not {wanted}", where)
     return value.astype(np.float64)
 
 

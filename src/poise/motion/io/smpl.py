@@ -103,7 +103,7 @@ def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str
 def _needed(data: Mapping[str, Any], names: Sequence[str], path: Path) -> str:
     found = _first(data, names)
     if found is None:
-        require(data, names[:1], path, "a motion of the SMPL family")
+        require(data, names[:1], path, "this motion of the SMPL family")
     return str(found)
 
 
