@@ -133,7 +133,11 @@ def read_npy(file: IO[bytes], where: str | Path, allow_pickle: bool = False) -> 
         raise PoiseError(
             f"it states the shape {header.shape} of {size} bytes, but {there} are there", where, CUT_OFF
         )
-    return np.frombuffer(data, header.dtype).reshape(header.shape, order="F" if header.fortran else "C")
+    try:
+        flat = np.frombuffer(data, header.dtype) if size else np.zeros(0, header.dtype)
+        return flat.reshape(header.shape, order="F" if header.fortran else "C")
+    except ValueError:
+        raise PoiseError(f"its shape {header.shape} makes no array", where, CUT_OFF) from None
 
 
 def first_member(head: bytes) -> bytes:
