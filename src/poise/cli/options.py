@@ -34,12 +34,21 @@ class Reading:
     """Metres in one unit of the file: 0.01 for centimetres."""
     up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
     """The file's vertical."""
+    allow_pickle: bool = False
+    """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
     def read(self, path: Path) -> Clip:
         """The clip in the file `path`."""
         from poise.motion.io import read_clip
 
-        return read_clip(path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up)
+        return read_clip(
+            path,
+            skeleton=self.skeleton,
+            fps=self.fps,
+            unit_m=self.unit,
+            up_axis=self.up,
+            allow_pickle=self.allow_pickle,
+        )
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ MAX_KEYS = 4096
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
 _HEADER_BYTES = 1 << 16
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,11 @@ def read_npy(file: IO[bytes], where: str | Path, allow_pickle: bool = False) -> 
         raise PoiseError(
             f"it states the shape {header.shape} of {size} bytes, but {there} are there", where, CUT_OFF
         )
-    return np.frombuffer(data, header.dtype).reshape(header.shape, order="F" if header.fortran else "C")
+    try:
+        flat = np.frombuffer(data, header.dtype) if size else np.zeros(0, header.dtype)
+        return flat.reshape(header.shape, order="F" if header.fortran else "C")
+    except ValueError:
+        raise PoiseError(f"its shape {header.shape} makes no array", where, CUT_OFF) from None
 
 
 def first_member(head: bytes) -> bytes:
@@ -147,9 +151,8 @@ def require(data: Mapping[str, Any], keys: Sequence[str], path: Path, what: str)
     """Refuses data that lack some of `keys`, with what is there and what was perhaps meant."""
     missing = [k for k in keys if k not in data]
     if missing:
-        plural = "s" if len(missing) > 1 else ""
-        hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It holds no arrays"
-        raise PoiseError(f"{what} needs the array{plural} {listed(missing)}", path, hint)
+        hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It is empty"
+        raise PoiseError(f"{what} lacks {listed(missing)}", path, hint)
 
 
 def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path) -> np.ndarray:
@@ -162,9 +165,18 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
         b in (None, a) for a, b in zip(value.shape, shape, strict=False)
     )
     if not fits:
-        wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise PoiseError(f"it has the shape {value.shape}, not ({wanted})", where)
+        wanted = " x ".join("any" if n is None else str(n) for n in shape)
+        found = " x ".join(map(str, value.shape)) or "()"
+        raise PoiseError(f"it has the shape {found}, not {wanted}", where)
     return value.astype(np.float64)
+
+
+def one_number(data: Mapping[str, Any], key: str, path: Path) -> float:
+    """A finite number that stands alone, in an array of any number of axes."""
+    value = float(numeric({key: np.ravel(np.asarray(data[key]))}, key, (1,), path)[0])
+    if not np.isfinite(value):
+        raise PoiseError(f"it holds {value}, not a finite number", f"{path}, array {shown(key)}")
+    return value
 
 
 def text_of(value: Any, default: str = "") -> str:

@@ -155,8 +155,8 @@ def _labels(point: dict[str, np.ndarray]) -> list[str]:
 
 
 def _text(point: dict[str, np.ndarray], key: str) -> str:
-    value = point.get(key, ())
-    return str(value[0]).strip() if len(value) else ""
+    value = [str(x) for x in point.get(key, ())]
+    return value[0].strip() if value else ""
 
 
 def _vertical(point: dict[str, np.ndarray]) -> str | None:

@@ -22,7 +22,7 @@ from poise.errors import PoiseError
 from poise.motion.io.arrays import MAX_ARRAY_BYTES, NPY_MAGIC, npy_header
 from poise.motion.io.text import CUT_OFF, check_file, shown
 
-ASK = "Read it with --allow-pickle (allow_pickle=True) if you trust where it comes from"
+ASK = "Read it with --allow-pickle (in Python: allow_pickle) if you want that; no code of its runs"
 """The hint of every refusal of a pickled file."""
 _MAX_STEPS = 5_000_000
 _CORE = ("numpy.core.", "numpy._core.")
@@ -295,6 +295,11 @@ def _made_bytes(text: Any, coding: Any = "latin1") -> bytes:
     return _as(str, text).encode("latin-1")
 
 
+def _made_nothing() -> bytes:
+    """What old protocols write for empty bytes."""
+    return b""
+
+
 def _made_dict(*args: Any) -> dict[Any, Any]:
     return _dict([x for pair in (args[0] if args else ()) for x in pair])
 
@@ -305,17 +310,18 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "numpy.core.multiarray.scalar": _made_scalar,
     "numpy.core.numeric._frombuffer": _made_from_buffer,
     "_codecs.encode": _made_bytes,
+    "__builtin__.bytes": _made_nothing,
     "collections.OrderedDict": _made_dict,
 }
 
+_PUSHED = (
+    *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
+    *("STRING", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
+    *("BYTEARRAY8", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"),
+)
 _STEPS: dict[str, Callable[[_Machine, Any], None]] = {
     **dict.fromkeys(("PROTO", "FRAME"), _nothing),
-    **dict.fromkeys(
-        "INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING "
-        "BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 UNICODE BINUNICODE SHORT_BINUNICODE "
-        "BINUNICODE8".split(),
-        _push,
-    ),
+    **dict.fromkeys(_PUSHED, _push),
     "NONE": _const(None),
     "NEWTRUE": _const(True),
     "NEWFALSE": _const(False),
