@@ -26,9 +26,14 @@ def drop_spikes(positions: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarr
     for k in range(positions.shape[1]):
         off = np.linalg.norm(positions[:, k] - _running_median(positions[:, k], _HALF_WINDOW), axis=-1)
         usual = _running_median(off[:, None], max(_HALF_WINDOW, round(0.5 * fps)))[:, 0]
-        spikes[:, k] = off > np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
-    # At the ends nothing tells a spike from a step.
-    spikes[:_HALF_WINDOW] = spikes[-_HALF_WINDOW:] = False
+        limit = np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
+        found = off > limit
+        # At the ends nothing tells a spike from a step.
+        found[:_HALF_WINDOW] = found[-_HALF_WINDOW:] = False
+        if found.any():
+            # In fast motion a spike bends the median beside it; what lies on the path of the rest stays.
+            path = fill(np.where(found[:, None], np.nan, positions[:, k]))
+            spikes[:, k] = found & (np.linalg.norm(positions[:, k] - path, axis=-1) > limit)
     out = positions.copy()
     out[spikes] = np.nan
     return out, spikes

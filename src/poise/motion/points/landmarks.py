@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 
-from poise.errors import PoiseError, did_you_mean
+from poise.errors import PoiseError
 from poise.motion.io.text import listed
 from poise.motion.keypoints import Keypoints
 from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
@@ -66,8 +67,17 @@ def _label_of(points: Keypoints, found: dict[str, tuple[int, ...]], place: str) 
 def _lacking(points: Keypoints, lost: list[str]) -> PoiseError:
     """Which places have no keypoint, what the file has, and which label may have been meant."""
     places = listed((place.replace("_", " ") for place in lost), 12)
-    guess = did_you_mean(lost[0].replace("_", " "), list(points.names))
-    hint = guess.split("Known:")[0] + f"The keypoints are {listed(points.names, 12)}; labels like "
+    side, part = lost[0].split("_")
+    wanted = (
+        f"{side[0].upper()}{part.capitalize()}",
+        lost[0],
+        f"{side.capitalize()}{part.capitalize()}",
+    )
+    guess = next(
+        (g for w in wanted for g in get_close_matches(w, unknown_labels(points.names), 1)), None
+    )
+    hint = f"Did you mean '{guess}'? " if guess else ""
+    hint += f"The keypoints are {listed(points.names, 12)}; labels like "
     hint += f"{listed(known_labels(), 6)} or the joint names of BVH, SMPL and COCO are understood"
     return PoiseError(f"no keypoint is the {places}", points.source.path or points.name, hint)
 
