@@ -20,6 +20,7 @@ from poise.motion.io.numpy_files import (
     read_pickled,
     write_npz,
 )
+from poise.motion.io.opensim import looks_like_mot, read_mot
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
@@ -74,6 +75,7 @@ READERS = (
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL or Poise", (".npz",), looks_like_npz, read_npz),
     Reader("pickled SMPL or poselib", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
+    Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
     Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
     Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
 )
@@ -92,7 +94,6 @@ _NOT_YET = {
     ".glb": "glTF",
     ".gltf": "glTF",
     ".trc": "TRC",
-    ".mot": "OpenSim",
     ".h5": "HDF5",
     ".usd": "USD",
     ".usda": "USD",
