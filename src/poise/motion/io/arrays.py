@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,12 @@ ZIP_MAGIC = b"PK\x03\x04"
 _HEADER_BYTES = 1 << 16
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError)
 
+# NumPy reads headers as Python literals, hence the odd company.
+_BAD_HEADER = (
+    *(ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError),
+    tokenize.TokenError,
+)
+
 
 @dataclass(frozen=True)
 class Header:
@@ -44,7 +51,7 @@ def npy_header(file: IO[bytes], where: str | Path) -> Header:
         version = npy.read_magic(file)
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(file, _HEADER_BYTES)
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError) as error:
+    except _BAD_HEADER as error:
         raise PoiseError(f"its NumPy header is damaged ({shown(str(error))})", where, CUT_OFF) from None
     if min(shape, default=0) < 0:
         raise PoiseError(f"its NumPy header states the shape {shape}", where, CUT_OFF)

@@ -21,6 +21,7 @@ from poise.motion.io.numpy_files import (
     read_pickled,
     write_npz,
 )
+from poise.motion.io.opensim import looks_like_mot, read_mot
 from poise.motion.io.points_csv import looks_like_points_csv, read_points_csv
 from poise.motion.io.points_refused import looks_like_openpose, refuse_folder, refuse_openpose
 from poise.motion.io.raw import Options, check_options
@@ -81,6 +82,7 @@ READERS = (
     Reader("TRC keypoints", (".trc",), looks_like_trc, read_trc),
     Reader("C3D markers", (".c3d",), looks_like_c3d, read_c3d),
     Reader("OpenPose", (), looks_like_openpose, refuse_openpose, asks=True),
+    Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
     Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
     Reader("CSV keypoints", (".csv",), looks_like_points_csv, read_points_csv),
     Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
@@ -100,7 +102,6 @@ _NOT_YET = {
     ".fbx": "FBX",
     ".glb": "glTF",
     ".gltf": "glTF",
-    ".mot": "OpenSim",
     ".h5": "HDF5",
     ".usd": "USD",
     ".usda": "USD",
