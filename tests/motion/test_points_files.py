@@ -90,6 +90,9 @@ def test_a_trc_is_read_as_any_other_clip(tmp_path: Path) -> None:
     wrist = clip.positions()[:, clip.skeleton.index("RightHand")]
     assert np.allclose(wrist, walking()[:, NAMES.index("RWrist")][:, [0, 2, 1]] * [1, -1, 1], atol=2e-3)
     assert read_clip(path, fps=60).fps == 60
+    assert "low-pass at 6 Hz" in notes(read_clip(path, smooth_hz=6.0))
+    with pytest.raises(PoiseError, match="--smooth must be above 0"):
+        read_clip(path, smooth_hz=0.0)
 
 
 def test_points_with_y_down_are_turned_over(tmp_path: Path) -> None:

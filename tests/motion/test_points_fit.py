@@ -149,6 +149,8 @@ def test_noise_of_a_centimetre_is_carried_and_smoothing_takes_it_away() -> None:
     jerk = [np.abs(np.diff(c.positions(), 2, axis=0)).mean() for c in (rough, calm)]
     assert jerk[1] < 0.2 * jerk[0]
     assert any("smoothed" in note for note in calm.skeleton.source.notes)
+    assert any("jitter by about 10 mm" in note for note in rough.skeleton.source.notes)
+    assert not any("jitter" in note for note in fit_clip(points).skeleton.source.notes)
 
 
 def test_spikes_are_taken_out_and_steps_and_fast_motion_stay() -> None:

@@ -117,6 +117,7 @@ def read_clip(
     unit_m: float | None = None,
     up_axis: str | None = None,
     allow_pickle: bool = False,
+    smooth_hz: float | None = None,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
 
@@ -128,13 +129,15 @@ def read_clip(
             instead of read or guessed.
         allow_pickle: reads pickled files too (AIST++, poselib); what they hold is rebuilt as plain
             arrays, and no code of theirs runs.
+        smooth_hz: cut-off of a low-pass on keypoints (TRC, C3D, ...), see `FitConfig`; other formats
+            are read as they are.
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
-    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle)
+    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, smooth_hz=smooth_hz)
     check_options(options)
     reader = _reader_of(path)
     try:

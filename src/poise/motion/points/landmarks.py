@@ -10,7 +10,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.motion.io.text import listed
 from poise.motion.keypoints import Keypoints
-from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
+from poise.motion.points.clean import drop_spikes, fill, jitter, longest_stretch, smooth, spike_note
 from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels, unknown_labels
 from poise.motion.points.markers import marker_places
 
@@ -18,6 +18,7 @@ from poise.motion.points.markers import marker_places
 _CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
 _CARRIER |= {"elbow": "shoulder", "wrist": "elbow", "hand": "wrist"}
 _LEAST_SHARE = 0.5
+_JITTER_M = 0.0035
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,12 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
     tracks = _filled(tracks)
+    size = jitter(np.stack([tracks[place] for place in NEEDED], 1))
+    if smooth_hz is None and size > _JITTER_M:
+        notes.append(
+            f"The keypoints jitter by about {size * 1e3:.0f} mm from frame to frame, and so does the "
+            "clip: --smooth HZ (6 suits most motion) takes it away"
+        )
     if smooth_hz is not None:
         tracks = {place: smooth(track, points.fps, smooth_hz) for place, track in tracks.items()}
         notes.append(
