@@ -28,6 +28,21 @@ def test_the_scale_multiplies_the_limits_on_both_paths(make_env):
     assert push(env, 0.0).abs().max() == 0
 
 
+def test_without_help_the_drive_is_that_of_help_scaled_to_nothing(make_env):
+    """The short way taken without help moves the characters as the long one does, to the last digit."""
+    short, long = make_env(2), make_env(2)
+    long._control[False] = long._controlled
+    for env in (short, long):
+        env.help.set(0.0)
+        env.reset_to(torch.zeros(2, dtype=torch.long), torch.full((2,), 3))
+        for k in range(4):
+            env.step(torch.full((2, env.num_actions), 0.1 * k))
+    assert torch.equal(short.backend.state.qpos, long.backend.state.qpos)
+    for ours, theirs in zip(short.wrench[:3], long.wrench[:3], strict=True):
+        torch.testing.assert_close(ours, theirs)
+    assert short.wrench.body == long.wrench.body
+
+
 def test_it_counts_with_fading_memory():
     budget = HelpBudget(SuccessHelp(lower_at=0.8, raise_at=0.5, factor=0.5, every=2))
     budget.count(10, 0)

@@ -251,6 +251,9 @@ def test_results_of_the_motion_diffusion_model(data_dir: Path) -> None:
     assert (clip.fps, clip.frames, clip.skeleton.source.up_axis) == (20.0, 192, "Y")
     assert "holds 30 motions" in notes(clip) and "A person throws" in notes(clip)
     assert "LeftToeBase" in clip.skeleton.names and len(HUMANML3D) == 22
+    assert "number 7 was read" in notes(read_clip(path, allow_pickle=True, take="7"))
+    with pytest.raises(PoiseError, match="number of a motion, got 'last'"):
+        read_clip(path, allow_pickle=True, take="last")
     data = {"motion": np.zeros((2, 22, 3, 9)), "lengths": np.array([9, 12])}
     assert mdm_points(data, path).positions.shape == (9, 22, 3)
     with pytest.raises(PoiseError, match="states 12 of 9 frames"):
@@ -292,7 +295,7 @@ def test_broken_c3d_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PoiseError, match="not a C3D file"):
         read_clip(path)
     path.write_bytes(whole[:600])
-    with pytest.raises(PoiseError, match="end of the file|do not fit|damaged"):
+    with pytest.raises(PoiseError, match=r"end of the file|do not fit|damaged"):
         read_clip(path)
     path.write_bytes(whole[:2] + b"\xff\x07" + whole[4:])
     with pytest.raises(PoiseError, match="do not fit into"):

@@ -18,17 +18,19 @@ from poise.sim import CpuBackend
 
 
 def bench_latency(
-    imitation: Imitation, policy: Policy | None = None, steps: int = 600
+    imitation: Imitation, policy: Policy | None = None, steps: int = 600, helped: bool = False
 ) -> dict[str, Any]:
     """Policy, physics and observation of one deterministic character, in ms per control step.
 
     Rewards, failures and the guard against unstable states belong to training and are left out.
 
-    policy: None takes an untrained one of the recipe's size, which costs the same.
+    policy: None takes an untrained one of the recipe's size, which costs the same. helped: with
+    residual forces; without, as a character runs that was trained to need none.
     """
     task = replace(imitation.task, rewards=(), dones=(), auto_reset=False)
     backend = CpuBackend(imitation.humanoid.model, 1, 1)
     env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
+    env.help.set(1.0 if helped else 0.0)
     if policy is None:
         trainer = imitation.trainer(threads=1)
         policy = trainer.policy()
@@ -63,6 +65,7 @@ def bench_latency(
         "ms": round(median_ms, 3),
         "ms_95": round(ms[int(0.95 * len(ms))], 3),
         "phases_ms": {**split, "observation": rest},
+        "helped": helped,
         "steps": steps,
         "threads": 1,
         "rate_hz": imitation.config.sim.rate_hz,

@@ -214,7 +214,8 @@ def _show_scaling(rows: list[Result]) -> None:
 def _show_latency(r: Result) -> None:
     rows = [("one control step", f"{r['ms']:.3f}"), ("95 % are below", f"{r['ms_95']:.3f}")]
     rows += [(f"of it {name}", f"{ms:.3f}") for name, ms in r["phases_ms"].items()]
-    table("one character on one core", ("latency", "ms"), rows)
+    helped = "with residual forces" if r["helped"] else "without residual forces"
+    table(f"one character on one core, {helped}", ("latency", "ms"), rows)
 
 
 def _show_physics(rows: list[Result]) -> None:

@@ -19,6 +19,7 @@ from poise.errors import PoiseError, did_you_mean
 VERBS = {
     "info": "what a motion file holds: joints, rate, unit, height, what was guessed",
     "convert": "write a motion file in another format or at another rate",
+    "retarget": "move a clip onto another human skeleton",
     "body": "the physical body that is made for a clip: masses, hinges, gains",
     "imitate": "give one clip a body: train, simulate, score, report",
     "train": "train a recipe on one clip or a library, and no more",

@@ -111,8 +111,10 @@ class ImitationEnv:
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
         self._goal, self._goal_rows = torch.empty(0), torch.empty(0, dtype=torch.long)
         self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long).to(here)
-        self._control: TensorFunction | None = None
-        self._helped: tuple[int, ...] = ()
+        # One for characters with help, one for those without.
+        self._control: dict[bool, TensorFunction] = {}
+        self._helped: tuple[int, ...] = getattr(task.residual, "bodies", (0,))
+        self._places = torch.tensor([b + 1 for b in self._helped], device=here)
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
@@ -224,9 +226,11 @@ class ImitationEnv:
             drive.xfrc_applied,
             self.help.scale,
         )
-        if self._control is None:
-            self._control = record(self._controlled, given) if self._terms.fused else self._controlled
-        done = self._control(*given)
+        helped = self.help.now > 0 and residual is not None and residual.limit_n + residual.limit_nm > 0
+        if helped not in self._control:
+            plain = self._controlled if helped else self._unhelped
+            self._control[helped] = record(plain, given) if self._terms.fused else plain
+        done = self._control[helped](*given)
         if residual is not None:
             force, torque, point = done
             self.wrench = Wrench(force, torque, point, self._helped)
@@ -238,17 +242,24 @@ class ImitationEnv:
 
         hinges: the reference's angles, of which the rows `goal` are aimed at.
         """
+        self._unhelped(action, hinges, goal, *state)
         xpos, xquat, xipos, *applied, scale = state
-        drive = Drive(*applied)
-        drive.clear()
-        joints, extra = action[:, : self.hinges], action[:, self.hinges :]
-        self.task.pd.apply(joints, hinges.index_select(0, goal), drive)
-        if self.task.residual is None:
-            return (joints,)
+        assert self.task.residual is not None
         force, torque, point, self._helped = self.task.residual.apply(
-            extra, xpos, xquat, xipos, drive, scale
+            action[:, self.hinges :], xpos, xquat, xipos, Drive(*applied), scale
         )
         return force, torque, point
+
+    def _unhelped(
+        self, action: Tensor, hinges: Tensor, goal: Tensor, *state: Tensor
+    ) -> tuple[Tensor, ...]:
+        """The same where no help is left: a wrench of nothing."""
+        drive, joints = Drive(*state[3:6]), action[:, : self.hinges]
+        drive.clear()
+        self.task.pd.apply(joints, hinges.index_select(0, goal), drive)
+        point = state[0][:, self._places].to(joints.dtype)
+        nothing = torch.zeros_like(point)
+        return nothing, nothing, point
 
     # --- views --------------------------------------------------------------------------------
 

@@ -117,22 +117,33 @@ def fit_ground(
     smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed.
     """
     state = Kinematics(table)(torch.tensor(qpos))
-    low = lowest_height(table, state.pos, state.quat).min(-1).values.numpy()
-    flights = find_flights(low, centre_of_mass(table, state.pos, state.quat)[:, 2].numpy(), fps)
-    stance = stance_heights(table, state.pos, state.quat, fps)
+    fit = fit_heights(table, state.pos, state.quat, fps, cyclic)
+    out = np.array(qpos)
+    out[:, 2] += fit.lift_m - fit.settle_m + fit.clear_m
+    return out, fit
+
+
+def fit_heights(
+    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, cyclic: bool = False
+) -> GroundFit:
+    """How a motion with body poses `pos (T, B, 3)` m and `quat (T, B, 4)` would be set on the floor.
+
+    See `fit_ground`, which does it.
+    """
+    low = lowest_height(table, pos, quat).min(-1).values.numpy()
+    flights = find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), fps)
+    stance = stance_heights(table, pos, quat, fps)
     lift = -float(np.quantile(low, 0.1))
     if len(stance) >= 3:
         # Badly solved feet point their toes down while they stand; they may not drag the rest along.
         lift = max(-float(np.median(stance)), lift - 2 * SINK_M)
     reach = max(1, round(0.1 * fps))
     # The mirror image of a clearance: a running minimum, so that no frame is lowered beyond its excess.
-    settle = np.maximum(-_smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
+    settle = np.maximum(-smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
     low_now = low + lift - settle
     clear = _clearance(np.maximum(-low_now - SINK_M, 0.0), reach, cyclic)
-    out = np.array(qpos)
-    out[:, 2] += lift - settle + clear
     after = low_now + clear
-    return out, GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
+    return GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
 
 
 def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
@@ -152,10 +163,10 @@ def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
 
 def _clearance(depth: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
     """The smooth lift `(T,)` that covers `depth (T,)`, both in m."""
-    return np.maximum(_smooth_hull(depth, reach, cyclic), 0.0) * float(depth.max() > 1e-4)
+    return np.maximum(smooth_hull(depth, reach, cyclic), 0.0) * float(depth.max() > 1e-4)
 
 
-def _smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
+def smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
     """The running maximum of `values (T,)` over +-reach frames, averaged over as many."""
     if cyclic:
         # The last frame is the first one again, so it counts once.

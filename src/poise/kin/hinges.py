@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.kin.branches import euler_path
 from poise.spatial import euler_to_quat, quat_conj, quat_mul, quat_to_euler
 
 
@@ -23,8 +24,8 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
     """Hinge angles `(T, n)` rad whose chain comes nearest to `rot (T, 4)`, continuous in time.
 
     Three hinges reproduce any rotation. Of the two Euler branches (a, b, c) and
-    (a + pi, pi - b, c + pi) the sequence with the smallest sum of squared steps is found by dynamic
-    programming; whole turns are unwrapped, so a pirouette counts up. Two hinges drop the missing
+    (a + pi, pi - b, c + pi) the sequence with the smallest sum of squared steps is found
+    (`euler_path`); whole turns are unwrapped, so a pirouette counts up. Two hinges drop the missing
     third angle and one hinge takes the twist about its axis: both exact for rotations that lie in
     the chain. The whole sequence is shifted by full turns to lie nearest `prefer (n)` (default 0).
     """
@@ -39,14 +40,17 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
         missing = next(c for c in "XYZ" if c not in order)
         path = quat_to_euler(local, order[0] + missing + order[1])[:, [0, 2]]
     else:
-        path = _best_branch(_through_lock(quat_to_euler(local, order), order), prefer)
+        free = through_lock(quat_to_euler(local, order), order).numpy()
+        path = torch.tensor(
+            euler_path(free[:, None], None if prefer is None else prefer.numpy()[None])[:, 0]
+        )
     path = torch.tensor(np.unwrap(path.numpy(), axis=0))
     centre = torch.zeros(len(order), dtype=path.dtype) if prefer is None else prefer
     turns = torch.round((path.median(0).values - centre) / (2 * math.pi))
     return path - turns * 2 * math.pi
 
 
-def _through_lock(angles: Tensor, order: str) -> Tensor:
+def through_lock(angles: Tensor, order: str) -> Tensor:
     """Euler angles `(T, 3)` whose third angle is held through frames exactly at gimbal lock.
 
     There only the sum a +- c is known and `quat_to_euler` sets c to zero, which would be a jump.
@@ -65,25 +69,3 @@ def _through_lock(angles: Tensor, order: str) -> Tensor:
     out[:, 0] = torch.where(locked, first, angles[:, 0])
     out[:, 2] = torch.where(locked, held, angles[:, 2])
     return out
-
-
-def _best_branch(first: Tensor, prefer: Tensor | None) -> Tensor:
-    """The smoothest sequence `(T, 3)` through the two Euler branches, by Viterbi's algorithm."""
-    second = torch.stack((first[:, 0] + math.pi, math.pi - first[:, 1], first[:, 2] + math.pi), -1)
-    both = torch.stack((first, second), 1).numpy()  # (T, 2, 3)
-    step = np.remainder(both[1:, None, :, :] - both[:-1, :, None, :] + np.pi, 2 * np.pi) - np.pi
-    price = (step**2).sum(-1)  # (T-1, from, to)
-    centre = np.zeros(3) if prefer is None else prefer.numpy()
-    home = np.remainder(both - centre + np.pi, 2 * np.pi) - np.pi
-    # A slight pull toward the preferred pose breaks ties and chooses the branch of a still clip.
-    pull = 1e-4 * (home**2).sum(-1)
-    cost, back = pull[0].copy(), np.zeros((len(both), 2), dtype=np.int64)
-    for t in range(1, len(both)):
-        total = cost[:, None] + price[t - 1]
-        back[t] = total.argmin(0)
-        cost = total.min(0) + pull[t]
-    pick = np.zeros(len(both), dtype=np.int64)
-    pick[-1] = int(cost.argmin())
-    for t in range(len(both) - 1, 0, -1):
-        pick[t - 1] = back[t, pick[t]]
-    return torch.tensor(both[np.arange(len(both)), pick])

@@ -1,6 +1,7 @@
 """Pure functions that score motion: tracking, plausibility, help; definitions in docs/metrics.md."""
 
 from poise.metrics.help import GRAVITY, HelpAudit, help_audit
+from poise.metrics.inbetween import Physics, l2p, l2q, npss, physics
 from poise.metrics.masking import masked_mean, masked_quantile, span_mask
 from poise.metrics.plausibility import (
     Penetration,
@@ -39,6 +40,7 @@ __all__ = [
     "HelpAudit",
     "Outcome",
     "Penetration",
+    "Physics",
     "Shapes",
     "SuccessRule",
     "acceleration_error",
@@ -52,15 +54,19 @@ __all__ = [
     "geom_heights",
     "help_audit",
     "jerk",
+    "l2p",
+    "l2q",
     "lowest_points",
     "masked_mean",
     "masked_quantile",
     "mpjpe_global",
     "mpjpe_pa",
     "mpjpe_root",
+    "npss",
     "penetration",
     "physdiff_float",
     "physdiff_penetrate",
+    "physics",
     "s2h_foot_penetration",
     "smoothness",
     "span_mask",

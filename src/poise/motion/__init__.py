@@ -5,15 +5,19 @@ from poise.motion.edits import ground_shift, resample, shifted, trim
 from poise.motion.info import describe, standing_height
 from poise.motion.io import read_clip, write_bvh, write_clip
 from poise.motion.library import ClipLibrary
+from poise.motion.roles import Role, Roles, find_roles
 from poise.motion.skeleton import Channel, Skeleton, Source
 
 __all__ = [
     "Channel",
     "Clip",
     "ClipLibrary",
+    "Role",
+    "Roles",
     "Skeleton",
     "Source",
     "describe",
+    "find_roles",
     "ground_shift",
     "read_clip",
     "resample",

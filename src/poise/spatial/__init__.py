@@ -3,6 +3,7 @@
 from poise.spatial.directions import across, cluster_quat, frame_quat, rejected, shortest_arc
 from poise.spatial.rotations import (
     axis_angle_to_quat,
+    axis_heading,
     euler_to_quat,
     heading_quat,
     into_heading,
@@ -20,20 +21,23 @@ from poise.spatial.rotations import (
     quat_to_rotvec,
     quat_to_sixd,
     rotvec_to_quat,
+    sixd_to_matrix,
     slerp,
     unwrap_quats,
 )
-from poise.spatial.tree import forward_kinematics
+from poise.spatial.tree import forward_kinematics, matrix_kinematics
 
 __all__ = [
     "across",
     "axis_angle_to_quat",
+    "axis_heading",
     "cluster_quat",
     "euler_to_quat",
     "forward_kinematics",
     "frame_quat",
     "heading_quat",
     "into_heading",
+    "matrix_kinematics",
     "matrix_to_quat",
     "normalize",
     "quat_angle",
@@ -50,6 +54,7 @@ __all__ = [
     "rejected",
     "rotvec_to_quat",
     "shortest_arc",
+    "sixd_to_matrix",
     "slerp",
     "unwrap_quats",
 ]

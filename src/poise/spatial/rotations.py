@@ -223,6 +223,14 @@ def heading_quat(q: Tensor) -> Tensor:
     return twist / twist.norm(dim=-1, keepdim=True)
 
 
+def axis_heading(q: Tensor, axis: Tensor) -> Tensor:
+    """The turn about +Z `(..., 4)` from +X to where the local `axis (3)` of `q` points on the ground."""
+    ahead = quat_rotate(q, axis.expand(*q.shape[:-1], 3))
+    half = 0.5 * torch.atan2(ahead[..., 1], ahead[..., 0])
+    zero = torch.zeros_like(half)
+    return torch.stack((half.cos(), zero, zero, half.sin()), -1)
+
+
 def into_heading(heading: Tensor, v: Tensor) -> Tensor:
     """Vectors `v (N, K, 3)` of the world in the frames of turns about +Z `heading (N, 4)`."""
     # R^T v, written v R for rows v
@@ -232,6 +240,14 @@ def into_heading(heading: Tensor, v: Tensor) -> Tensor:
 def quat_to_sixd(q: Tensor) -> Tensor:
     """The first two columns of the rotation matrix, `(..., 6)` (Zhou et al. 2019)."""
     return _bilinear(q, q, _SIXD)
+
+
+def sixd_to_matrix(d: Tensor) -> Tensor:
+    """Rotation matrices `(..., 3, 3)` of two columns `(..., 6)` made orthonormal (Zhou et al. 2019)."""
+    x = torch.nn.functional.normalize(d[..., :3], dim=-1, eps=1e-8)
+    y = d[..., 3:] - (x * d[..., 3:]).sum(-1, keepdim=True) * x
+    y = torch.nn.functional.normalize(y, dim=-1, eps=1e-8)
+    return torch.stack((x, y, torch.linalg.cross(x, y)), -1)
 
 
 def unwrap_quats(q: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -34,3 +35,39 @@ def forward_kinematics(
             pos.append(pos[parent] + quat_rotate(quat[parent], offsets[j].expand_as(root_pos)))
             quat.append(quat_mul(quat[parent], rot[..., j, :]))
     return torch.stack(pos, -2), torch.stack(quat, -2)
+
+
+@cache
+def _levels(parents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
+    """Joints by depth, with the place of each one's parent in the level above; then the way back."""
+    depth = [0] * len(parents)
+    for j, parent in enumerate(parents):
+        depth[j] = 0 if parent < 0 else depth[parent] + 1
+    rows = [tuple(j for j, d in enumerate(depth) if d == k) for k in range(max(depth) + 1)]
+    return tuple(
+        (row, tuple(rows[k - 1].index(parents[j]) if k else 0 for j in row)) for k, row in enumerate(rows)
+    )
+
+
+def matrix_kinematics(
+    parents: Sequence[int], offsets: Tensor, root_pos: Tensor, rot: Tensor
+) -> tuple[Tensor, Tensor]:
+    """World positions `(..., J, 3)` and rotation matrices `(..., J, 3, 3)`, one product per level.
+
+    As `forward_kinematics`, but `rot (..., J, 3, 3)` are matrices and joints of one depth are computed
+    together, which pays for batches that are learned from.
+
+    Args:
+        offsets: `(J, 3)` m, or with leading dimensions that broadcast with those of `rot`.
+    """
+    levels = _levels(tuple(parents))
+    pos, mats = [root_pos.unsqueeze(-2)], [rot[..., :1, :, :]]
+    for joints, above in levels[1:]:
+        up, down = list(above), list(joints)
+        turn = mats[-1][..., up, :, :]
+        step = offsets[..., down, :].unsqueeze(-1)
+        pos.append(pos[-1][..., up, :] + (turn @ step).squeeze(-1))
+        mats.append(turn @ rot[..., down, :, :])
+    order = [j for joints, _ in levels for j in joints]
+    back = [order.index(j) for j in range(len(order))]
+    return torch.cat(pos, -2)[..., back, :], torch.cat(mats, -3)[..., back, :, :]

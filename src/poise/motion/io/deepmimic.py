@@ -66,7 +66,7 @@ def read_deepmimic(path: Path, options: Options) -> Clip:
     notes: list[str] = []
     joints = _humanoid()
     names = tuple(j[0] for j in joints)
-    rot = _rotations(table, joints, path, notes)
+    rot, mended = _rotations(table, joints, path, notes)
     times, uneven = _times(table[:, 0], path)
     step = float(np.median(times))
     raw = RawMotion(
@@ -84,6 +84,7 @@ def read_deepmimic(path: Path, options: Options) -> Clip:
         unit_m=1.0,
         up_axis="Y",
         cyclic=loop == "wrap",
+        mended=mended,
     )
     clip = assemble(raw, options)
     if uneven and options.fps is None:
@@ -136,7 +137,9 @@ def _rotations(
     joints: list[tuple[str, str | None, tuple[float, float, float], int]],
     path: Path,
     notes: list[str],
-) -> np.ndarray:
+) -> tuple[np.ndarray, tuple[tuple[str, str, int, int, float], ...]]:
+    """`(T, J, 4)` local rotations, and where their quaternions were off unit length by how much."""
+    mended: list[tuple[str, str, int, int, float]] = []
     out = np.zeros((len(table), len(joints), 4))
     out[..., 0] = 1.0
     column, worst = 4, (0.0, "", 0)
@@ -151,6 +154,10 @@ def _rotations(
                     f"{path}, frame {frame}",
                 )
             worst = max(worst, (float(abs(norm[frame] - 1)), name, frame))
+            off = np.flatnonzero(np.abs(norm - 1) > _NORM_NOTE)
+            if len(off):
+                span = (int(off[0]), int(off[-1]))
+                mended.append(("quaternion length", name, *span, float(abs(norm[frame] - 1))))
             out[:, j] = quat / norm[:, None]
         elif size == 1:
             axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -161,7 +168,7 @@ def _rotations(
             f"Quaternions off unit length were normalised, at most by {worst[0]:.3f} (joint "
             f"'{worst[1]}' at frame {worst[2]})"
         )
-    return out
+    return out, tuple(mended)
 
 
 def _times(durations: np.ndarray, path: Path) -> tuple[np.ndarray, bool]:

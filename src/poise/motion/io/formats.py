@@ -13,6 +13,8 @@ from poise.motion.io.bvh_read import read_bvh
 from poise.motion.io.bvh_write import write_bvh
 from poise.motion.io.c3d import looks_like_c3d, read_c3d
 from poise.motion.io.deepmimic import read_deepmimic
+from poise.motion.io.gltf_read import read_gltf
+from poise.motion.io.gltf_write import write_gltf
 from poise.motion.io.motion_csv import looks_like_csv, read_csv, write_csv
 from poise.motion.io.numpy_files import (
     looks_like_npz,
@@ -66,6 +68,10 @@ def _looks_like_json(head: bytes) -> bool:
     return head[:1] == b"{" and (b'"Frames"' in head or b'"Loop"' in head)
 
 
+def _looks_like_gltf(head: bytes) -> bool:
+    return head[:4] == b"glTF" or (head[:1] == b"{" and b'"asset"' in head and b'"version"' in head)
+
+
 def _refuse_asf(path: Path, options: Options) -> Clip:
     raise PoiseError(
         "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
@@ -76,6 +82,7 @@ READERS = (
     Reader("BVH", (".bvh",), _looks_like_bvh, read_bvh),
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
+    Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
     Reader("pickled SMPL, poselib or MDM", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
@@ -87,21 +94,18 @@ READERS = (
     Reader("CSV keypoints", (".csv",), looks_like_points_csv, read_points_csv),
     Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
 )
+#: Readers that only say what to give instead.
+_REFUSERS = ("ASF", "robot", "OpenPose")
 READABLE = "Formats that can be read: " + ", ".join(
-    f"{r.name} ({', '.join(r.suffixes)})"
-    for r in READERS
-    if r.suffixes and r.name not in ("ASF", "robot")
+    f"{r.name} ({', '.join(r.suffixes)})" for r in READERS if r.name not in _REFUSERS
 )
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
-    (b"glTF", "glTF"),
     (b"PK\x03\x04", "zip"),
     (b"\x89HDF", "HDF5"),
 )
 _NOT_YET = {
     ".fbx": "FBX",
-    ".glb": "glTF",
-    ".gltf": "glTF",
     ".h5": "HDF5",
     ".usd": "USD",
     ".usda": "USD",
@@ -118,6 +122,7 @@ def read_clip(
     up_axis: str | None = None,
     allow_pickle: bool = False,
     smooth_hz: float | None = None,
+    take: str | None = None,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
 
@@ -131,13 +136,16 @@ def read_clip(
             arrays, and no code of theirs runs.
         smooth_hz: cut-off of a low-pass on keypoints (TRC, C3D, ...), see `FitConfig`; other formats
             are read as they are.
+        take: which animation of a file that holds several, by name or number (glTF, MDM).
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
-    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, smooth_hz=smooth_hz)
+    options = Options(
+        asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz
+    )
     check_options(options)
     reader = _reader_of(path)
     try:
@@ -174,11 +182,13 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
     ".bvh": write_bvh,
     ".npz": write_npz,
     ".csv": write_csv,
+    ".glb": write_gltf,
+    ".gltf": write_gltf,
 }
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_csv`.
+    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_csv`, `write_gltf`.
 
     `.npz`: a clip that came from the SMPL family is written with the keys of AMASS, any other as
     Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the one or the other.

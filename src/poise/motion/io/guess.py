@@ -168,10 +168,10 @@ def inserted_rest_frame(rot: np.ndarray) -> str | None:
     return note
 
 
-def teleports(root_pos: np.ndarray, fps: float) -> list[str]:
-    """A sentence about frames where the root jumps faster than a body can: frames, metres.
+def root_jumps(root_pos: np.ndarray, fps: float) -> list[tuple[int, float]]:
+    """(frame, metres) wherever the root path `(T, 3)` m gets in one step farther than a body can.
 
-    A jump exceeds 6 m/s and five times the usual step of the frames around it.
+    Such a step exceeds 6 m/s and five times the usual step of the frames around it.
     """
     step = np.linalg.norm(np.diff(root_pos, axis=0), axis=-1)
     if len(step) < 3:
@@ -181,7 +181,13 @@ def teleports(root_pos: np.ndarray, fps: float) -> list[str]:
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
     usual = np.concatenate([np.median(part, axis=-1) for part in np.array_split(windows, 16)])
     found = np.flatnonzero((step * fps > _TELEPORT_SPEED) & (step > 5.0 * usual))
-    if not len(found):
+    return [(int(f) + 1, float(step[f])) for f in found]
+
+
+def teleports(root_pos: np.ndarray, fps: float) -> list[str]:
+    """A sentence about the `root_jumps`: frames, metres."""
+    found = root_jumps(root_pos, fps)
+    if not found:
         return []
-    jumps = listed((f"{f + 1} ({step[f]:.2f} m)" for f in found), 12)
+    jumps = listed((f"{frame} ({size:.2f} m)" for frame, size in found), 12)
     return [f"The root jumps at frame{'' if len(found) == 1 else 's'} {jumps}; the jumps were kept"]

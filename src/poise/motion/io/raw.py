@@ -34,6 +34,7 @@ class Options:
     up_axis: str | None = None
     allow_pickle: bool = False
     smooth_hz: float | None = None
+    take: str | None = None
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class RawMotion:
     unit_m, up_axis: what the format itself states, None where it states nothing.
     unit_hint: a unit the file suggests, checked with the person's height.
     strays: `(joint, largest distance)` of position channels that did not stay constant.
+    whole: frame 0 belongs to the motion for certain, so no rest pose is sought there.
+    mended: what the reader mended, as in `Source.mended`.
     """
 
     format: str
@@ -64,7 +67,9 @@ class RawMotion:
     cyclic: bool = False
     notes: tuple[str, ...] = ()
     strays: tuple[tuple[str, float], ...] = ()
+    mended: tuple[tuple[str, str, int, int, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
+    whole: bool = False
 
 
 def vectors_to_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
@@ -101,7 +106,9 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
     """The clip in metres, Z up, with every guess and repair in its source's notes."""
     _check(raw)
     notes = list(raw.notes)
+    whole = len(raw.rot)
     raw = _drop_rest_frame(raw, notes)
+    mended = [*raw.mended, *((("rest frame", "", 0, 0, 1.0),) if len(raw.rot) < whole else ())]
     rot = unwrap_quats(normalize(torch.tensor(raw.rot, dtype=torch.float64))).numpy()
     up, unit = _up_and_unit(raw, rot, options)
     notes += [guess.note for guess in (up, unit) if guess.note]
@@ -112,6 +119,7 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
             f"Joint '{name}' moves against its parent by up to {stray * scale * 1e3:.1f} mm; its bone "
             "is kept rigid at the median"
         )
+        mended.append(("bone drift", name, 0, -1, stray * scale))
     fps = float(options.fps or raw.fps)
     root_pos = vectors_to_z_up(raw.root_pos, axis) * scale
     notes += teleports(root_pos, fps)
@@ -129,10 +137,28 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
             frame_time=raw.frame_time,
             travel_joint=raw.travel_joint,
             notes=tuple(notes),
+            evidence=_evidence(raw, options, up, unit),
+            mended=tuple(mended),
             extra=raw.extra,
         ),
     )
     return Clip(skeleton, root_pos, quats_to_z_up(rot, axis), fps, raw.path.stem, raw.cyclic)
+
+
+def _evidence(raw: RawMotion, options: Options, up: Guess, unit: Guess) -> tuple[tuple[str, str], ...]:
+    """Why the vertical, the unit and the frame rate are what they are, one sentence each."""
+    by_format = "The format itself states it"
+    if options.fps is not None:
+        rate = "Stated with --fps"
+    elif raw.frame_time is not None:
+        rate = f"The file's frame time is {raw.frame_time:.6g} s"
+    else:
+        rate = next((n for n in raw.notes if "frame rate" in n), by_format)
+    return (
+        ("up", "Stated with --up" if options.up_axis else up.note or by_format),
+        ("unit", "Stated with --unit" if options.unit_m else unit.note or by_format),
+        ("fps", rate),
+    )
 
 
 def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[float, float, float]:
@@ -153,7 +179,7 @@ def _check(raw: RawMotion) -> None:
 
 
 def _drop_rest_frame(raw: RawMotion, notes: list[str]) -> RawMotion:
-    note = None if raw.format == "deepmimic" else inserted_rest_frame(raw.rot)
+    note = None if raw.whole or raw.format == "deepmimic" else inserted_rest_frame(raw.rot)
     if note is None:
         return raw
     notes.append(note)

@@ -1,0 +1,96 @@
+"""`poise retarget`: a motion on another skeleton."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+
+from poise.cli.console import notes, say, say_json, table
+from poise.cli.options import Reading
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.kin import RetargetReport
+
+
+@dataclass(frozen=True)
+class Options:
+    """Move a clip onto another human skeleton: joints are matched by their names, steps scaled by the
+    legs, standing feet kept standing."""
+
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
+    """The motion file."""
+    onto: Annotated[Path, arg(metavar="FILE")]
+    """Any motion file with the skeleton that shall move."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
+    """The motion file to write; its suffix names the format (.bvh)."""
+    map: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="JOINT=JOINT")] = ()
+    """A joint of CLIP and the joint that it moves, such as LeftArm=upperarm_l; or a joint and its part,
+    such as left_upper_arm=upperarm_l."""
+    onto_skeleton: Annotated[Path | None, arg(metavar="ASF", help_behavior_hint="")] = None
+    """The ASF skeleton where FILE is an AMC."""
+    contacts: bool = True
+    """Hold standing feet and hands where the clip has them."""
+    json: bool = False
+    """Print the report as JSON alone."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Reads both files, moves the motion over, writes, says what was matched and measured."""
+    from poise.kin import RetargetConfig, retarget
+    from poise.motion.io import read_clip, write_clip
+
+    out = options.out
+    for path in (options.clip, options.onto):
+        if out.exists() and path.exists() and out.samefile(path):
+            raise PoiseError("a file that is read would be written over", out, "Give OUT another name")
+    mapping = pairs(options.map)
+    clip = options.reading.read(options.clip)
+    onto = read_clip(options.onto, skeleton=options.onto_skeleton)
+    config = RetargetConfig(contacts=options.contacts, clear=options.contacts)
+    made, report = retarget(clip, onto, mapping, config)
+    write_clip(made, out)
+    if options.json:
+        say_json(report.to_dict())
+        return 0
+    show(report)
+    say(f"{out}: {made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
+    return 0
+
+
+def pairs(texts: Sequence[str]) -> dict[str, str]:
+    """{"LeftArm": "upperarm_l"} from ("LeftArm=upperarm_l",)."""
+    out: dict[str, str] = {}
+    for text in texts:
+        a, equals, b = (x.strip() for x in text.partition("="))
+        if not (equals and a and b):
+            raise PoiseError(
+                f"--map needs JOINT=JOINT, got '{text}'", hint="Write --map LeftArm=upperarm_l"
+            )
+        if out.get(a, b) != b:
+            raise PoiseError(f"--map gives '{a}' both '{out[a]}' and '{b}' to move")
+        out[a] = b
+    return out
+
+
+def show(report: RetargetReport) -> None:
+    """The table of joints and the sentences of the report."""
+    joints = report.joints
+    source, target = joints.source.skeleton.names, joints.target.skeleton.names
+    rows = [
+        (
+            row.role.replace("_", " ") or "-",
+            ", ".join(source[j] for j in row.source) or "nothing",
+            target[row.target],
+            f"{row.confidence:.1f}",
+            row.evidence,
+        )
+        for row in joints.rows
+    ]
+    table("", ("part", "moved by", "joint", "sure", "why"), rows, left=5)
+    notes(report.sentences())

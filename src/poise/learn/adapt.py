@@ -1,0 +1,172 @@
+"""Test-time adaptation of an in-betweening network (Skeleton2Humanoid, section 3.2, Eqs. 1, 2 and 4).
+
+Only what the network itself says is used, never the truth: where it predicts that a foot stands, the foot
+should not move, and the root should take the shorter way.
+
+    L_contact = sum_t sum_f |p_f(t+1) - p_f(t)| contact_f(t+1)      (1)    t = 0 .. T-2, f: ankles, toes
+    L_smooth  = sum_t ||r(t+1) - r(t)||_2                           (2)
+    L_test    = L_contact + beta L_smooth                           (4)
+
+Frame 0 is the last one that was seen, frames 1 .. T-1 are the transition. The paper gives neither beta,
+nor the optimiser, nor which weights move; these are settings here.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from poise.errors import PoiseError
+from poise.learn.guard import TrainingError
+from poise.nets.transition import Filled, Known, TransitionNet, joint_positions
+
+N = TypeVar("N", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """How a network is adapted to what it is asked."""
+
+    iterations: int = 5
+    """Passes over the whole test set, or steps for one sequence; choose them on validation."""
+    lr: float = 1e-5
+    beta: float = 0.01
+    """Weight of the root's path."""
+    contacts: Literal["detached", "paper"] = "detached"
+    """detached: predicted contacts only weigh. paper: gradients flow through them as Eq. 1 is written,
+    so that predicting no contact at all also lowers the loss."""
+    optimizer: Literal["sgd", "adam"] = "adam"
+    batch: int = 128
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
+            raise PoiseError(
+                f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}"
+            )
+        for name, known in (("contacts", ("detached", "paper")), ("optimizer", ("sgd", "adam"))):
+            if getattr(self, name) not in known:
+                raise PoiseError(f"{name} must be one of {', '.join(known)}", "Adaptation")
+
+
+def contact_loss(feet: Tensor, contact: Tensor) -> Tensor:
+    """Eq. 1 `(N)` of foot joints `(N, T, F, 3)` m, frame 0 the last one seen, and their predicted
+    contacts `(N, T - 1, F)` in frames 1 .. T - 1."""
+    step = torch.diff(feet, dim=1).square().sum(-1)
+    # The root of zero has no slope, and a foot that stands still has none to give.
+    moved = torch.where(step > 0, step, torch.ones_like(step)).sqrt() * (step > 0)
+    return (moved * contact).sum((1, 2))
+
+
+def smoothness_loss(root: Tensor) -> Tensor:
+    """Eq. 2 `(N)` of root paths `(N, T, 3)` m, frame 0 the last one seen: the length of the path."""
+    step = torch.diff(root, dim=1).square().sum(-1)
+    return (torch.where(step > 0, step, torch.ones_like(step)).sqrt() * (step > 0)).sum(1)
+
+
+def test_loss(net: TransitionNet, known: Known, filled: Filled, config: Adaptation) -> Tensor:
+    """Eq. 4 `(N)` of transitions that a network gave."""
+    feet = list(net.layout.feet)
+    seen = joint_positions(net.layout, known.offsets, known.past_root[:, -1:], known.past_rot[:, -1:])
+    path = torch.cat((seen, filled.pos), 1)[:, :, feet]
+    contact = filled.contact if config.contacts == "paper" else filled.contact.detach()
+    root = torch.cat((known.past_root[:, -1:], filled.root), 1)
+    return contact_loss(path, contact) + config.beta * smoothness_loss(root)
+
+
+def adapt(
+    net: N,
+    known: Known,
+    length: int,
+    config: Adaptation | None = None,
+    on_iteration: Callable[[int, N, float], None] | None = None,
+) -> N:
+    """A copy of the network adapted to a whole test set of one length; the given one stays as it is.
+
+    Args:
+        known: all sequences; each iteration passes over them once, `config.batch` at a time, in order.
+        on_iteration: called with its number (from 1), the network so far and the mean loss before it.
+
+    Raises:
+        TrainingError: the loss became infinite or not a number.
+    """
+    config = config or Adaptation()
+    own = copy.deepcopy(net)
+    params = [p for p in own.parameters() if p.requires_grad_(True) is p]
+    kind = torch.optim.Adam if config.optimizer == "adam" else torch.optim.SGD
+    optimizer = kind(params, lr=config.lr)
+    count = len(known.target_root)
+    for iteration in range(1, config.iterations + 1):
+        total = 0.0
+        for low in range(0, count, config.batch):
+            part = Known(*(x[low : low + config.batch] for x in known))
+            with torch.enable_grad():
+                loss = test_loss(own, part, own.fill(part, length), config).mean()  # type: ignore[arg-type]
+                optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+            optimizer.step()
+            total += float(loss.detach()) * len(part.target_root)
+        if not total < float("inf"):
+            raise TrainingError("the loss of the adaptation is not finite", hint="Lower its lr")
+        if on_iteration is not None:
+            on_iteration(iteration, own, total / count)
+    for p in params:
+        p.requires_grad_(False)
+    return own
+
+
+def adapt_each(net: N, known: Known, length: int, config: Adaptation | None = None) -> Filled:
+    """Transitions of a network adapted anew to every single sequence, as a user with one gap needs it."""
+    config = config or Adaptation()
+    parts = []
+    for i in range(len(known.target_root)):
+        one = Known(*(x[i : i + 1] for x in known))
+        own = adapt(net, one, length, config)
+        with torch.no_grad():
+            parts.append(own.fill(one, length))  # type: ignore[operator]
+    return Filled(*(torch.cat(x) for x in zip(*parts, strict=True)))
+
+
+def choose_iterations(
+    net: N,
+    known: Known,
+    length: int,
+    score: Callable[[Filled], float],
+    config: Adaptation | None = None,
+    most: int = 7,
+) -> tuple[int, tuple[float, ...]]:
+    """The number of iterations, 0 to `most`, whose transitions score lowest on validation sequences.
+
+    The paper reports the best iteration on the test set itself, which is tuning on test data; this is
+    for sequences held out for choices. Returns the number and the scores of 0, 1, ... iterations.
+    """
+    config = config or Adaptation()
+
+    @torch.no_grad()
+    def scored(own: nn.Module) -> float:
+        filled = [
+            own.fill(Known(*(x[low : low + config.batch] for x in known)), length)  # type: ignore[operator]
+            for low in range(0, len(known.target_root), config.batch)
+        ]
+        return score(Filled(*(torch.cat(x) for x in zip(*filled, strict=True))))
+
+    scores = [scored(net)]
+    steps = Adaptation(**{**config.__dict__, "iterations": most})
+    adapt(net, known, length, steps, lambda i, own, loss: scores.append(scored(own)))
+    best = min(range(len(scores)), key=scores.__getitem__)
+    return best, tuple(scores)
+
+
+def best_setting(
+    choices: Sequence[Adaptation], tried: Callable[[Adaptation], tuple[int, tuple[float, ...]]]
+) -> Adaptation:
+    """The setting, with its iterations, that scored lowest; `tried` runs `choose_iterations` for one."""
+    if not choices:
+        raise PoiseError("there is no setting to choose from")
+    results = [(config, *tried(config)) for config in choices]
+    config, iterations, _ = min(results, key=lambda r: r[2][r[1]])
+    return Adaptation(**{**config.__dict__, "iterations": iterations})

@@ -1,0 +1,238 @@
+"""The words by which joints of human skeletons are named, and who names them so."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+
+#: Bare lower-case names by the part they mean, best first; a share below 1 says that other programs mean
+#: another part by the same word.
+_WORDS: dict[str, dict[str, float]] = {
+    "hips": {"hips": 1, "pelvis": 1, "hip": 1, "root": 0.6, "torso": 0.3},
+    "spine": {
+        **{"spine": 1, "chest": 1, "abdomen": 1, "thorax": 1, "upperchest": 1, "lowerback": 1},
+        **{"upperback": 1, "torso": 0.9, "back": 1, "waist": 1, "midspine": 1, "spineupper": 1},
+        **{"spinelower": 1, "abdomenlower": 1, "abdomenupper": 1, "chestlower": 1, "chestupper": 1},
+        **{"belly": 1, "sternum": 0.8, "ribs": 0.8, "lumbar": 1, "spinemid": 1, "spinemiddle": 1},
+    },
+    "neck": {"neck": 1, "lowerneck": 1, "upperneck": 1, "neckbase": 1, "necklower": 1, "neckupper": 1},
+    "head": {"head": 1, "skull": 1},
+    "clavicle": {
+        "clavicle": 1,
+        "collar": 1,
+        "collarbone": 1,
+        "clav": 1,
+        "scapula": 0.9,
+        "shoulder": 0.8,
+    },
+    "upper_arm": {
+        **{"upperarm": 1, "arm": 1, "humerus": 1, "shldr": 1, "uparm": 1, "shoulder": 0.8, "bicep": 1},
+        **{"shldrbend": 1, "armupper": 1},
+    },
+    "forearm": {
+        **{"forearm": 1, "lowerarm": 1, "elbow": 1, "radius": 1, "ulna": 1, "lowarm": 1, "loarm": 1},
+        **{"forearmbend": 1, "armlower": 1},
+    },
+    "hand": {"hand": 1, "wrist": 1, "palm": 0.4},
+    "thigh": {
+        **{"thigh": 1, "upleg": 1, "upperleg": 1, "femur": 1, "hip": 1, "thighbend": 1, "legupper": 1},
+        **{"leg": 0.4},
+    },
+    "shin": {
+        **{"shin": 1, "leg": 1, "lowerleg": 1, "calf": 1, "tibia": 1, "knee": 1, "lowleg": 1},
+        **{"loleg": 1, "leglower": 1, "crus": 1},
+    },
+    "foot": {"foot": 1, "ankle": 1, "talus": 0.9},
+    "toes": {"toe": 1, "toes": 1, "toebase": 1, "ball": 1, "football": 1, "foot": 0.3, "bigtoe": 0.9},
+}
+#: Words of fingers; a name that holds one is of that finger.
+FINGERS = {
+    "thumb": "thumb",
+    "index": "index",
+    "middle": "middle",
+    "mid": "middle",
+    "ring": "ring",
+    "pinky": "pinky",
+    "little": "pinky",
+    "finger": "fingers",
+    "fingers": "fingers",
+}
+#: 3ds Max Biped counts its fingers from the thumb: Finger0, Finger01, Finger02, Finger1, ...
+_BIPED_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+#: Words of joints that carry no part of the body: tips, twist bones, control rigs, faces, clothes.
+_HELPERS = frozenset(
+    (
+        *(
+            "end",
+            "nub",
+            "tip",
+            "top",
+            "site",
+            "effector",
+            "rigmesh",
+            "mesh",
+            "twist",
+            "roll",
+            "ik",
+            "fk",
+        ),
+        *("pole", "target", "ctrl", "control", "helper", "sec", "adj", "eye", "jaw", "hair", "skirt"),
+        *("breast", "bust", "tongue", "brow", "eyebrow", "lip", "cheek", "ear", "nose", "weapon", "gun"),
+        *("prop", "attach", "socket", "cloth", "tail", "hat", "holster", "corrective", "correctiveroot"),
+        *(
+            "mch",
+            "org",
+            "interaction",
+            "center",
+            "hipjoint",
+            "buttock",
+            "lid",
+            "eyelid",
+            "face",
+            "teeth",
+        ),
+    )
+)
+#: Words that say nothing about the part.
+_NOISE = frozenset(
+    ("j", "bip", "biped", "def", "c", "valve", "valvebiped", "jnt", "bone", "b", "skel", "avg", "smplhf")
+)
+_KNOWN = frozenset(w for words in _WORDS.values() for w in words) | _HELPERS | frozenset(FINGERS)
+
+
+@dataclass(frozen=True)
+class NameWords:
+    """What a joint's name says.
+
+    side: "left", "right" or "". core: its words joined, without side, prefix and numbers. tokens: the
+    same words apart. index: its last number, or None. helper: it is no part of the body.
+    """
+
+    side: str
+    core: str
+    tokens: tuple[str, ...]
+    index: int | None
+    helper: bool
+
+    def score(self, kind: str) -> float:
+        """How clearly the name says `kind`: 1 without doubt, 0 not at all."""
+        return 0.0 if self.helper else float(_WORDS.get(kind, {}).get(self.core, 0.0))
+
+    @property
+    def finger(self) -> str:
+        """Which finger the name says, or ""."""
+        if self.helper:
+            return ""
+        if self.core == "finger" and self.index is not None:
+            first = self.index // 10 if self.index >= 10 else self.index
+            return _BIPED_FINGERS[first] if first < 5 else "fingers"
+        found = (FINGERS[t] for t in self.tokens if t in FINGERS)
+        return next(found, "fingers" if self.core == "fingerbase" else "")
+
+
+@cache
+def name_words(name: str) -> NameWords:
+    """The words in a joint's name: "mixamorig:LeftUpLeg" is left and upleg, "lfemur" left and femur."""
+    text = re.split(r"[:|]", name)[-1]
+    text = re.sub(r"^(mixamorig|character)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
+    raw = [t.lower() for t in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)]
+    if len(raw) > 1 and raw[0] in ("joint", "m", "f"):
+        raw = raw[1:]
+    numbers = [int(t) for t in raw if t.isdigit()]
+    side, tokens = "", []
+    for token in (t for t in raw if not t.isdigit()):
+        found, rest = _side_of(token)
+        side = side or found
+        tokens += [rest] if rest else []
+    bare = [t for t in tokens if t not in _NOISE]
+    core = "".join(bare)
+    helper = core in _HELPERS or any(t in _HELPERS for t in tokens) or not bare
+    return NameWords(side, core, tuple(bare), numbers[-1] if numbers else None, helper)
+
+
+def _side_of(token: str) -> tuple[str, str]:
+    """The side that a word states, and what is left of the word."""
+    for side, letter in (("left", "l"), ("right", "r")):
+        if token in (side, letter):
+            return side, ""
+        for start in (side, letter):
+            rest = token.removeprefix(start)
+            if rest != token and rest in _KNOWN and token not in _KNOWN:
+                return side, rest
+    return "", token
+
+
+_SIDED = ("Left{}", "Right{}")
+
+
+def _both(pattern: tuple[str, str], parts: str) -> frozenset[str]:
+    return frozenset(p.format(part) for part in parts.split() for p in pattern)
+
+
+_ARM, _UPLEG = "Shoulder Arm ForeArm Hand", "UpLeg Leg Foot"
+_SMPL_SIDED = "Hip Knee Ankle Foot Collar Shoulder Elbow Wrist"
+#: Names that mark who made a skeleton, without prefix such as "mixamorig:".
+CONVENTIONS: dict[str, frozenset[str]] = {
+    "Mixamo or MotionBuilder": _both(_SIDED, f"{_ARM} {_UPLEG} ToeBase")
+    | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
+    "LAFAN1": _both(_SIDED, f"{_ARM} {_UPLEG} Toe")
+    | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},
+    "CMU (ASF)": _both(
+        ("l{}", "r{}"),
+        "hipjoint femur tibia foot toes clavicle humerus radius wrist hand fingers thumb",
+    )
+    | {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"},
+    "CMU (BVH, MotionBuilder)": _both(_SIDED, f"{_ARM} {_UPLEG} ToeBase FingerBase")
+    | _both(("L{}", "R{}"), "HipJoint Fingers Thumb")
+    | {"Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head"},
+    "CMU (BVH, 3ds Max)": _both(_SIDED, "Hip Knee Ankle Toe Collar Shoulder Elbow Wrist")
+    | _both(("L{}", "R{}"), "HipJoint Fingers Thumb")
+    | {"Hips", "lowerback", "Chest", "Chest2", "lowerneck", "Neck", "Head", "lhand", "rhand"},
+    "CMU (BVH, Poser)": _both(("l{}", "r{}"), "Collar Shldr ForeArm Hand Buttock Thigh Shin Foot")
+    | {"hip", "abdomen", "chest", "neck", "head"},
+    "Bandai Namco": _both(
+        ("{}_L", "{}_R"), "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes"
+    )
+    | {"joint_Root", "Hips", "Spine", "Chest", "Neck", "Head"},
+    "SMPL": _both(("L_{}", "R_{}"), f"{_SMPL_SIDED} Hand")
+    | {"Pelvis", "Spine1", "Spine2", "Spine3", "Neck", "Head"},
+    "SMPL-X": _both(("left_{}", "right_{}"), _SMPL_SIDED.lower())
+    | {"pelvis", "spine1", "spine2", "spine3", "neck", "head"},
+    "Unreal mannequin": _both(("{}_l", "{}_r"), "clavicle upperarm lowerarm hand thigh calf foot ball")
+    | {"root", "pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"},
+    "VRM (VRoid)": _both(
+        ("J_Bip_L_{}", "J_Bip_R_{}"), "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase"
+    )
+    | {f"J_Bip_C_{x}" for x in ("Hips", "Spine", "Chest", "UpperChest", "Neck", "Head")},
+    "VRM (humanoid bones)": _both(
+        ("left{}", "right{}"), "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes"
+    )
+    | {"hips", "spine", "chest", "upperChest", "neck", "head"},
+    "3ds Max Biped": _both(
+        ("Bip01 L {}", "Bip01 R {}"), "Clavicle UpperArm Forearm Hand Thigh Calf Foot Toe0"
+    )
+    | {f"Bip01 {x}" for x in ("Pelvis", "Spine", "Spine1", "Spine2", "Neck", "Head")},
+    "Rigify": _both(("{}.L", "{}.R"), "shoulder upper_arm forearm hand thigh shin foot toe")
+    | {"spine", "spine.001", "spine.002", "spine.003"},
+    "Xsens": _both(_SIDED, "Hip Knee Ankle Toe Collar Shoulder Elbow Wrist")
+    | {"Hips", "Chest", "Chest2", "Chest3", "Chest4", "Neck", "Head"},
+    "DeepMimic": _both(("left_{}", "right_{}"), "hip knee ankle shoulder elbow wrist")
+    | {"root", "chest", "neck"},
+}
+
+
+def convention_of(names: tuple[str, ...]) -> tuple[str, int]:
+    """Whose names these are ("" if nobody's), and how many of them."""
+    bare = {
+        re.sub(r"^(mixamorig\d*_?|Character\d*_|DEF-)(?=.)", "", n.rsplit(":", 1)[-1]) for n in names
+    }
+    parts = {n for n in bare if not name_words(n).helper and not name_words(n).finger}
+    ranked = {
+        # How many joints agree, against all that either side has.
+        maker: (len(bare & marks) / len(parts | marks), len(bare & marks))
+        for maker, marks in CONVENTIONS.items()
+    }
+    maker = max(ranked, key=lambda m: ranked[m])
+    share, count = ranked[maker]
+    return (maker, count) if share >= 0.6 else ("", count)

@@ -1,0 +1,1 @@
+"""Motion made from motion: transitions between keyframes, in files' own skeletons."""
