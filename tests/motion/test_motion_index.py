@@ -48,6 +48,32 @@ def test_all_files_of_the_index(data_dir: Path) -> None:
         check(read_clip(data_dir / row["path"], skeleton=skeleton), row)
 
 
+def test_arrays_of_the_index(data_dir: Path) -> None:
+    with (data_dir / "INDEX.tsv").open(newline="") as file:
+        rows = {r["path"]: r for r in csv.DictReader(file, delimiter="\t")}
+    kinds = {
+        "smpl-pkl(72d)": "smpl",
+        "poselib-npy": "poselib",
+        "npz": "opensim",
+        "opensim-mot": "opensim",
+    }
+    wanted = [r for r in rows.values() if r["format"] in kinds]
+    assert len(wanted) == 9
+    for row in wanted:
+        clip = read_clip(data_dir / row["path"], allow_pickle=True)
+        facts = describe(clip)
+        assert facts["format"] == kinds[row["format"]], row["path"]
+        assert facts["frames"] == int(row["frames"]), row["path"]
+        # Of OpenSim's coordinates only those that turn a person's joints are counted.
+        assert facts["joints"] == (17 if facts["format"] == "opensim" else int(row["joints"]))
+        if row["fps"]:
+            assert abs(facts["fps"] - float(row["fps"])) < 2e-3, row["path"]
+        smpl = facts["format"] == "smpl"
+        assert np.isclose(facts["unit_m"], 1 / 93.77886 if smpl else 1.0), row["path"]
+        assert facts["up_axis"] == ("Z" if facts["format"] == "poselib" else "Y"), row["path"]
+        assert 1.4 < facts["height_m"] < 1.8, row["path"]
+
+
 def test_known_teleports(data_dir: Path) -> None:
     for name, frames in (("04", ("346", "347", "350")), ("10", ("317", "356", "361"))):
         clip = read_clip(data_dir / f"cmu_bvh/acrnn_salsa/{name}.bvh")

@@ -39,6 +39,9 @@ class Reading:
     allow_pickle: bool = False
     """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
+    smooth: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="")] = None
+    """Cut-off of a low-pass on jittering keypoints (TRC, C3D, CSV): 6 suits most motion."""
+
     def read(self, path: Path) -> Clip:
         """The clip in the file `path`."""
         from poise.motion.io import read_clip
@@ -51,6 +54,7 @@ class Reading:
             up_axis=self.up,
             allow_pickle=self.allow_pickle,
             take=self.take,
+            smooth_hz=self.smooth,
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,12 @@ ZIP_MAGIC = b"PK\x03\x04"
 _HEADER_BYTES = 1 << 16
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError)
 
+# NumPy reads headers as Python literals, hence the odd company.
+_BAD_HEADER = (
+    *(ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError),
+    tokenize.TokenError,
+)
+
 
 @dataclass(frozen=True)
 class Header:
@@ -44,7 +51,7 @@ def npy_header(file: IO[bytes], where: str | Path) -> Header:
         version = npy.read_magic(file)
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(file, _HEADER_BYTES)
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError) as error:
+    except _BAD_HEADER as error:
         raise PoiseError(f"its NumPy header is damaged ({shown(str(error))})", where, CUT_OFF) from None
     if min(shape, default=0) < 0:
         raise PoiseError(f"its NumPy header states the shape {shape}", where, CUT_OFF)
@@ -133,7 +140,11 @@ def read_npy(file: IO[bytes], where: str | Path, allow_pickle: bool = False) -> 
         raise PoiseError(
             f"it states the shape {header.shape} of {size} bytes, but {there} are there", where, CUT_OFF
         )
-    return np.frombuffer(data, header.dtype).reshape(header.shape, order="F" if header.fortran else "C")
+    try:
+        flat = np.frombuffer(data, header.dtype) if size else np.zeros(0, header.dtype)
+        return flat.reshape(header.shape, order="F" if header.fortran else "C")
+    except ValueError:
+        raise PoiseError(f"its shape {header.shape} makes no array", where, CUT_OFF) from None
 
 
 def first_member(head: bytes) -> bytes:
@@ -147,9 +158,8 @@ def require(data: Mapping[str, Any], keys: Sequence[str], path: Path, what: str)
     """Refuses data that lack some of `keys`, with what is there and what was perhaps meant."""
     missing = [k for k in keys if k not in data]
     if missing:
-        plural = "s" if len(missing) > 1 else ""
-        hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It holds no arrays"
-        raise PoiseError(f"{what} needs the array{plural} {listed(missing)}", path, hint)
+        hint = did_you_mean(missing[0], tuple(data)) if len(data) else "It is empty"
+        raise PoiseError(f"{what} lacks {listed(missing)}", path, hint)
 
 
 def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], path: Path) -> np.ndarray:
@@ -162,8 +172,9 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
         b in (None, a) for a, b in zip(value.shape, shape, strict=False)
     )
     if not fits:
-        wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise PoiseError(f"it has the shape {value.shape}, not ({wanted})", where)
+        wanted = " x ".join("any" if n is None else str(n) for n in shape)
+        found = " x ".join(map(str, value.shape)) or "()"
+        raise PoiseError(f"it has the shape {found}, not {wanted}", where)
     return value.astype(np.float64)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +19,27 @@ from poise.motion.io.trc import UNITS_M
 
 _KEY = 0x50
 _BLOCK = 512
+# Prints an npz of points, residuals, rate, and the text parameters of the group POINT.
+_READER = """
+import io, sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]),) * 2)
+except (ImportError, ValueError, OSError):
+    pass
+import ezc3d
+import numpy as np
+file = ezc3d.c3d(sys.argv[1])
+point = file["parameters"]["POINT"]
+texts = {k: v["value"] for k, v in point.items() if v.get("type") == -1}
+out = {k: np.array([str(x) for x in v], dtype=str) for k, v in texts.items()}
+out["points"] = np.asarray(file["data"]["points"], dtype=float)
+out["residuals"] = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)
+out["rate"] = np.array(file["header"]["points"]["frame_rate"], dtype=float)
+buffer = io.BytesIO()
+np.savez(buffer, **out)
+sys.stdout.buffer.write(buffer.getvalue())
+"""
 # What Vicon writes beside markers: lists of labels that are no places.
 _NO_PLACES = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "EVENTS", "REACTIONS")
 
@@ -40,22 +64,14 @@ def c3d_points(path: Path) -> RawPoints:
     Raises:
         PoiseError: damage, no labelled markers; ezc3d is not installed.
     """
-    try:
-        import ezc3d
-    except ImportError:
+    if find_spec("ezc3d") is None:
         raise PoiseError(
             "C3D files need the package ezc3d", path, "Install it with pip install 'poise-motion[c3d]'"
-        ) from None
-    _check_header(path)
-    try:
-        file = ezc3d.c3d(str(path), extract_forceplat_data=False)
-        point: dict[str, Any] = file["parameters"]["POINT"]
-        points = np.asarray(file["data"]["points"], dtype=np.float64)
-        residuals = np.asarray(file["data"]["meta_points"]["residuals"], dtype=np.float64)
-        rate = float(file["header"]["points"]["frame_rate"])
-    except Exception as error:
-        # ezc3d throws whatever its C++ side threw; the user needs one sentence.
-        raise PoiseError(f"the C3D file is damaged ({shown(str(error))})", path, CUT_OFF) from None
+        )
+    size = _check_header(path)
+    point = _read_apart(path, size)
+    points, residuals = np.asarray(point.pop("points")), np.asarray(point.pop("residuals"))
+    rate = float(np.ravel(point.pop("rate"))[0])
     labels = _labels(point)
     if points.shape[1] < len(labels) or not labels:
         raise PoiseError(
@@ -85,8 +101,8 @@ def c3d_points(path: Path) -> RawPoints:
     )
 
 
-def _check_header(path: Path) -> None:
-    """Refuses headers whose counts do not fit into the file, before memory is taken for them."""
+def _check_header(path: Path) -> int:
+    """The file's size; a header whose counts do not fit into it is refused before it is read."""
     size = check_file(path)
     with path.open("rb") as file:
         head = file.read(_BLOCK)
@@ -105,30 +121,53 @@ def _check_header(path: Path) -> None:
         )
     if (start - 1) * _BLOCK > size or (head[0] - 1) * _BLOCK >= size:
         raise PoiseError("its header points beyond the end of the file", path, CUT_OFF)
+    return size
 
 
-def _labels(point: dict[str, Any]) -> list[str]:
+def _read_apart(path: Path, size: int) -> dict[str, np.ndarray]:
+    """What ezc3d reads, by name; in a process of its own.
+
+    Damaged files make the C++ library loop without end or take any memory, so it works under a limit of
+    both and can be stopped.
+    """
+    seconds = 60 + size / 1e6
+    command = [sys.executable, "-c", _READER, str(path.resolve()), str(int(4e9 + 40 * size))]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        raise PoiseError(
+            f"the C3D file could not be read in {seconds:.0f} s: it seems damaged", path, CUT_OFF
+        ) from None
+    if done.returncode != 0:
+        said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        reason = said[-1].rsplit("Error: ", 1)[-1] if said else f"exit code {done.returncode}"
+        raise PoiseError(f"the C3D file is damaged ({shown(reason)})", path, CUT_OFF)
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def _labels(point: dict[str, np.ndarray]) -> list[str]:
     """All labels; files with more than 255 continue in LABELS2, LABELS3."""
     out: list[str] = []
     for key in ("LABELS", "LABELS2", "LABELS3", "LABELS4"):
-        out += [str(x).strip() for x in point.get(key, {}).get("value", ())]
+        out += [str(x).strip() for x in point.get(key, ())]
     return out
 
 
-def _text(point: dict[str, Any], key: str) -> str:
-    value = point.get(key, {}).get("value", ())
-    return str(value[0]).strip() if len(value) else ""
+def _text(point: dict[str, np.ndarray], key: str) -> str:
+    value = [str(x) for x in point.get(key, ())]
+    return value[0].strip() if value else ""
 
 
-def _vertical(point: dict[str, Any]) -> str | None:
+def _vertical(point: dict[str, np.ndarray]) -> str | None:
     """The file's vertical, where it says which axis points up on the screen."""
     axis = _text(point, "Y_SCREEN").upper().lstrip("+")
     return axis if axis in ("Y", "Z") else None
 
 
-def _chosen(labels: list[str], point: dict[str, Any]) -> tuple[list[int], list[str]]:
+def _chosen(labels: list[str], point: dict[str, np.ndarray]) -> tuple[list[int], list[str]]:
     """Columns of labelled markers, of one subject, each label once."""
-    outputs = {str(x).strip() for key in _NO_PLACES for x in point.get(key, {}).get("value", ())}
+    outputs = {str(x).strip() for key in _NO_PLACES for x in point.get(key, ())}
     subjects = dict.fromkeys(x.rsplit(":", 1)[0] for x in labels if ":" in x and not x.startswith("*"))
     notes: list[str] = []
     only = next(iter(subjects), None)

@@ -23,14 +23,9 @@ from poise.motion.io.numpy_files import (
     read_pickled,
     write_npz,
 )
+from poise.motion.io.opensim import looks_like_mot, read_mot
 from poise.motion.io.points_csv import looks_like_points_csv, read_points_csv
-from poise.motion.io.points_refused import (
-    looks_like_openpose,
-    looks_like_opensim,
-    refuse_folder,
-    refuse_openpose,
-    refuse_opensim,
-)
+from poise.motion.io.points_refused import looks_like_openpose, refuse_folder, refuse_openpose
 from poise.motion.io.raw import Options, check_options
 from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
@@ -96,18 +91,18 @@ READERS = (
     Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
-    Reader("npz of AMASS, SMPL or Poise", (".npz",), looks_like_npz, read_npz),
-    Reader("pickled SMPL or poselib", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
-    Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
+    Reader("npz of AMASS, SMPL, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
+    Reader("pickled SMPL, poselib or MDM", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
     Reader("TRC keypoints", (".trc",), looks_like_trc, read_trc),
     Reader("C3D markers", (".c3d",), looks_like_c3d, read_c3d),
-    Reader("OpenPose", (), looks_like_openpose, refuse_openpose),
-    Reader("OpenSim", (".mot", ".sto"), looks_like_opensim, refuse_opensim),
-    Reader("CSV keypoints", (), looks_like_points_csv, read_points_csv),
+    Reader("OpenPose", (), looks_like_openpose, refuse_openpose, asks=True),
+    Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
+    Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
+    Reader("CSV keypoints", (".csv",), looks_like_points_csv, read_points_csv),
     Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
 )
 #: Readers that only say what to give instead.
-_REFUSERS = ("ASF", "robot", "OpenPose", "OpenSim")
+_REFUSERS = ("ASF", "robot", "OpenPose")
 READABLE = "Formats that can be read: " + ", ".join(
     f"{r.name} ({', '.join(r.suffixes)})" for r in READERS if r.name not in _REFUSERS
 )
@@ -131,6 +126,7 @@ def read_clip(
     unit_m: float | None = None,
     up_axis: str | None = None,
     allow_pickle: bool = False,
+    smooth_hz: float | None = None,
     take: str | None = None,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
@@ -143,14 +139,18 @@ def read_clip(
             instead of read or guessed.
         allow_pickle: reads pickled files too (AIST++, poselib); what they hold is rebuilt as plain
             arrays, and no code of theirs runs.
-        take: which animation of a file that holds several, by name or number (glTF).
+        smooth_hz: cut-off of a low-pass on keypoints (TRC, C3D, ...), see `FitConfig`; other formats
+            are read as they are.
+        take: which animation of a file that holds several, by name or number (glTF, MDM).
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
-    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take)
+    options = Options(
+        asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz
+    )
     check_options(options)
     reader = _reader_of(path)
     try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
-from poise.motion.io.arrays import refuse_bad
+from poise.motion.io.arrays import refuse_bad, require
 from poise.motion.io.bvh_write import write_whole
 from poise.motion.io.raw import Options
 from poise.motion.io.record import (
@@ -86,18 +86,21 @@ def read_csv(path: Path, options: Options) -> Clip:
     refuse_overrides(options, path)
     skeleton = _skeleton(header, path)
     order = _order(lines, first, skeleton, path)
-    fps = options.fps or number(header["fps"], path_of(path, "fps"))
+    rate = number(header["fps"], _place(path, "fps"))
+    if not rate > 0:
+        raise PoiseError(f"the frame rate must be above 0, got {rate:g}", _place(path, "fps"))
     table = _table(lines, first, order, path)
-    _check_times(table[:, 0], number(header["fps"], path_of(path, "fps")), path)
+    _check_times(table[:, 0], rate, path)
     root_pos = table[:, 1:4]
     rot = table[:, 4:].reshape(len(table), len(skeleton), 4)
     refuse_bad(root_pos, "the root position", path)
     refuse_bad(rot, "the rotation", path, skeleton.names)
     name = loads(f'{{"name":{header["name"]}}}', path, "name")["name"]
-    return make_clip(skeleton, root_pos, rot, fps, str(name), header["cyclic"].strip() == "true", path)
+    cyclic = header["cyclic"] == "true"
+    return make_clip(skeleton, root_pos, rot, options.fps or rate, str(name), cyclic, path)
 
 
-def path_of(path: Path, key: str) -> str:
+def _place(path: Path, key: str) -> str:
     """The place of a header line."""
     return f"{path}, '# {key}:'"
 
@@ -131,12 +134,13 @@ def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
 
 def _skeleton(header: dict[str, str], path: Path) -> Skeleton:
     record = loads(header["skeleton"], path, "skeleton")
+    require(record, ("names", "parents", "offsets", "ends"), path, "the skeleton record")
     try:
         names = [str(n) for n in record["names"]]
         parents = np.array(record["parents"], dtype=np.int64).reshape(-1)
         offsets = np.array(record["offsets"], dtype=np.float64).reshape(-1, 3)
         ends = np.array(record["ends"], dtype=np.float64).reshape(-1, 4)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise PoiseError(
             f"the skeleton record is damaged ({shown(str(error))})", path, CUT_OFF
         ) from None

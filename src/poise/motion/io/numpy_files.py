@@ -10,7 +10,9 @@ from typing import Any
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.arrays import NPY_MAGIC, Archive, first_member, npy_header
+from poise.motion.io.opensim import is_opensim, read_loco
 from poise.motion.io.pickles import ASK, load_restricted
+from poise.motion.io.points_arrays import is_mdm, is_points, read_mdm, read_points_arrays
 from poise.motion.io.poise_npz import MARK, read_poise_npz, write_poise_npz
 from poise.motion.io.poselib import is_poselib, read_poselib
 from poise.motion.io.raw import Options
@@ -44,6 +46,9 @@ KINDS: tuple[Kind, ...] = (
     Kind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
     Kind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
     Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
+    Kind("keypoints (positions, names, fps)", is_points, read_points_arrays),
+    Kind("results of the motion diffusion model (motion, lengths)", is_mdm, read_mdm),
+    Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
     Kind("a robot's joint angles", _is_qpos, _refuse_qpos),
 )
 """Named arrays that are known, whether they come from `.npz`, `.npy` or `.pkl`; first match reads."""

@@ -295,6 +295,11 @@ def _made_bytes(text: Any, coding: Any = "latin1") -> bytes:
     return _as(str, text).encode("latin-1")
 
 
+def _made_nothing() -> bytes:
+    """What old protocols write for empty bytes."""
+    return b""
+
+
 def _made_dict(*args: Any) -> dict[Any, Any]:
     return _dict([x for pair in (args[0] if args else ()) for x in pair])
 
@@ -305,6 +310,7 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "numpy.core.multiarray.scalar": _made_scalar,
     "numpy.core.numeric._frombuffer": _made_from_buffer,
     "_codecs.encode": _made_bytes,
+    "__builtin__.bytes": _made_nothing,
     "collections.OrderedDict": _made_dict,
 }
 

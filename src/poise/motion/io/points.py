@@ -84,7 +84,7 @@ def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
 
 def points_clip(raw: RawPoints, options: Options) -> Clip:
     """The clip of a skeleton that follows the file's keypoints, see `fit_clip`."""
-    return fit_clip(assemble_points(raw, options), FitConfig())
+    return fit_clip(assemble_points(raw, options), FitConfig(smooth_hz=options.smooth_hz))
 
 
 def _of(raw: RawPoints) -> Source:

@@ -74,8 +74,11 @@ def is_mdm(data: Mapping[str, Any]) -> bool:
 
 
 def read_mdm(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
-    """The first motion in the results of a motion diffusion model, as a clip."""
-    return points_clip(mdm_points(data, path), options)
+    """One motion in the results of a motion diffusion model: the first, or number `options.take`."""
+    take = options.take or "0"
+    if not take.isdecimal():
+        raise PoiseError(f"--take must be the number of a motion, got {shown(take)}", path)
+    return points_clip(mdm_points(data, path, int(take)), options)
 
 
 def mdm_points(data: Mapping[str, Any], path: Path, index: int = 0) -> RawPoints:
@@ -92,7 +95,7 @@ def mdm_points(data: Mapping[str, Any], path: Path, index: int = 0) -> RawPoints
         raise PoiseError(f"motion {index} states {length:g} of {motion.shape[-1]} frames", path)
     notes = []
     if len(motion) > 1:
-        notes.append(f"The file holds {len(motion)} motions: number {index} was read")
+        notes.append(f"The file holds {len(motion)} motions: number {index} was read (--take N)")
     if "text" in data:
         texts = np.ravel(np.asarray(data["text"]))
         if index < len(texts) and text_of(texts[index]):

@@ -187,8 +187,8 @@ def measured_rate(times: np.ndarray, path: Path) -> float:
     odd = np.flatnonzero(np.abs(steps / step - 1) > 0.5)
     if len(odd):
         raise PoiseError(
-            f"its times are uneven: frame {odd[0] + 1} comes {steps[odd[0]]:.4g} s after the one before, "
-            f"the usual step is {step:.4g} s",
+            f"its times are uneven: frame {odd[0] + 1} comes {steps[odd[0]]:.4g} s after the one "
+            f"before, the usual step is {step:.4g} s",
             path,
             "Resample the table, or state the rate with --fps FRAMES_PER_SECOND",
         )

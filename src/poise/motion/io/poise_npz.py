@@ -73,7 +73,7 @@ def read_poise_npz(data: Mapping[str, Any], path: Path, options: Options) -> Cli
             path,
             "Install a newer Poise",
         )
-    require(data, _KEYS, path, "Poise's own npz")
+    require(data, _KEYS, path, "this file of Poise")
     refuse_overrides(options, path)
     names = np.asarray(data["names"])
     if names.dtype.kind != "U" or names.ndim != 1:

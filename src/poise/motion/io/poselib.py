@@ -33,7 +33,12 @@ def read_poselib(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
     Raises:
         PoiseError: parts that are missing, of the wrong shape or not finite.
     """
-    require(data, ("rotation", "root_translation", "skeleton_tree", "fps", "is_local"), path, "poselib")
+    require(
+        data,
+        ("rotation", "root_translation", "skeleton_tree", "fps", "is_local"),
+        path,
+        "this poselib motion",
+    )
     tree = data["skeleton_tree"]
     if not isinstance(tree, dict):
         raise PoiseError("its skeleton_tree is no dict", path)

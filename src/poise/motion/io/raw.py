@@ -33,6 +33,7 @@ class Options:
     unit_m: float | None = None
     up_axis: str | None = None
     allow_pickle: bool = False
+    smooth_hz: float | None = None
     take: str | None = None
 
 
@@ -93,7 +94,8 @@ def quats_from_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
 
 def check_options(options: Options) -> None:
     """Refuses overrides that make no sense."""
-    for name, value in (("unit", options.unit_m), ("fps", options.fps)):
+    stated = (("unit", options.unit_m), ("fps", options.fps), ("smooth", options.smooth_hz))
+    for name, value in stated:
         if value is not None and not (np.isfinite(value) and value > 0):
             raise PoiseError(f"--{name} must be above 0, got {value}")
     if options.up_axis is not None and options.up_axis.upper() not in ("Y", "Z"):

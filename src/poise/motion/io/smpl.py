@@ -7,6 +7,7 @@ model's frame. What a file lacks, bone lengths above all, is a stated default (`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,7 @@ def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str
 def _needed(data: Mapping[str, Any], names: Sequence[str], path: Path) -> str:
     found = _first(data, names)
     if found is None:
-        require(data, names[:1], path, "a motion of the SMPL family")
+        require(data, names[:1], path, "this motion of the SMPL family")
     return str(found)
 
 
@@ -113,7 +114,7 @@ def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, Layout]:
     if key is not None:
         many = np.ndim(data[key]) == 3
         poses = numeric(data, key, (None, None, 3) if many else (None, None), path)
-        poses = poses.reshape(len(poses), -1)
+        poses = _flat(poses)
         what = f"array '{key}'"
     else:
         poses, what = _parts(data, path), "root_orient, pose_body and the rest together"
@@ -127,6 +128,11 @@ def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, Layout]:
     return poses.reshape(len(poses), len(layout.names), 3), layout
 
 
+def _flat(value: np.ndarray) -> np.ndarray:
+    """One row per frame, even where there are no frames."""
+    return value.reshape(len(value), math.prod(value.shape[1:])) if value.ndim > 1 else value
+
+
 def _parts(data: Mapping[str, Any], path: Path) -> np.ndarray:
     """`(T, D)` the poses put together from the parts that some tools keep apart."""
 
@@ -135,8 +141,7 @@ def _parts(data: Mapping[str, Any], path: Path) -> np.ndarray:
         if key is None:
             return None
         value = np.asarray(data[key])
-        flat = value.reshape(len(value), -1) if value.ndim > 1 else value
-        return numeric({key: flat}, key, (None, None), path)
+        return numeric({key: _flat(value)}, key, (None, None), path)
 
     body = [part(*_ROOT), part(*_BODY)]
     left, right = part("left_hand_pose"), part("right_hand_pose")

@@ -26,7 +26,14 @@ def drop_spikes(positions: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarr
     for k in range(positions.shape[1]):
         off = np.linalg.norm(positions[:, k] - _running_median(positions[:, k], _HALF_WINDOW), axis=-1)
         usual = _running_median(off[:, None], max(_HALF_WINDOW, round(0.5 * fps)))[:, 0]
-        spikes[:, k] = off > np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
+        limit = np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
+        found = off > limit
+        # At the ends nothing tells a spike from a step.
+        found[:_HALF_WINDOW] = found[-_HALF_WINDOW:] = False
+        if found.any():
+            # In fast motion a spike bends the median beside it; what lies on the path of the rest stays.
+            path = fill(np.where(found[:, None], np.nan, positions[:, k]))
+            spikes[:, k] = found & (np.linalg.norm(positions[:, k] - path, axis=-1) > limit)
     out = positions.copy()
     out[spikes] = np.nan
     return out, spikes
@@ -98,6 +105,17 @@ def smooth(values: np.ndarray, fps: float, cutoff_hz: float) -> np.ndarray:
     for k, weight in enumerate(kernel):
         out += weight * padded[k : k + len(flat)]
     return out.reshape(values.shape)
+
+
+def jitter(positions: np.ndarray) -> float:
+    """The size of white noise on positions `(T, K, 3)` m, per coordinate.
+
+    Third differences of smooth motion vanish; those of white noise of size s have the size sqrt(20) s.
+    The median over all samples knows no spikes.
+    """
+    if len(positions) < 8:
+        return 0.0
+    return float(1.4826 * np.median(np.abs(np.diff(positions, 3, axis=0))) / np.sqrt(20.0))
 
 
 def spike_note(names: tuple[str, ...], spikes: np.ndarray) -> list[str]:

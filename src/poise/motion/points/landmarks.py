@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 
-from poise.errors import PoiseError, did_you_mean
+from poise.errors import PoiseError
 from poise.motion.io.text import listed
 from poise.motion.keypoints import Keypoints
-from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
+from poise.motion.points.clean import drop_spikes, fill, jitter, longest_stretch, smooth, spike_note
 from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels, unknown_labels
 from poise.motion.points.markers import marker_places
 
@@ -17,6 +18,7 @@ from poise.motion.points.markers import marker_places
 _CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
 _CARRIER |= {"elbow": "shoulder", "wrist": "elbow", "hand": "wrist"}
 _LEAST_SHARE = 0.5
+_JITTER_M = 0.0035
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,17 @@ def _label_of(points: Keypoints, found: dict[str, tuple[int, ...]], place: str) 
 def _lacking(points: Keypoints, lost: list[str]) -> PoiseError:
     """Which places have no keypoint, what the file has, and which label may have been meant."""
     places = listed((place.replace("_", " ") for place in lost), 12)
-    guess = did_you_mean(lost[0].replace("_", " "), list(points.names))
-    hint = guess.split("Known:")[0] + f"The keypoints are {listed(points.names, 12)}; labels like "
+    side, part = lost[0].split("_")
+    wanted = (
+        f"{side[0].upper()}{part.capitalize()}",
+        lost[0],
+        f"{side.capitalize()}{part.capitalize()}",
+    )
+    guess = next(
+        (g for w in wanted for g in get_close_matches(w, unknown_labels(points.names), 1)), None
+    )
+    hint = f"Did you mean '{guess}'? " if guess else ""
+    hint += f"The keypoints are {listed(points.names, 12)}; labels like "
     hint += f"{listed(known_labels(), 6)} or the joint names of BVH, SMPL and COCO are understood"
     return PoiseError(f"no keypoint is the {places}", points.source.path or points.name, hint)
 
@@ -112,6 +123,12 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
     tracks = _filled(tracks)
+    size = jitter(np.stack([tracks[place] for place in NEEDED], 1))
+    if smooth_hz is None and size > _JITTER_M:
+        notes.append(
+            f"The keypoints jitter by about {size * 1e3:.0f} mm from frame to frame, and so does the "
+            "clip: --smooth HZ (6 suits most motion) takes it away"
+        )
     if smooth_hz is not None:
         tracks = {place: smooth(track, points.fps, smooth_hz) for place, track in tracks.items()}
         notes.append(

@@ -15,6 +15,8 @@ import numpy as np
 from poise.motion.points.labels import SIDES, split_label
 
 Tracks = dict[str, np.ndarray]
+Estimate = tuple[Tracks, str]
+"""Tracks of some places, and the sentence that tells how they were estimated."""
 
 # Half the width of a joint and a marker's radius, as shares of the standing height (Winter 2009; the
 # shoulder's centre lies 17 % of the distance of the acromia below them, Rab et al. 2002).
@@ -41,10 +43,11 @@ def marker_places(
         _put(out, f"{side}_toe", m.middle(side, ("mt1",), ("mt5",)) if toe is None else toe)
         _put(out, f"{side}_wrist", m.middle(side, ("wra", "lwriststudy"), ("wrb", "mwriststudy")))
         _put(out, f"{side}_hand", m.first(side, "fin"))
-    for estimate in (_shoulders, _legs, _elbows, _hips):
-        estimate(m, out, {**out, **known}, notes)
-    _head_and_trunk(m, out)
-    _lumbar(m, out, {**out, **known})
+    for estimate in (_shoulders, _legs, _elbows, _hips, _head_and_trunk, _lumbar):
+        made, note = estimate(m, {**out, **known})
+        out.update(made)
+        if note and not set(made) <= set(known):
+            notes.append(note)
     return out, notes
 
 
@@ -75,22 +78,22 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
 
 
-def _shoulders(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
+def _shoulders(m: _Markers, have: Tracks) -> Estimate:
     """The joint lies below the acromion, along the trunk."""
-    tops = {s: m.first(s, "sho", "shoulderstudy") for s in SIDES}
-    left, right = tops["left"], tops["right"]
+    left, right = (m.first(s, "sho", "shoulderstudy") for s in SIDES)
     pelvis = _pelvis(m)
     if left is None or right is None or pelvis is None:
-        return
+        return {}, ""
     width = np.nanmedian(np.linalg.norm(left - right, axis=-1))
     down = _unit(np.mean(list(pelvis.values()), axis=0) - (left + right) / 2)
-    out["left_shoulder"] = left + _SHOULDER * width * down
-    out["right_shoulder"] = right + _SHOULDER * width * down
-    notes.append(f"Shoulder joints taken {_SHOULDER * width * 1e3:.0f} mm below the shoulder markers")
+    shift = _SHOULDER * width * down
+    note = f"Shoulder joints taken {_SHOULDER * width * 1e3:.0f} mm below the shoulder markers"
+    return {"left_shoulder": left + shift, "right_shoulder": right + shift}, note
 
 
-def _legs(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
+def _legs(m: _Markers, have: Tracks) -> Estimate:
     """Knees and ankles: between two markers of the joint, else inwards from the outer one."""
+    out: Tracks = {}
     single = []
     for side in SIDES:
         knee = m.middle(side, ("kne", "kneestudy"), ("knm", "mkn", "knem", "mkne", "mkneestudy"))
@@ -111,11 +114,11 @@ def _legs(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
             single.append(f"{side} ankle")
         _put(out, f"{side}_knee", k if knee is None else knee)
         _put(out, f"{side}_ankle", a if ankle is None else ankle)
-    if single:
-        notes.append(
-            f"Only outer markers show the {', '.join(single)}: the joints were put inwards by the half "
-            "width that is usual at this height (some millimetres wrong)"
-        )
+    note = (
+        f"Only outer markers show the {', '.join(single)}: the joints were put inwards by the half "
+        "width that is usual at this height (some millimetres wrong)"
+    )
+    return out, note if single else ""
 
 
 def _inwards(side: str, knee: np.ndarray, ankle: np.ndarray, have: Tracks) -> np.ndarray | None:
@@ -130,7 +133,9 @@ def _inwards(side: str, knee: np.ndarray, ankle: np.ndarray, have: Tracks) -> np
     return -left if side == "left" else left
 
 
-def _elbows(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
+def _elbows(m: _Markers, have: Tracks) -> Estimate:
+    """Between two markers of the elbow, else inwards along the axis about which it bends."""
+    out: Tracks = {}
     single = []
     for side in SIDES:
         middle = m.middle(side, ("elb", "lelbowstudy"), ("elm", "melb", "elbm", "melbowstudy"))
@@ -147,11 +152,9 @@ def _elbows(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
             height = _height(have)
             out[f"{side}_elbow"] = outer + (1 if side == "left" else -1) * _ELBOW * height * shift
             single.append(f"{side} elbow")
-    if single:
-        notes.append(
-            f"Only outer markers show the {', '.join(single)}: put inwards by {_ELBOW * 100:.1f} % "
-            "of the height"
-        )
+    note = f"Only outer markers show the {', '.join(single)}: put inwards by {_ELBOW * 100:.1f} % "
+    note += "of the height"
+    return out, note if single else ""
 
 
 def _height(have: Tracks) -> float:
@@ -182,14 +185,14 @@ def _axes(pelvis: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return left, np.cross(left, up), up
 
 
-def _hips(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
+def _hips(m: _Markers, have: Tracks) -> Estimate:
     """Hip joint centres by the regression of Harrington et al. 2007 on the pelvis' markers."""
-    own = {s: m.first(s, "hjcstudy") for s in SIDES}
-    for side, track in own.items():
-        _put(out, f"{side}_hip", track)
+    out: Tracks = {}
+    for side in SIDES:
+        _put(out, f"{side}_hip", m.first(side, "hjcstudy"))
     pelvis = _pelvis(m)
-    if pelvis is None or all(f"{s}_hip" in {**out, **have} for s in SIDES):
-        return
+    if pelvis is None or len(out) == len(SIDES):
+        return out, ""
     left, ahead, up = _axes(pelvis)
     front = (pelvis["left"] + pelvis["right"]) / 2
     width = np.nanmedian(np.linalg.norm(pelvis["left"] - pelvis["right"], axis=-1))
@@ -202,13 +205,15 @@ def _hips(m: _Markers, out: Tracks, have: Tracks, notes: list[str]) -> None:
             - (0.30 * width + 0.0109) * up
             + sign * (0.33 * width + 0.0073) * left
         )
-    notes.append(
+    note = (
         f"Hip joints estimated from the pelvis' markers (width {width * 1e3:.0f} mm, depth "
         f"{depth * 1e3:.0f} mm; Harrington et al. 2007)"
     )
+    return out, note
 
 
-def _head_and_trunk(m: _Markers, out: Tracks) -> None:
+def _head_and_trunk(m: _Markers, have: Tracks) -> Estimate:
+    out: Tracks = {}
     fronts, backs = ([m.first(s, core) for s in SIDES] for core in ("fhd", "bhd"))
     if fronts[0] is not None and fronts[1] is not None and backs[0] is not None and backs[1] is not None:
         out["face"] = (fronts[0] + fronts[1]) / 2
@@ -216,16 +221,17 @@ def _head_and_trunk(m: _Markers, out: Tracks) -> None:
     neck, chest = m.middle("", ("c7",), ("clav",)), m.middle("", ("t10",), ("strn",))
     _put(out, "neck", neck)
     _put(out, "spine 50", chest)
+    return out, ""
 
 
-def _lumbar(m: _Markers, out: Tracks, have: Tracks) -> None:
+def _lumbar(m: _Markers, have: Tracks) -> Estimate:
     """A point above the hips that moves with the pelvis' markers, so that they show its tilt."""
     pelvis = _pelvis(m)
     needed = [f"{s}_{p}" for p in ("hip", "shoulder") for s in SIDES]
     if pelvis is None or not all(place in have for place in needed):
-        return
+        return {}, ""
     hips = (have["left_hip"] + have["right_hip"]) / 2
     line = (have["left_shoulder"] + have["right_shoulder"]) / 2 - hips
     frame = np.stack(_axes(pelvis), -1)
     own = np.nanmedian(np.einsum("tij,ti->tj", frame, _LUMBAR * line), axis=0) * (0.0, 1.0, 1.0)
-    out["spine 0"] = hips + frame @ own
+    return {"spine 0": hips + frame @ own}, ""

@@ -26,6 +26,8 @@ from poise.spatial import (
 TWIST_S = 0.05
 #: Sine of a bend at which the hinge counts as much as that smoothing.
 _BENT = 0.25
+#: Cosine of the twist beyond which no joint goes, with the sign changed.
+_BEYOND = 0.65
 #: How much the foot's direction counts against the knee's hinge (as the sine of a bend).
 _FOOT_HINT = 0.12
 _ROUNDS = 30
@@ -212,6 +214,8 @@ def steady_twist(shown: Tensor, fps: float) -> Tensor:
     length = shown.norm(dim=-1)
     weight = (length / _BENT).pow(4).clamp(max=1e3)
     unit = shown / length.clamp_min(1e-12).unsqueeze(-1)
+    # No shoulder or hip twists beyond some 130 degrees: there the bend is a noisy, straight limb's.
+    weight = weight * ((unit[..., 0] + _BEYOND) / _BEYOND).clamp(0.0, 1.0)
     prior, between = 1e-6, (TWIST_S * fps) ** 2
     right = weight.unsqueeze(-1) * unit
     right = right + prior * torch.tensor([1.0, 0.0], dtype=shown.dtype)
