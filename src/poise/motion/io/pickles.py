@@ -22,7 +22,7 @@ from poise.errors import PoiseError
 from poise.motion.io.arrays import MAX_ARRAY_BYTES, NPY_MAGIC, npy_header
 from poise.motion.io.text import CUT_OFF, check_file, shown
 
-ASK = "Read it with --allow-pickle (in Python: allow_pickle) if you want that; no code of its runs"
+ASK = "Read it with --allow-pickle (in Python: allow_pickle); no code in it will run"
 """The hint of every refusal of a pickled file."""
 _MAX_STEPS = 5_000_000
 _CORE = ("numpy.core.", "numpy._core.")
