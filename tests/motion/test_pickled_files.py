@@ -18,6 +18,7 @@ from handmade_numpy_files import aist, poselib, save_npy, save_npz, save_pickle
 
 from poise.errors import PoiseError
 from poise.motion import read_clip, write_clip
+from poise.motion.io import pickles
 from poise.motion.io.pickles import load_restricted, loads_restricted
 
 
@@ -130,6 +131,21 @@ def test_refusals(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_memo_of_two_billion_slots_takes_no_memory() -> None:
     data = b"\x80\x02K\x07r" + struct.pack("<I", (1 << 31) - 1) + b"."
     assert loads_restricted(data, "a") == 7
+
+
+def test_bytes_that_are_shared_do_not_multiply(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pickles, "MAX_ARRAY_BYTES", 4000)
+    # One buffer of 800 bytes from which many arrays are made by reference.
+    one = b"cnumpy.core.multiarray\nscalar\ncnumpy\ndtype\nX\x04\x00\x00\x00S800\x85Rh\x01\x86R"
+    start = b"\x80\x03](B" + struct.pack("<I", 800) + bytes(800) + b"q\x01"
+    assert len(loads_restricted(start + one * 5 + b"e.", "a")) == 6
+    array = (
+        b"cnumpy.core.multiarray\n_reconstruct\n)R(K\x01K\x64\x85cnumpy\ndtype\nX\x02\x00\x00\x00f8\x85R"
+        b"\x89h\x01tb"
+    )
+    assert len(loads_restricted(start + array * 9 + b"e.", "a")) == 10
+    with pytest.raises(PoiseError, match="more arrays than the limit"):
+        loads_restricted(start + array * 12 + b"e.", "a")
 
 
 def test_damaged_pickles_never_break_out() -> None:

@@ -9,7 +9,6 @@ NumPy's own reconstruction runs.
 from __future__ import annotations
 
 import io
-import math
 import pickletools
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,13 +19,13 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.io.arrays import MAX_ARRAY_BYTES, NPY_MAGIC, npy_header
+from poise.motion.io.pickled_arrays import CALLS, Array, Dtype, array_of, checked, text
 from poise.motion.io.text import CUT_OFF, check_file, shown
 
-ASK = "Read it with --allow-pickle (in Python: allow_pickle) if you want that; no code of its runs"
+ASK = "Read it with --allow-pickle (in Python: allow_pickle); no code in it will run"
 """The hint of every refusal of a pickled file."""
 _MAX_STEPS = 5_000_000
 _CORE = ("numpy.core.", "numpy._core.")
-_KINDS = "biufcSU?"
 
 
 @dataclass(eq=False)
@@ -37,21 +36,6 @@ class _Named:
 
 
 @dataclass(eq=False)
-class _Dtype:
-    """An array's element type while it is read."""
-
-    code: str
-    order: str = "="
-
-
-@dataclass(eq=False)
-class _Array:
-    """An array or a scalar while it is read."""
-
-    value: Any = None
-
-
-@dataclass(eq=False)
 class _Machine:
     """The stack, the marks in it and the memo of the pickle machine."""
 
@@ -59,6 +43,7 @@ class _Machine:
     stack: list[Any] = field(default_factory=list)
     marks: list[int] = field(default_factory=list)
     memo: dict[int, Any] = field(default_factory=dict)
+    made: int = 0
 
     def since_mark(self) -> list[Any]:
         """Takes everything above the last mark from the stack."""
@@ -66,6 +51,17 @@ class _Machine:
         items = self.stack[at:]
         del self.stack[at:]
         return items
+
+    def counted(self, value: Any) -> Any:
+        """The value, unless the arrays made so far grow beyond all need (a few bytes shared often)."""
+        inner = value.value if isinstance(value, Array) else value
+        if isinstance(inner, np.ndarray):
+            self.made += inner.nbytes
+        elif isinstance(inner, bytes):
+            self.made += len(inner)
+        if self.made > 2 * MAX_ARRAY_BYTES:
+            raise PoiseError("the pickle holds more arrays than the limit", self.path)
+        return value
 
 
 def load_restricted(path: str | Path) -> dict[str, Any]:
@@ -149,18 +145,12 @@ def _get(machine: _Machine, arg: Any) -> None:
 
 def _append(machine: _Machine, arg: Any) -> None:
     item = machine.stack.pop()
-    _as(list, machine.stack[-1]).append(item)
+    checked(list, machine.stack[-1]).append(item)
 
 
 def _appends(machine: _Machine, arg: Any) -> None:
     items = machine.since_mark()
-    _as(list, machine.stack[-1]).extend(items)
-
-
-def _as(kind: type | tuple[type, ...], value: Any) -> Any:
-    if not isinstance(value, kind):
-        raise ValueError(f"a {type(value).__name__} stands in the wrong place")
-    return value
+    checked(list, machine.stack[-1]).extend(items)
 
 
 def _set(target: Any, pairs: list[Any]) -> None:
@@ -208,11 +198,11 @@ def _tuple(count: int) -> Callable[[_Machine, Any], None]:
 def _global(machine: _Machine, arg: Any) -> None:
     if arg is None:
         name = machine.stack.pop()
-        arg = f"{_as(str, machine.stack.pop())} {_as(str, name)}"
+        arg = f"{checked(str, machine.stack.pop())} {checked(str, name)}"
     name = str(arg).replace(" ", ".")
     for core in _CORE:
         name = name.replace(core, "numpy.core.", 1) if name.startswith(core) else name
-    if name not in _CALLS and name not in ("numpy.ndarray", "__builtin__.object", "builtins.object"):
+    if name not in CALLS and name not in ("numpy.ndarray", "__builtin__.object", "builtins.object"):
         raise PoiseError(
             f"the pickle names {shown(name)}, which is no plain data, and was not read",
             machine.path,
@@ -222,97 +212,27 @@ def _global(machine: _Machine, arg: Any) -> None:
 
 
 def _reduce(machine: _Machine, arg: Any) -> None:
-    args = _as(tuple, machine.stack.pop())
-    what = _as(_Named, machine.stack.pop())
-    call = _CALLS.get(what.name)
+    args = checked(tuple, machine.stack.pop())
+    what = checked(_Named, machine.stack.pop())
+    call = CALLS.get(what.name)
     if call is None:
         raise ValueError(f"{what.name} cannot be made")
-    machine.stack.append(call(*args))
+    machine.stack.append(machine.counted(call(*args)))
 
 
 def _build(machine: _Machine, arg: Any) -> None:
     state = machine.stack.pop()
     target = machine.stack[-1]
-    if isinstance(target, _Array):
+    if isinstance(target, Array):
         # (version, shape, dtype, Fortran order, bytes or list), in old files without the version.
-        target.value = _array(*_as(tuple, state)[-4:])
-    elif isinstance(target, _Dtype):
-        if any(part is not None for part in _as(tuple, state)[2:5]):
+        target.value = machine.counted(array_of(*checked(tuple, state)[-4:]))
+    elif isinstance(target, Dtype):
+        if any(part is not None for part in checked(tuple, state)[2:5]):
             raise ValueError("structured arrays are no plain data")
-        target.order = str(_text(state[1]))
+        target.order = str(text(state[1]))
     else:
         raise ValueError("an object that is no array has a state")
 
-
-def _text(value: Any) -> str:
-    return value.decode("ascii") if isinstance(value, bytes) else _as(str, value)
-
-
-def _array(shape: Any, dtype: _Dtype, fortran: Any, data: Any) -> Any:
-    shape = tuple(int(n) for n in _as(tuple, shape))
-    count = math.prod(shape)
-    if min(shape, default=0) < 0:
-        raise ValueError("an array has a negative length")
-    if _as(_Dtype, dtype).code.startswith("O"):
-        items = _as(list, data)
-        if len(items) != count:
-            raise ValueError("an array has the wrong number of items")
-        return items if shape else items[0]
-    kind = _numeric(dtype)
-    # Python 2 wrote bytes as text.
-    raw = data.encode("latin-1") if isinstance(data, str) else bytes(_as((bytes, bytearray), data))
-    if len(raw) != count * kind.itemsize:
-        raise ValueError(f"an array of shape {shape} has {len(raw)} bytes")
-    order = "F" if fortran else "C"
-    return np.frombuffer(raw, kind).reshape(shape, order=order).copy()
-
-
-def _numeric(dtype: _Dtype) -> np.dtype[Any]:
-    code = _text(dtype.code)
-    if code[:1] not in _KINDS or not (code[1:] == "" or code[1:].isdecimal()) or len(code) > 9:
-        raise ValueError(f"arrays of type {code[:12]} are no plain data")
-    kind = np.dtype(code)
-    return kind if dtype.order == "|" else kind.newbyteorder(dtype.order)  # type: ignore[arg-type]
-
-
-def _made_dtype(code: Any, *more: Any) -> _Dtype:
-    return _Dtype(_text(code))
-
-
-def _made_array(*args: Any) -> _Array:
-    return _Array()
-
-
-def _made_scalar(dtype: Any, data: Any = b"") -> _Array:
-    return _Array(_array((), dtype, False, data)[()])
-
-
-def _made_from_buffer(data: Any, dtype: Any, shape: Any, order: Any = "C") -> _Array:
-    return _Array(_array(tuple(shape), dtype, order == "F", data))
-
-
-def _made_bytes(text: Any, coding: Any = "latin1") -> bytes:
-    return _as(str, text).encode("latin-1")
-
-
-def _made_nothing() -> bytes:
-    """What old protocols write for empty bytes."""
-    return b""
-
-
-def _made_dict(*args: Any) -> dict[Any, Any]:
-    return _dict([x for pair in (args[0] if args else ()) for x in pair])
-
-
-_CALLS: dict[str, Callable[..., Any]] = {
-    "numpy.dtype": _made_dtype,
-    "numpy.core.multiarray._reconstruct": _made_array,
-    "numpy.core.multiarray.scalar": _made_scalar,
-    "numpy.core.numeric._frombuffer": _made_from_buffer,
-    "_codecs.encode": _made_bytes,
-    "__builtin__.bytes": _made_nothing,
-    "collections.OrderedDict": _made_dict,
-}
 
 _PUSHED = (
     *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
@@ -347,18 +267,18 @@ _STEPS: dict[str, Callable[[_Machine, Any], None]] = {
 
 def _plain(value: Any, seen: dict[int, Any], depth: int) -> Any:
     """The value with arrays in place of what stood for them; shared parts are walked once."""
-    if isinstance(value, _Named | _Dtype):
+    if isinstance(value, _Named | Dtype):
         raise ValueError("a type stands where data was expected")
-    if isinstance(value, _Array) and not isinstance(value.value, list | dict | tuple | _Array):
+    if isinstance(value, Array) and not isinstance(value.value, list | dict | tuple | Array):
         return value.value
-    if not isinstance(value, list | dict | tuple | _Array):
+    if not isinstance(value, list | dict | tuple | Array):
         return value
     if depth > 64:
         raise RecursionError
     if id(value) not in seen:
         # A part that contains itself finds None in its own place.
         seen[id(value)] = None
-        if isinstance(value, _Array):
+        if isinstance(value, Array):
             out: Any = _plain(value.value, seen, depth + 1)
         elif isinstance(value, dict):
             out = {k: _plain(v, seen, depth + 1) for k, v in value.items()}

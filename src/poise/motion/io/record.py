@@ -22,7 +22,8 @@ MAX_RECORD = 16 << 20
 
 def source_to_json(source: Source) -> str:
     """All of a `Source` as one line of JSON."""
-    return json.dumps(asdict(source), ensure_ascii=True, separators=(",", ":"))
+    # NumPy's numbers, which readers may leave in a source, become plain ones.
+    return json.dumps(asdict(source), separators=(",", ":"), default=lambda value: value.item())
 
 
 def source_from_json(text: str, path: Path) -> Source:

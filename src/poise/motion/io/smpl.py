@@ -112,8 +112,9 @@ def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, Layout]:
     """`(T, J, 3)` axis-angle vectors in rad, and the layout with that many joints."""
     key = _first(data, _POSES)
     if key is not None:
-        many = np.ndim(data[key]) == 3
-        poses = numeric(data, key, (None, None, 3) if many else (None, None), path)
+        found = np.asarray(data[key])
+        shape = (None, None, 3) if found.ndim == 3 else (None, None)
+        poses = numeric({key: found}, key, shape, path)
         poses = _flat(poses)
         what = f"array '{key}'"
     else:
