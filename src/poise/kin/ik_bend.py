@@ -88,5 +88,5 @@ def _mean(
         return np.fft.ifft(np.fft.fft(x, 2 * frames, axis=0) * both, axis=0)[:frames]
 
     around = spread(weight * own) + trust * np.exp(2j * home)
-    total = spread(weight).real + trust + 1e-12
+    total = np.real(spread(weight)) + trust + 1e-12
     return weight * own + (1 - weight) * around / total
