@@ -34,12 +34,37 @@ class Reading:
     """Metres in one unit of the file: 0.01 for centimetres."""
     up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
     """The file's vertical."""
+    ground: Annotated[str | None, arg(metavar="METRES|auto", help_behavior_hint="")] = None
+    """The floor's height, which becomes 0; auto takes the one that the soles tell."""
+    swap_sides: bool = False
+    """Exchange the names of left and right joints."""
 
     def read(self, path: Path) -> Clip:
         """The clip in the file `path`."""
         from poise.motion.io import read_clip
 
-        return read_clip(path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up)
+        floor = self._floor()
+        clip = read_clip(path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up)
+        if self.swap_sides or self.ground is not None:
+            from poise.kin import anatomy_of, grounded, support_of, swap_sides
+
+            clip = swap_sides(clip) if self.swap_sides else clip
+            if self.ground is not None:
+                support = support_of(clip, anatomy_of(clip)) if floor is None else None
+                clip = grounded(clip, support, floor)
+        return clip
+
+    def _floor(self) -> float | None:
+        """The stated height of the floor in m, None where it is to be guessed or stays."""
+        if self.ground is None or self.ground == "auto":
+            return None
+        try:
+            height = float(self.ground)
+        except ValueError:
+            height = math.nan
+        if not abs(height) < 1000.0:
+            raise PoiseError(f"--ground needs a height in metres or auto, got '{self.ground}'")
+        return height
 
 
 @dataclass(frozen=True)

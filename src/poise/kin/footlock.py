@@ -33,7 +33,8 @@ def lock_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     kernel = _gaussian(COMMON_S * clip.fps)
     total = np.convolve(np.pad(weight, len(kernel) // 2), kernel, "valid")
     mean = np.stack(
-        [np.convolve(np.pad(slip[:, k] * weight, len(kernel) // 2), kernel, "valid") for k in range(2)], -1
+        [np.convolve(np.pad(slip[:, k] * weight, len(kernel) // 2), kernel, "valid") for k in range(2)],
+        -1,
     )
     mean = mean / np.maximum(total, 1e-6)[:, None]
     size = np.linalg.norm(mean, axis=-1, keepdims=True)

@@ -82,9 +82,7 @@ def mend_jitter(clip: Clip) -> Clip:
     skeleton = clip.skeleton
     root = _smoothed(torch.tensor(clip.root_pos), clip.fps, ROOT_M, None)
     rot, world = torch.tensor(clip.rot), torch.tensor(clip.world()[1])
-    smooth = [
-        _smoothed_bones(world[:, j], bones, clip.fps) for j, bones in enumerate(_bones(clip))
-    ]
+    smooth = [_smoothed_bones(world[:, j], bones, clip.fps) for j, bones in enumerate(_bones(clip))]
     if root is None and all(s is None for s in smooth):
         return clip
     out, turned = rot.clone(), world.clone()
@@ -113,12 +111,12 @@ def _bones(clip: Clip) -> list[list[Tensor]]:
             out[parent].append(torch.tensor(skeleton.offsets[j]))
     for j, tip in skeleton.ends:
         out[j].append(torch.tensor(tip, dtype=torch.float64))
-    return [sorted((v for v in b if float(v.norm()) > 0.01), key=lambda v: -float(v.norm())) for b in out]
+    return [
+        sorted((v for v in b if float(v.norm()) > 0.01), key=lambda v: -float(v.norm())) for b in out
+    ]
 
 
-def _bone_noise(
-    track: Tensor, bone: Tensor, fps: float, limit: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _bone_noise(track: Tensor, bone: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
     return trembling(quat_rotate(track, bone.expand(len(track), 3)), fps, limit)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.body import Anatomy, BodyTable, generate_table
+from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.faults import Fault, spell_faults
 from poise.kin.flight import centre_of_mass
@@ -53,17 +53,8 @@ class Support:
     fit: GroundFit
 
     @classmethod
-    def of(cls, clip: Clip, anatomy: Anatomy) -> Support | None:
-        """The support of a clip, None where no body can be made for its skeleton."""
-        try:
-            table = generate_table(clip.skeleton, None, [clip])
-        except PoiseError:
-            return None
-        return cls.on(clip, anatomy, table)
-
-    @classmethod
-    def on(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
-        """The support of a clip with the body `table`, made from it or from a version of it."""
+    def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
+        """The support of a clip with the body `table`, which was made from it."""
         world = [torch.tensor(x) for x in clip.world()]
         pos, quat = (x[:, [r.joint for r in table.rows]] for x in world)
         soles, feet = _soles(table, pos, quat)
@@ -99,6 +90,23 @@ class Support:
         ground = -self.fit.lift_m
         speed, contact = foot_contacts(self.soles, self.fps, height=NEAR_M, ground=ground)
         return speed / 1000.0, contact
+
+
+def anatomy_of(clip: Clip) -> Anatomy:
+    """The parts of the clip's body; empty where it is no human's."""
+    try:
+        return find_anatomy(clip.skeleton)
+    except PoiseError:
+        return Anatomy((), ())
+
+
+def support_of(clip: Clip, anatomy: Anatomy) -> Support | None:
+    """The support of a clip, None where no body can be made for its skeleton."""
+    try:
+        table = generate_table(clip.skeleton, None, [clip])
+    except PoiseError:
+        return None
+    return Support.of(clip, anatomy, table) if anatomy.parts else None
 
 
 def _soles(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[Tensor, tuple[int, ...]]:

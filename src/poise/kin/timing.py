@@ -99,7 +99,9 @@ def timing_faults(clip: Clip) -> list[Fault]:
     # The step out of a hold is told already.
     known = {h.stop + 1 for h in holds}
     out += [
-        Fault("missing frames", "", t, t, round(ratio) - 1.0, f"all joints step {ratio:.1f} times as far")
+        Fault(
+            "missing frames", "", t, t, round(ratio) - 1.0, f"all joints step {ratio:.1f} times as far"
+        )
         for t, ratio in find_gaps(clip)
         if t not in known and round(ratio) > 1
     ]
