@@ -14,8 +14,8 @@ from poise.body import Anatomy
 from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.faults import Fault, by_kind
 from poise.kin.flight import likely_rate
-from poise.kin.ground import smooth_hull
 from poise.kin.footlock import lock_feet, lock_path
+from poise.kin.ground import smooth_hull
 from poise.kin.jitter import jitter_faults, mend_jitter
 from poise.kin.limits import limit_faults
 from poise.kin.sides import exchanged_sides
@@ -89,10 +89,11 @@ def _on_floor(clip: Clip, anatomy: Anatomy) -> Clip:
 
 
 def set_on_floor(clip: Clip, support: Support) -> Clip:
-    """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is."""
-    lift = np.zeros(clip.frames)
-    if support.off_m:
-        lift += support.fit.lift_m
+    """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is.
+
+    First the whole of it, by what its soles say; then spells that hover or sink, smoothed over 0.2 s.
+    """
+    lift = np.full(clip.frames, -support.off_m)
     settle = support.fit.settle_m
     if any(
         f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in support_faults(clip, support)

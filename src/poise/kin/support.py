@@ -22,12 +22,15 @@ from poise.spatial import quat_rotate
 #: How far (m) the estimated soles of a clip may be off the floor before the whole clip is: the file
 #: tells where ankles and toes are, not how thick the soles below them.
 SOLE_M = 0.045
+#: The same for soles under the floor, where points are below it by `UNDER_M` in this share of frames.
+SUNK_M, UNDER_M, UNDER_SHARE = 0.02, 0.005, 0.1
 #: Depth (m) to which joints may be under the floor, and bone tips (toes bend, their tips are guessed).
 JOINT_M, TIP_M = 0.01, 0.03
 #: A sole point is near the floor below this height (m).
 NEAR_M = 0.04
-#: A standing foot slides if it is faster than this on average (m/s) and gets this far (m).
-SLIDE_SPEED, SLIDE_M = 0.15, 0.04
+#: A standing foot slides if it is faster than this on average (m/s), gets this far (m), and for so long
+#: (s); a shorter touch belongs to a foot that swings through.
+SLIDE_SPEED, SLIDE_M, SLIDE_S = 0.15, 0.04, 0.06
 #: Hovering (m beyond `HOVER_M`) and gaps between spells (s).
 HOVER_MORE_M, GAP_S = 0.005, 0.1
 
@@ -73,8 +76,14 @@ class Support:
 
     @property
     def off_m(self) -> float:
-        """How far (m) the whole clip is above (below: negative) its floor, 0 within `SOLE_M`."""
-        return -self.fit.lift_m if abs(self.fit.lift_m) > SOLE_M else 0.0
+        """How far (m) the whole clip is above (below: negative) its floor, 0 where that is not sure.
+
+        The soles must say so by more than `SOLE_M`, or by more than `SUNK_M` downwards if the joints and
+        tips, whose places are known, are under the floor as well.
+        """
+        lift = self.fit.lift_m
+        under = float((self.low.min(-1) < -UNDER_M).mean())
+        return -lift if abs(lift) > SOLE_M or (lift > SUNK_M and under > UNDER_SHARE) else 0.0
 
     @cached_property
     def depth(self) -> np.ndarray:
@@ -176,7 +185,8 @@ def slide_faults(clip: Clip, support: Support) -> list[Fault]:
             way = np.concatenate((np.zeros((1, 2)), np.cumsum(run, axis=0)))
             distance = float(np.linalg.norm(np.ptp(way, axis=0)))
             speed = float(np.linalg.norm(run, axis=-1).mean()) * clip.fps
-            if distance > SLIDE_M and speed > SLIDE_SPEED:
+            lasting = last - first + 1 >= SLIDE_S * clip.fps
+            if lasting and distance > SLIDE_M and speed > SLIDE_SPEED:
                 name, detail = clip.skeleton.names[foot], f"at {speed:.2f} m/s"
                 out.append(Fault("foot slide", name, first, last + 1, distance * 100, detail))
     return sorted(out, key=lambda f: f.start)

@@ -67,8 +67,8 @@ def find_holds(clip: Clip) -> list[Hold]:
 def find_gaps(clip: Clip) -> list[tuple[int, float]]:
     """(frame, how many usual steps) where the whole body gets in one step as far as in several.
 
-    The median over the joints of their step against their neighbouring steps; a body that starts or
-    stops differs on one side only.
+    Most joints must step farther than on either side, so that a start or a stop is no gap. How many
+    usual steps it holds is told by all joints together, the fast ones most.
     """
     steps = body_steps(clip)
     if len(steps) < 7:
@@ -79,7 +79,8 @@ def find_gaps(clip: Clip) -> list[tuple[int, float]]:
     ratio = np.median(steps / np.maximum(usual, 1e-9), axis=-1)
     ratio[:3] = ratio[-3:] = 0.0
     fast = np.median(steps, axis=-1) * clip.fps > GAP_SPEED
-    return [(int(t) + 1, float(ratio[t])) for t in np.flatnonzero((ratio > GAP_RATIO) & fast)]
+    whole = steps.sum(-1) / np.maximum(np.median(around, axis=0).sum(-1), 1e-9)
+    return [(int(t) + 1, float(whole[t])) for t in np.flatnonzero((ratio > GAP_RATIO) & fast)]
 
 
 def timing_faults(clip: Clip) -> list[Fault]:
