@@ -12,6 +12,7 @@ from handmade_motion_files import BVH_HEADER, bvh_rows, bvh_text, put
 
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton, read_clip, trim, write_bvh, write_clip
+from poise.motion.io import WRITERS
 from poise.spatial import quat_angle, quat_conj, quat_mul
 
 TRAVEL = """HIERARCHY
@@ -218,7 +219,10 @@ def test_writing_refuses_and_leaves_nothing(tmp_path: Path) -> None:
             tmp_path / "a.bvh" / "b.bvh",
             "the file cannot be written (Not a directory). Choose a folder you may write to",
         ),
-        (tmp_path / "b.fbx", "a clip cannot be written as '.fbx'. Suffixes that can be written: .bvh"),
+        (
+            tmp_path / "b.fbx",
+            f"a clip cannot be written as '.fbx'. Suffixes that can be written: {', '.join(WRITERS)}",
+        ),
     ):
         with pytest.raises(PoiseError) as error:
             write_clip(clip, target)

@@ -21,6 +21,7 @@ from handmade_motion_files import (
 from poise.errors import PoiseError
 from poise.motion import read_clip
 from poise.motion.io import text as limits
+from poise.motion.io.formats import READABLE
 
 
 def refusal(path: Path, **options: object) -> str:
@@ -270,9 +271,6 @@ def test_deepmimic_refusals(tmp_path: Path, case: str) -> None:
     assert refusal(put(tmp_path, "a.txt", text)) == message
 
 
-READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json)"
-
-
 def test_files_that_are_no_motion(tmp_path: Path) -> None:
     assert refusal(tmp_path / "none.bvh") == ": there is no such file"
     assert refusal(tmp_path) == ": this is a folder, not a motion file. Name one file in it"
@@ -281,7 +279,7 @@ def test_files_that_are_no_motion(tmp_path: Path) -> None:
         refusal(put(tmp_path, "a.fbx", b"Kaydara FBX Binary  \0"))
         == f": FBX files are not read yet. {READABLE}"
     )
-    for suffix, name in ((".c3d", "C3D"), (".glb", "glTF"), (".pkl", "pickle")):
+    for suffix, name in ((".c3d", "C3D"), (".glb", "glTF"), (".usd", "USD")):
         path = put(tmp_path, f"a{suffix}", b"\1P\2\3")
         assert refusal(path) == f": {name} files are not read yet. {READABLE}"
     path = put(tmp_path, "a.xyz", "hello")

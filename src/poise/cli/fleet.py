@@ -144,11 +144,12 @@ def _is_clip(path: Path) -> bool:
     suffix = path.suffix.lower()
     if suffix in (".bvh", ".amc"):
         return path.is_file()
-    if not path.is_file() or not any(suffix in r.suffixes for r in READERS if r.name != "ASF"):
+    readers = [r for r in READERS if suffix in r.suffixes and r.name != "ASF" and not r.asks]
+    if not path.is_file() or not readers:
         return False
     with path.open("rb") as file:
         head = file.read(4096).lstrip()
-    return any(suffix in r.suffixes and r.looks_like(head) for r in READERS)
+    return any(r.looks_like(head) for r in readers)
 
 
 def _setting(text: str) -> tuple[str, list[str]]:

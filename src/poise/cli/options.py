@@ -38,13 +38,22 @@ class Reading:
     """The floor's height, which becomes 0; auto takes the one that the soles tell."""
     swap_sides: bool = False
     """Exchange the names of left and right joints."""
+    allow_pickle: bool = False
+    """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
     def read(self, path: Path) -> Clip:
         """The clip in the file `path`."""
         from poise.motion.io import read_clip
 
         floor = self._floor()
-        clip = read_clip(path, skeleton=self.skeleton, fps=self.fps, unit_m=self.unit, up_axis=self.up)
+        clip = read_clip(
+            path,
+            skeleton=self.skeleton,
+            fps=self.fps,
+            unit_m=self.unit,
+            up_axis=self.up,
+            allow_pickle=self.allow_pickle,
+        )
         if self.swap_sides or self.ground is not None:
             from poise.kin import anatomy_of, grounded, support_of, swap_sides
 

@@ -201,14 +201,14 @@ def _rows(
     return [form % tuple(row) for row in table.tolist()]
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Writes a text file so that it appears whole or not at all: beside, then in its place."""
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Writes a file, text as UTF-8, whole or not at all: beside its place, then into it."""
     if path.is_dir():
         raise PoiseError("this is a folder; name a file to write", path)
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with beside.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        with beside.open("xb") as file:
+            file.write(content if isinstance(content, bytes) else content.encode("utf-8"))
             file.flush()
             os.fsync(file.fileno())
         beside.replace(path)

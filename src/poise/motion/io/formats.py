@@ -12,18 +12,31 @@ from poise.motion.io.amc import read_amc
 from poise.motion.io.bvh_read import read_bvh
 from poise.motion.io.bvh_write import write_bvh
 from poise.motion.io.deepmimic import read_deepmimic
+from poise.motion.io.motion_csv import looks_like_csv, read_csv, write_csv
+from poise.motion.io.numpy_files import (
+    looks_like_npz,
+    looks_like_pickle,
+    read_npz,
+    read_pickled,
+    write_npz,
+)
 from poise.motion.io.raw import Options, check_options
+from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A format: its name, its suffixes, whether a file's first bytes look like it, its reader."""
+    """A format: its name, its suffixes, whether a file's first bytes look like it, its reader.
+
+    asks: the file is read only when it is named (and a flag allows it), never found in a folder.
+    """
 
     name: str
     suffixes: tuple[str, ...]
     looks_like: Callable[[bytes], bool]
     read: Callable[[Path, Options], Clip]
+    asks: bool = False
 
 
 def _looks_like_bvh(head: bytes) -> bool:
@@ -59,30 +72,27 @@ READERS = (
     Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
+    Reader("npz of AMASS, SMPL or Poise", (".npz",), looks_like_npz, read_npz),
+    Reader("pickled SMPL or poselib", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
+    Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
+    Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
 )
-_READABLE = "Formats that can be read: BVH (.bvh), AMC with its ASF (.amc), DeepMimic (.txt, .json)"
+READABLE = "Formats that can be read: " + ", ".join(
+    f"{r.name} ({', '.join(r.suffixes)})" for r in READERS if r.name not in ("ASF", "robot")
+)
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
     (b"glTF", "glTF"),
-    (b"\x93NUMPY", "NumPy"),
-    (b"PK\x03\x04", "NumPy or zip"),
+    (b"PK\x03\x04", "zip"),
     (b"\x89HDF", "HDF5"),
-    (b"\x80\x04", "pickle"),
-    (b"\x80\x03", "pickle"),
-    (b"\x80\x02", "pickle"),
 )
 _NOT_YET = {
     ".fbx": "FBX",
     ".c3d": "C3D",
     ".glb": "glTF",
     ".gltf": "glTF",
-    ".pkl": "pickle",
-    ".pickle": "pickle",
-    ".npy": "NumPy",
-    ".npz": "NumPy",
     ".trc": "TRC",
     ".mot": "OpenSim",
-    ".csv": "CSV",
     ".h5": "HDF5",
     ".usd": "USD",
     ".usda": "USD",
@@ -97,6 +107,7 @@ def read_clip(
     fps: float | None = None,
     unit_m: float | None = None,
     up_axis: str | None = None,
+    allow_pickle: bool = False,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
 
@@ -106,12 +117,15 @@ def read_clip(
         skeleton: the ASF file of an AMC; by default the one beside it that bears its subject's name.
         fps, unit_m, up_axis: frames per second, metres per file unit and "Y" or "Z", stated
             instead of read or guessed.
+        allow_pickle: reads pickled files too (AIST++, poselib); what they hold is rebuilt as plain
+            arrays, and no code of theirs runs.
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     path = Path(path)
-    options = Options(None if skeleton is None else Path(skeleton), fps, unit_m, up_axis)
+    asf = None if skeleton is None else Path(skeleton)
+    options = Options(asf, fps, unit_m, up_axis, allow_pickle=allow_pickle)
     check_options(options)
     reader = _reader_of(path)
     try:
@@ -134,19 +148,26 @@ def _reader_of(path: Path) -> Reader:
     suffix = path.suffix.lower()
     other = next((name for magic, name in _MAGIC if head.startswith(magic)), _NOT_YET.get(suffix))
     if other is not None:
-        raise PoiseError(f"{other} files are not read yet", path, _READABLE)
+        raise PoiseError(f"{other} files are not read yet", path, READABLE)
     for reader in READERS:
         if suffix in reader.suffixes:
             return reader
     what = f"the suffix {shown(path.suffix)}" if path.suffix else "a file without suffix"
-    raise PoiseError(f"{what} and its content belong to no known motion format", path, _READABLE)
+    raise PoiseError(f"{what} and its content belong to no known motion format", path, READABLE)
 
 
-WRITERS: dict[str, Callable[[Clip, Path], None]] = {".bvh": write_bvh}
+WRITERS: dict[str, Callable[[Clip, Path], None]] = {
+    ".bvh": write_bvh,
+    ".npz": write_npz,
+    ".csv": write_csv,
+}
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh`.
+    """Writes a clip in the format of the file's suffix; see `write_bvh`, `write_csv`.
+
+    `.npz`: a clip that came from the SMPL family is written with the keys of AMASS, any other as
+    Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the one or the other.
 
     Raises:
         PoiseError: an unknown suffix (the known ones are listed) or a folder that cannot be written.

@@ -32,6 +32,7 @@ class Options:
     fps: float | None = None
     unit_m: float | None = None
     up_axis: str | None = None
+    allow_pickle: bool = False
 
 
 @dataclass(frozen=True)
