@@ -12,8 +12,8 @@ import torch
 from planted_faults import (
     cut,
     drift,
-    excursion,
     exchanged,
+    excursion,
     frozen,
     lifted,
     repeated,
@@ -116,7 +116,10 @@ def test_a_flip_is_found_and_turned_back(walk: Clip) -> None:
 def test_a_drifting_root_makes_feet_slide_until_it_is_mended(walk: Clip) -> None:
     broken = drift(walk, 0.5)
     slides = found(broken, "foot slide")
-    assert {f.joint for f in slides} == {foot(walk), foot(walk).replace("Left", "Right").replace("lf", "rf")}
+    assert {f.joint for f in slides} == {
+        foot(walk),
+        foot(walk).replace("Left", "Right").replace("lf", "rf"),
+    }
     assert min(f.size for f in slides) > 4.0
     fixed = heal(broken)
     assert found(fixed, "foot slide") == []

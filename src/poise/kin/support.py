@@ -177,7 +177,7 @@ def height_faults(clip: Clip, support: Support) -> list[Fault]:
 
 
 def slide_faults(clip: Clip, support: Support) -> list[Fault]:
-    """Spells in which a standing foot travels over the floor, in cm from one end of its way to the other."""
+    """Spells in which a standing foot travels over the floor, in cm between the ends of its way."""
     out = []
     for foot, slip, contact in foot_slips(support):
         for first, last in spells(contact, 1):
@@ -201,9 +201,9 @@ def foot_slips(support: Support) -> list[tuple[int, np.ndarray, np.ndarray]]:
     velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
     out = []
     for foot in dict.fromkeys(support.feet):
-        mine = [k for k, f in enumerate(support.feet) if f == foot]
+        mine = np.flatnonzero(np.array(support.feet) == foot)
         pick = np.where(contact[:, mine], speed[:, mine], np.inf).argmin(-1)
-        touching = contact[:, mine].any(-1)
-        chosen = velocity[np.arange(len(velocity)), np.array(mine)[pick]]
-        out.append((foot, np.where(touching[:, None], chosen, 0.0), touching))
+        chosen = velocity[np.arange(len(velocity)), mine[pick]]
+        touching = np.any(contact[:, mine], axis=-1, keepdims=True)
+        out.append((foot, np.where(touching, chosen, 0.0), touching[:, 0]))
     return out

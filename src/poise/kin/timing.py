@@ -123,8 +123,8 @@ def mend_holds(clip: Clip) -> Clip:
             continue
         a, b = hold.start - 1, hold.stop + 1
         t = torch.linspace(0.0, 1.0, b - a + 1, dtype=rot.dtype)[1:-1]
-        ends = (rot[k].expand(len(t), *rot[k].shape) for k in (a, b))
-        rot[a + 1 : b] = slerp(*ends, t[:, None].expand(-1, rot.shape[1]))
+        first, last = (rot[k].expand(len(t), *rot[k].shape) for k in (a, b))
+        rot[a + 1 : b] = slerp(first, last, t[:, None].expand(-1, rot.shape[1]))
         share = t.numpy()[:, None]
         root[a + 1 : b] = root[a] * (1 - share) + root[b] * share
     return clip.replaced(root_pos=root[keep], rot=rot.numpy()[keep]) if holds else clip
