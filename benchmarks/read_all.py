@@ -227,7 +227,8 @@ def page(seen: list[Seen]) -> str:
     left = [s for s in seen if s.refused and "malformed" not in s.path]
     parts = [
         "# Reading real files",
-        f"Made by `{COMMAND}`: every file of a development set of {len(seen)} motion files, and what "
+        f"```sh\n{COMMAND}\n```",
+        f"Every file of a development set of {len(seen)} motion files, and what "
         "`poise info` and `poise doctor` say of it. Nothing was stated but the skeleton of the clips "
         "that come without their own; unit, vertical and rate are guessed, and compared with the truth.",
         f"{len(read)} of {len(human)} files with human motion are read, {len(wrong)} with something "

@@ -1,4 +1,4 @@
-"""`poise doctor CLIP` and the guesses of `poise info`: what is printed, what is written, what is refused."""
+"""`poise doctor CLIP` and the guesses of `poise info`: what they print, write and refuse."""
 
 from __future__ import annotations
 
