@@ -1,4 +1,4 @@
-"""`poise doctor`: what works on this machine, and what to do about the rest."""
+"""`poise doctor`: what works on this machine; `poise doctor CLIP`: what is wrong with a motion."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from rich.text import Text
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise import __version__
 from poise.cli.console import out, say, say_json
+from poise.cli.options import Reading
+from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.motion import Skeleton
@@ -40,14 +43,27 @@ class Check:
 
 @dataclass(frozen=True)
 class Options:
-    """Say what works on this machine, and what to do about the rest."""
+    """Say what is wrong with a motion, and mend it; without a clip, what works on this machine."""
 
+    clip: Annotated[Positional[Path | None], arg(metavar="[CLIP]", help_behavior_hint="")] = None
+    """A motion file: sliding, floating, penetration, jumps, flips, jitter, frames, bones."""
+    fix: bool = False
+    """Mend what kinematics can mend, and write the result to OUT."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
+    """The mended motion on the same skeleton; its suffix names the format."""
     json: bool = False
     """Print JSON alone."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options, argv: Sequence[str]) -> int:
-    """Exit code 0 if everything needed is there, else 1."""
+    """For a clip see `doctor_motion`; for the machine exit code 0 if all is there, else 1."""
+    if options.clip is not None:
+        from poise.cli.doctor_motion import run_on
+
+        return run_on(options.clip, options.fix, options.out, options.json, options.reading)
+    if options.fix or options.out is not None:
+        raise PoiseError("no clip was given", hint="Write poise doctor CLIP --fix -o OUT")
     checks = [check() for check in CHECKS]
     ready = all(c.state != "missing" for c in checks)
     if options.json:

@@ -16,13 +16,13 @@ from poise.errors import PoiseError
 #: The keys of `--json`, which programs rely on.
 KEYS = (
     *("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "height_m", "warnings"),
-    "repairs",
+    *("repairs", "guesses"),
 )
 
 
 @dataclass(frozen=True)
 class Options:
-    """Say what motion files hold: joints, rate, length, unit, height, what was guessed."""
+    """Say what motion files hold, and what was guessed: each guess, why, and how to state it instead."""
 
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
@@ -37,26 +37,39 @@ def run(options: Options, argv: Sequence[str]) -> int:
     """Reads every file before the first line is printed."""
     if not options.clips:
         raise PoiseError("no clip was given", hint="Write poise info CLIP")
-    from poise.kin import find_faults
+    from poise.kin import find_faults, find_guesses
     from poise.motion.info import describe
 
     clips = [options.reading.read(path) for path in options.clips]
     facts, faults = [describe(clip) for clip in clips], [find_faults(clip) for clip in clips]
     for fact, fault in zip(facts, faults, strict=True):
         fact["repairs"] = None if fault is None else fault.numbers
+    for clip, fact in zip(clips, facts, strict=True):
+        fact["guesses"] = [g.to_dict() for g in find_guesses(clip)]
     if options.json:
         plain = [{key: fact[key] for key in KEYS} for fact in facts]
         say_json(plain[0] if len(plain) == 1 else plain)
         return 0
     for path, fact, fault in zip(options.clips, facts, faults, strict=True):
         table(str(path), ("", ""), _rows(fact), left=2)
-        if fact["warnings"]:
-            say("Guessed or repaired:")
-            notes(fact["warnings"], 40)
+        say("Guessed, and how to state it instead:")
+        notes([_guess(g) for g in fact["guesses"]], 40)
+        told = " ".join(g["evidence"] for g in fact["guesses"])
+        more = [w for w in fact["warnings"] if w not in told]
+        if more:
+            say("Also noticed:")
+            notes(more, 40)
         if fault is not None and fault.sentences:
             say("Will be repaired or should be checked:")
             notes(fault.sentences, 40)
     return 0
+
+
+def _guess(guess: dict[str, Any]) -> str:
+    """One guess in a line."""
+    value = guess["value"]
+    value = "not told" if value is None else f"{value:.5g}" if isinstance(value, float) else value
+    return f"{guess['what']}: {value}. {guess['evidence']}. [{guess['override']}]"
 
 
 def _rows(fact: dict[str, Any]) -> list[tuple[str, str]]:

@@ -27,13 +27,14 @@ VERBS = {
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
     "bench": "how fast the engine is against its limit, and whether its physics is true",
-    "doctor": "what works on this machine, and what to do about the rest",
+    "doctor": "what is wrong with a motion, and mend it; without a clip: is this machine ready",
 }
 _FIRST = (
     ("poise info walk.bvh", "what the clip holds"),
     ("poise imitate walk.bvh -o result", "ten minutes of training; then open result/report.html"),
     ("poise play result --open", "watch it"),
     ("poise eval result", "the score card"),
+    ("poise doctor walk.bvh", "what is wrong with the motion"),
     ("poise doctor", "whether this machine is ready"),
 )
 _INTERRUPTED = 130

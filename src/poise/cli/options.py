@@ -36,6 +36,10 @@ class Reading:
     """The file's vertical."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
     """Which animation of a file that holds several (glTF, USD); by default the longest."""
+    ground: Annotated[str | None, arg(metavar="METRES|auto", help_behavior_hint="")] = None
+    """The floor's height, which becomes 0; auto takes the one that the soles tell."""
+    swap_sides: bool = False
+    """Exchange the names of left and right joints."""
     allow_pickle: bool = False
     """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
@@ -46,7 +50,8 @@ class Reading:
         """The clip in the file `path`."""
         from poise.motion.io import read_clip
 
-        return read_clip(
+        floor = self._floor()
+        clip = read_clip(
             path,
             skeleton=self.skeleton,
             fps=self.fps,
@@ -56,6 +61,26 @@ class Reading:
             take=self.take,
             smooth_hz=self.smooth,
         )
+        if self.swap_sides or self.ground is not None:
+            from poise.kin import anatomy_of, grounded, support_of, swap_sides
+
+            clip = swap_sides(clip) if self.swap_sides else clip
+            if self.ground is not None:
+                support = support_of(clip, anatomy_of(clip)) if floor is None else None
+                clip = grounded(clip, support, floor)
+        return clip
+
+    def _floor(self) -> float | None:
+        """The stated height of the floor in m, None where it is to be guessed or stays."""
+        if self.ground is None or self.ground == "auto":
+            return None
+        try:
+            height = float(self.ground)
+        except ValueError:
+            height = math.nan
+        if not abs(height) < 1000.0:
+            raise PoiseError(f"--ground needs a height in metres or auto, got '{self.ground}'")
+        return height
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,15 @@
-"""Kinematics of a humanoid: clips cleaned, to generalized coordinates and back, cycles, ground."""
+"""Kinematics of a humanoid: clips cleaned and healed, to generalized coordinates and back, ground."""
 
 from poise.kin.clean import CleanReport, Faults, clean_clip, find_faults
 from poise.kin.contacts import contact_labels
 from poise.kin.coords import clip_to_qpos, qpos_to_clip
 from poise.kin.cycle import Cycle, close_cycle, cycle_step, cycle_velocity
+from poise.kin.doctor import Examination, examine, heal
+from poise.kin.faults import Fault, by_kind
 from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
+from poise.kin.guesses import Guess, find_guesses, grounded
 from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik import analytic_ik, clip_ik
 from poise.kin.ik_body import IkBody, ik_body
@@ -16,16 +19,21 @@ from poise.kin.ik_polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
 from poise.kin.retarget import RetargetConfig, retarget
 from poise.kin.retarget_report import RetargetReport
+from poise.kin.sides import swap_sides
 from poise.kin.stance import Stance, relaxed_stance
+from poise.kin.support import Support, anatomy_of, support_of
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
     "CORRECTIONS",
     "CleanReport",
     "Cycle",
+    "Examination",
+    "Fault",
     "Faults",
     "FitReport",
     "GroundFit",
+    "Guess",
     "IkBody",
     "IkConfig",
     "Kinematics",
@@ -35,8 +43,11 @@ __all__ = [
     "RetargetConfig",
     "RetargetReport",
     "Stance",
+    "Support",
     "TwoBone",
     "analytic_ik",
+    "anatomy_of",
+    "by_kind",
     "chain_angles",
     "chain_quat",
     "clean_clip",
@@ -46,9 +57,13 @@ __all__ = [
     "contact_labels",
     "cycle_step",
     "cycle_velocity",
+    "examine",
     "find_faults",
+    "find_guesses",
     "fit_ground",
     "fit_humanoid",
+    "grounded",
+    "heal",
     "ik_body",
     "limb_of",
     "lowest_height",
@@ -60,5 +75,7 @@ __all__ = [
     "relaxed_stance",
     "retarget",
     "shortest_arc",
+    "support_of",
+    "swap_sides",
     "two_bone",
 ]

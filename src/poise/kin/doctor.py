@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from poise.body import Anatomy, find_anatomy
-from poise.errors import PoiseError
+from poise.body import Anatomy
 from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.faults import Fault, by_kind
 from poise.kin.flight import likely_rate
 from poise.kin.footlock import lock_feet, lock_path
+from poise.kin.ground import smooth_hull
 from poise.kin.jitter import jitter_faults, mend_jitter
 from poise.kin.limits import limit_faults
 from poise.kin.sides import exchanged_sides
-from poise.kin.support import Support, slide_faults, support_faults
+from poise.kin.support import Support, anatomy_of, slide_faults, support_faults, support_of
 from poise.kin.timing import body_steps, mend_holds, mend_teleports, timing_faults
 from poise.metrics import floating, foot_slide, jerk, penetration
 from poise.motion import Clip
@@ -46,21 +46,13 @@ class Examination:
         }
 
 
-def anatomy_of(clip: Clip) -> Anatomy:
-    """The parts of the clip's body; empty where it is no human's."""
-    try:
-        return find_anatomy(clip.skeleton)
-    except PoiseError:
-        return Anatomy((), ())
-
-
 def examine(clip: Clip) -> Examination:
     """All faults of a clip and its figures; nothing is changed.
 
     Faults of the frames and of the joints are told of the clip as it is, the stance of the feet too.
     """
     anatomy = anatomy_of(clip)
-    support = Support.of(clip, anatomy) if anatomy.parts else None
+    support = support_of(clip, anatomy)
     cleaned, report = clean_clip(clip, anatomy)
     faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
     faults += [*limit_faults(clip), *_read_faults(clip)]
@@ -81,7 +73,7 @@ def heal(clip: Clip) -> Clip:
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)
-    support = Support.of(clip, anatomy) if anatomy.parts else None
+    support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)
     clip = mend_teleports(clip, low)
     clip = clean_clip(clip, anatomy)[0]
@@ -92,19 +84,20 @@ def heal(clip: Clip) -> Clip:
 
 
 def _on_floor(clip: Clip, anatomy: Anatomy) -> Clip:
-    support = Support.of(clip, anatomy)
+    support = support_of(clip, anatomy)
     return clip if support is None else set_on_floor(clip, support)
 
 
 def set_on_floor(clip: Clip, support: Support) -> Clip:
-    """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is."""
-    from poise.kin.ground import smooth_hull
+    """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is.
 
-    lift = np.zeros(clip.frames)
-    if support.off_m:
-        lift += support.fit.lift_m
+    First the whole of it, by what its soles say; then spells that hover or sink, smoothed over 0.2 s.
+    """
+    lift = np.full(clip.frames, -support.off_m)
     settle = support.fit.settle_m
-    if any(f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in support_faults(clip, support)):
+    if any(
+        f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in support_faults(clip, support)
+    ):
         lift -= settle
     # Points deeper than their margin come up to half of it, so that rounding leaves nothing behind.
     depth = np.where(support.depth > 0, support.depth + 0.5 * support.margin, 0.0).max(-1)
@@ -119,7 +112,7 @@ def _locked(clip: Clip, anatomy: Anatomy) -> Clip:
     """The clip without sliding feet."""
     steps: list[Callable[[Clip, Support, list[Fault]], Clip]] = [lock_path] + [lock_feet] * ROUNDS
     for step in steps:
-        support = Support.of(clip, anatomy)
+        support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:
             return clip
@@ -170,7 +163,6 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
         "joint_speed_max_rad_per_s": float(body_steps(clip).max()) * clip.fps,
     }
     if support is not None:
-        speed, contact = support.contacts
         slide = foot_slide(support.soles, clip.fps, height=0.04, ground=-support.fit.lift_m)
         lowest = torch.tensor(support.low.min(-1))
         depth = penetration(lowest)
@@ -178,7 +170,6 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
         out["foot_slide_mm_per_s"] = _number(slide)
         out["penetration_mm"], out["penetration_max_mm"] = _number(depth.mean_mm), _number(depth.max_mm)
         out["float_mm"] = _number(gap)
-        del speed, contact
     return out
 
 

@@ -133,7 +133,10 @@ def fit_humanoid(
     motions, cycles = [q for q, _ in joined], tuple(c for _, c in joined)
     table, widened = _widen(table, motions, config.margin)
     closed = [c is not None and c.closed for c in cycles]
-    fits = [fit_ground(q, table, rate_hz, c) for q, c in zip(motions, closed, strict=True)]
+    known = [c.skeleton.source.ground_m is not None for c in clips]
+    fits = [
+        fit_ground(q, table, rate_hz, c, known=k) for q, c, k in zip(motions, closed, known, strict=True)
+    ]
     motions = [q for q, _ in fits]
     humanoid = make_humanoid(clips[0].skeleton, table)
     overlaps = _overlaps(humanoid, motions)

@@ -115,7 +115,7 @@ def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
     for thigh, shin, foot in zip(*(anatomy.of(k) for k in ("thigh", "shin", "foot")), strict=True):
         leg = np.linalg.norm(rest[shin] - rest[thigh]) + np.linalg.norm(rest[foot] - rest[shin])
         drops.append((rest[thigh, 2] - rest[foot, 2]) / max(float(leg), 1e-9))
-    if min(drops) > 0.9:
+    if drops and min(drops) > 0.9:
         return identity, True
     rot = torch.tensor(clip.rot)
     # The principal eigenvector of the sum of q q^T (Markley et al. 2007).

@@ -9,7 +9,7 @@ import torch
 
 from poise.kin.faults import Fault
 from poise.kin.flips import spells
-from poise.kin.limbs import match_positions
+from poise.kin.limbs import limb_of, match_positions
 from poise.kin.support import Support, foot_slips
 from poise.motion import Clip
 
@@ -33,7 +33,8 @@ def lock_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     kernel = _gaussian(COMMON_S * clip.fps)
     total = np.convolve(np.pad(weight, len(kernel) // 2), kernel, "valid")
     mean = np.stack(
-        [np.convolve(np.pad(slip[:, k] * weight, len(kernel) // 2), kernel, "valid") for k in range(2)], -1
+        [np.convolve(np.pad(slip[:, k] * weight, len(kernel) // 2), kernel, "valid") for k in range(2)],
+        -1,
     )
     mean = mean / np.maximum(total, 1e-6)[:, None]
     size = np.linalg.norm(mean, axis=-1, keepdims=True)
@@ -70,12 +71,12 @@ def lock_feet(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     for foot, shift in shifts.items():
         targets[foot] = pos[:, foot] + torch.tensor(shift)
     root, rot = clip.tensors()
-    fixed = match_positions(skeleton, rot, root, targets)
+    reached, out = match_positions(skeleton, rot, root, targets), rot.clone()
     for foot, shift in shifts.items():
-        still = torch.tensor((shift == 0.0).all(-1))
-        for j in _leg(skeleton.parents, foot):
-            fixed[still, j] = rot[still, j]
-    return clip.replaced(rot=fixed.numpy())
+        moved = torch.tensor((shift != 0.0).any(-1))
+        for j in limb_of(skeleton, foot):
+            out[moved, j] = reached[moved, j]
+    return clip.replaced(rot=out.numpy())
 
 
 def _shift(slip: np.ndarray, contact: np.ndarray, faults: list[Fault], fps: float) -> np.ndarray:
@@ -105,7 +106,7 @@ def _shift(slip: np.ndarray, contact: np.ndarray, faults: list[Fault], fps: floa
 
 
 def _held(contact: np.ndarray, fps: float) -> np.ndarray:
-    """How firmly `(T)` a foot is held: 1 while it stands, rising and falling over `REST_S` at the ends."""
+    """How firmly `(T)` a foot is held: 1 while it stands, less within `REST_S` of either end."""
     out = np.zeros(len(contact))
     for first, last in spells(contact, 0):
         at = np.arange(last - first + 1)
@@ -127,12 +128,3 @@ def _gaussian(sigma: float) -> np.ndarray:
     reach = max(1, math.ceil(3 * sigma))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)
     return kernel / kernel.sum()
-
-
-def _leg(parents: tuple[int, ...], foot: int) -> list[int]:
-    """The foot and all joints above it, the root left out."""
-    out, j = [], foot
-    while parents[j] >= 0:
-        out.append(j)
-        j = parents[j]
-    return out

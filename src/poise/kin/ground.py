@@ -103,7 +103,12 @@ def _lowest(geom, pos: Tensor, quat: Tensor) -> Tensor:
 
 
 def fit_ground(
-    qpos: np.ndarray, table: BodyTable, fps: float, cyclic: bool = False, sink_m: float = SINK_M
+    qpos: np.ndarray,
+    table: BodyTable,
+    fps: float,
+    cyclic: bool = False,
+    sink_m: float = SINK_M,
+    known: bool = False,
 ) -> tuple[np.ndarray, GroundFit]:
     """The motion set on the floor z = 0, and by how much it was moved.
 
@@ -115,10 +120,11 @@ def fit_ground(
     high, is lowered there. Parts that sink in by more than `sink_m`, such as the toes of a rigid foot at
     push-off, are lifted out frame by frame (a replay without physics asks for less than the training,
     whose contacts push such parts out). Both follow the running extreme of the excess over 0.1 s
-    smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed.
+    smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed. A floor that is
+    `known` to be at z = 0 needs no constant lift.
     """
     state = Kinematics(table)(torch.tensor(qpos))
-    fit = fit_heights(table, state.pos, state.quat, fps, cyclic, sink_m)
+    fit = fit_heights(table, state.pos, state.quat, fps, cyclic, sink_m, known)
     out = np.array(qpos)
     out[:, 2] += fit.lift_m - fit.settle_m + fit.clear_m
     return out, fit
@@ -131,6 +137,7 @@ def fit_heights(
     fps: float,
     cyclic: bool = False,
     sink_m: float = SINK_M,
+    known: bool = False,
 ) -> GroundFit:
     """How a motion with body poses `pos (T, B, 3)` m and `quat (T, B, 4)` would be set on the floor.
 
@@ -143,6 +150,7 @@ def fit_heights(
     if len(stance) >= 3:
         # Badly solved feet point their toes down while they stand; they may not drag the rest along.
         lift = max(-float(np.median(stance)), lift - 2 * SINK_M)
+    lift = 0.0 if known else lift
     reach = max(1, round(0.1 * fps))
     # The mirror image of a clearance: a running minimum, so that no frame is lowered beyond its excess.
     settle = np.maximum(-smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)

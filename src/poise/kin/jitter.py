@@ -76,15 +76,14 @@ def mend_jitter(clip: Clip) -> Clip:
     """The clip smoothed where bones or the root tremble, as little as it takes; else as it is.
 
     A Gaussian mean, which shifts nothing in time, is blended in over the spell and its reach; its
-    deviation is the smallest of `SIGMAS` after which the noise is below its limit. Rotations are smoothed
-    in the world's frame, since in a captured chain the noise of one joint undoes that of the next.
+    deviation is the smallest of `SIGMAS` after which the noise is below its limit. Rotations are
+    smoothed in the world's frame, since in a captured chain the noise of one joint undoes that of the
+    next.
     """
     skeleton = clip.skeleton
     root = _smoothed(torch.tensor(clip.root_pos), clip.fps, ROOT_M, None)
     rot, world = torch.tensor(clip.rot), torch.tensor(clip.world()[1])
-    smooth = [
-        _smoothed_bones(world[:, j], bones, clip.fps) for j, bones in enumerate(_bones(clip))
-    ]
+    smooth = [_smoothed_bones(world[:, j], bones, clip.fps) for j, bones in enumerate(_bones(clip))]
     if root is None and all(s is None for s in smooth):
         return clip
     out, turned = rot.clone(), world.clone()
@@ -94,7 +93,8 @@ def mend_jitter(clip: Clip) -> Clip:
             # Calm against its parent: it rides along.
             turned[:, j] = rot[:, j] if above is None else quat_mul(above, rot[:, j])
             continue
-        turned[:, j] = world[:, j] if smooth[j] is None else smooth[j]
+        own = smooth[j]
+        turned[:, j] = world[:, j] if own is None else own
         local = turned[:, j] if above is None else quat_mul(quat_conj(above), turned[:, j])
         changed = (turned[:, j] != world[:, j]).any(-1)
         if parent >= 0:
@@ -113,12 +113,12 @@ def _bones(clip: Clip) -> list[list[Tensor]]:
             out[parent].append(torch.tensor(skeleton.offsets[j]))
     for j, tip in skeleton.ends:
         out[j].append(torch.tensor(tip, dtype=torch.float64))
-    return [sorted((v for v in b if float(v.norm()) > 0.01), key=lambda v: -float(v.norm())) for b in out]
+    return [
+        sorted((v for v in b if float(v.norm()) > 0.01), key=lambda v: -float(v.norm())) for b in out
+    ]
 
 
-def _bone_noise(
-    track: Tensor, bone: Tensor, fps: float, limit: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _bone_noise(track: Tensor, bone: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
     return trembling(quat_rotate(track, bone.expand(len(track), 3)), fps, limit)
 
 
@@ -141,7 +141,7 @@ def _smoothed_bones(track: Tensor, bones: list[Tensor], fps: float) -> Tensor | 
 
 
 def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Tensor | None:
-    """The path without its noise; None where it has none. With a `bone`, `path` holds rotations of it."""
+    """The path without its noise, None where it has none; with a `bone`, a path of its rotations."""
 
     def noise(now: Tensor) -> tuple[np.ndarray, np.ndarray]:
         return trembling(now, fps, limit) if bone is None else _bone_noise(now, bone, fps, limit)
@@ -157,8 +157,7 @@ def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Te
                 break
             out = _blend(before, spell.start, spell.stop, sigma)
             out = out if bone is None else normalize(out)
-            size, bad = noise(out)
-            if not bad[here].any():
+            if not noise(out)[1][here].any():
                 break
     return out if spells else None
 

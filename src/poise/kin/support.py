@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.body import Anatomy, BodyTable, generate_table
+from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.faults import Fault, spell_faults
 from poise.kin.flight import centre_of_mass
@@ -22,12 +22,15 @@ from poise.spatial import quat_rotate
 #: How far (m) the estimated soles of a clip may be off the floor before the whole clip is: the file
 #: tells where ankles and toes are, not how thick the soles below them.
 SOLE_M = 0.045
+#: The same for soles under the floor, where points are below it by `UNDER_M` in this share of frames.
+SUNK_M, UNDER_M, UNDER_SHARE = 0.02, 0.005, 0.1
 #: Depth (m) to which joints may be under the floor, and bone tips (toes bend, their tips are guessed).
 JOINT_M, TIP_M = 0.01, 0.03
 #: A sole point is near the floor below this height (m).
 NEAR_M = 0.04
-#: A standing foot slides if it is faster than this on average (m/s) and gets this far (m).
-SLIDE_SPEED, SLIDE_M = 0.15, 0.04
+#: A standing foot slides if it is faster than this on average (m/s), gets this far (m), and for so long
+#: (s); a shorter touch belongs to a foot that swings through.
+SLIDE_SPEED, SLIDE_M, SLIDE_S = 0.15, 0.04, 0.06
 #: Hovering (m beyond `HOVER_M`) and gaps between spells (s).
 HOVER_MORE_M, GAP_S = 0.005, 0.1
 
@@ -53,17 +56,8 @@ class Support:
     fit: GroundFit
 
     @classmethod
-    def of(cls, clip: Clip, anatomy: Anatomy) -> Support | None:
-        """The support of a clip, None where no body can be made for its skeleton."""
-        try:
-            table = generate_table(clip.skeleton, None, [clip])
-        except PoiseError:
-            return None
-        return cls.on(clip, anatomy, table)
-
-    @classmethod
-    def on(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
-        """The support of a clip with the body `table`, made from it or from a version of it."""
+    def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
+        """The support of a clip with the body `table`, which was made from it."""
         world = [torch.tensor(x) for x in clip.world()]
         pos, quat = (x[:, [r.joint for r in table.rows]] for x in world)
         soles, feet = _soles(table, pos, quat)
@@ -82,8 +76,14 @@ class Support:
 
     @property
     def off_m(self) -> float:
-        """How far (m) the whole clip is above (below: negative) its floor, 0 within `SOLE_M`."""
-        return -self.fit.lift_m if abs(self.fit.lift_m) > SOLE_M else 0.0
+        """How far (m) the whole clip is above (below: negative) its floor, 0 where that is not sure.
+
+        The soles must say so by more than `SOLE_M`, or by more than `SUNK_M` downwards if the joints and
+        tips, whose places are known, are under the floor as well.
+        """
+        lift = self.fit.lift_m
+        under = float((self.low.min(-1) < -UNDER_M).mean())
+        return -lift if abs(lift) > SOLE_M or (lift > SUNK_M and under > UNDER_SHARE) else 0.0
 
     @cached_property
     def depth(self) -> np.ndarray:
@@ -99,6 +99,23 @@ class Support:
         ground = -self.fit.lift_m
         speed, contact = foot_contacts(self.soles, self.fps, height=NEAR_M, ground=ground)
         return speed / 1000.0, contact
+
+
+def anatomy_of(clip: Clip) -> Anatomy:
+    """The parts of the clip's body; empty where it is no human's."""
+    try:
+        return find_anatomy(clip.skeleton)
+    except PoiseError:
+        return Anatomy((), ())
+
+
+def support_of(clip: Clip, anatomy: Anatomy) -> Support | None:
+    """The support of a clip, None where no body can be made for its skeleton."""
+    try:
+        table = generate_table(clip.skeleton, None, [clip])
+    except PoiseError:
+        return None
+    return Support.of(clip, anatomy, table) if anatomy.parts else None
 
 
 def _soles(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[Tensor, tuple[int, ...]]:
@@ -160,7 +177,7 @@ def height_faults(clip: Clip, support: Support) -> list[Fault]:
 
 
 def slide_faults(clip: Clip, support: Support) -> list[Fault]:
-    """Spells in which a standing foot travels over the floor, in cm from one end of its way to the other."""
+    """Spells in which a standing foot travels over the floor, in cm between the ends of its way."""
     out = []
     for foot, slip, contact in foot_slips(support):
         for first, last in spells(contact, 1):
@@ -168,7 +185,8 @@ def slide_faults(clip: Clip, support: Support) -> list[Fault]:
             way = np.concatenate((np.zeros((1, 2)), np.cumsum(run, axis=0)))
             distance = float(np.linalg.norm(np.ptp(way, axis=0)))
             speed = float(np.linalg.norm(run, axis=-1).mean()) * clip.fps
-            if distance > SLIDE_M and speed > SLIDE_SPEED:
+            lasting = last - first + 1 >= SLIDE_S * clip.fps
+            if lasting and distance > SLIDE_M and speed > SLIDE_SPEED:
                 name, detail = clip.skeleton.names[foot], f"at {speed:.2f} m/s"
                 out.append(Fault("foot slide", name, first, last + 1, distance * 100, detail))
     return sorted(out, key=lambda f: f.start)
@@ -183,9 +201,9 @@ def foot_slips(support: Support) -> list[tuple[int, np.ndarray, np.ndarray]]:
     velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
     out = []
     for foot in dict.fromkeys(support.feet):
-        mine = [k for k, f in enumerate(support.feet) if f == foot]
+        mine = np.flatnonzero(np.array(support.feet) == foot)
         pick = np.where(contact[:, mine], speed[:, mine], np.inf).argmin(-1)
-        touching = contact[:, mine].any(-1)
-        chosen = velocity[np.arange(len(velocity)), np.array(mine)[pick]]
-        out.append((foot, np.where(touching[:, None], chosen, 0.0), touching))
+        chosen = velocity[np.arange(len(velocity)), mine[pick]]
+        touching = np.any(contact[:, mine], axis=-1, keepdims=True)
+        out.append((foot, np.where(touching, chosen, 0.0), touching[:, 0]))
     return out

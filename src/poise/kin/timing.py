@@ -67,8 +67,8 @@ def find_holds(clip: Clip) -> list[Hold]:
 def find_gaps(clip: Clip) -> list[tuple[int, float]]:
     """(frame, how many usual steps) where the whole body gets in one step as far as in several.
 
-    The median over the joints of their step against their neighbouring steps; a body that starts or
-    stops differs on one side only.
+    Most joints must step farther than on either side, so that a start or a stop is no gap. How many
+    usual steps it holds is told by all joints together, the fast ones most.
     """
     steps = body_steps(clip)
     if len(steps) < 7:
@@ -79,7 +79,8 @@ def find_gaps(clip: Clip) -> list[tuple[int, float]]:
     ratio = np.median(steps / np.maximum(usual, 1e-9), axis=-1)
     ratio[:3] = ratio[-3:] = 0.0
     fast = np.median(steps, axis=-1) * clip.fps > GAP_SPEED
-    return [(int(t) + 1, float(ratio[t])) for t in np.flatnonzero((ratio > GAP_RATIO) & fast)]
+    whole = steps.sum(-1) / np.maximum(np.median(around, axis=0).sum(-1), 1e-9)
+    return [(int(t) + 1, float(whole[t])) for t in np.flatnonzero((ratio > GAP_RATIO) & fast)]
 
 
 def timing_faults(clip: Clip) -> list[Fault]:
@@ -99,7 +100,9 @@ def timing_faults(clip: Clip) -> list[Fault]:
     # The step out of a hold is told already.
     known = {h.stop + 1 for h in holds}
     out += [
-        Fault("missing frames", "", t, t, round(ratio) - 1.0, f"all joints step {ratio:.1f} times as far")
+        Fault(
+            "missing frames", "", t, t, round(ratio) - 1.0, f"all joints step {ratio:.1f} times as far"
+        )
         for t, ratio in find_gaps(clip)
         if t not in known and round(ratio) > 1
     ]
@@ -120,8 +123,8 @@ def mend_holds(clip: Clip) -> Clip:
             continue
         a, b = hold.start - 1, hold.stop + 1
         t = torch.linspace(0.0, 1.0, b - a + 1, dtype=rot.dtype)[1:-1]
-        ends = (rot[k].expand(len(t), *rot[k].shape) for k in (a, b))
-        rot[a + 1 : b] = slerp(*ends, t[:, None].expand(-1, rot.shape[1]))
+        first, last = (rot[k].expand(len(t), *rot[k].shape) for k in (a, b))
+        rot[a + 1 : b] = slerp(first, last, t[:, None].expand(-1, rot.shape[1]))
         share = t.numpy()[:, None]
         root[a + 1 : b] = root[a] * (1 - share) + root[b] * share
     return clip.replaced(root_pos=root[keep], rot=rot.numpy()[keep]) if holds else clip

@@ -35,6 +35,7 @@ class Source:
     channels: one `Channel` per joint. notes: what was guessed or repaired, one sentence each.
     frame_time: seconds per frame exactly as the file states it.
     travel_joint: the joint whose position channels carry the travel (Bandai: "Hips", not the root).
+    ground_m: where the floor was before it was moved to z = 0 by the user's word; None if it was not.
     evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps.
     mended: (kind, joint, first frame, last frame, size) of what the reader had to mend: "bone drift" m,
         "quaternion length" (distance from 1), "rest frame" (frames dropped); last frame -1 is the end.
@@ -47,6 +48,7 @@ class Source:
     channels: tuple[Channel, ...] = ()
     frame_time: float | None = None
     travel_joint: str | None = None
+    ground_m: float | None = None
     notes: tuple[str, ...] = ()
     evidence: tuple[tuple[str, str], ...] = ()
     mended: tuple[tuple[str, str, int, int, float], ...] = ()

@@ -1,0 +1,129 @@
+"""`poise doctor CLIP`: the faults of a motion, and with --fix the mended motion beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from poise.cli.console import say, say_json, table
+from poise.cli.options import Reading
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.kin import Examination, Fault
+    from poise.motion import Clip
+
+#: The figures of the table: key, title, unit, digits.
+FIGURES = (
+    ("foot_slide_mm_per_s", "foot slide, mean", "mm/s", 0),
+    ("penetration_mm", "penetration, mean", "mm", 1),
+    ("penetration_max_mm", "penetration, deepest", "mm", 1),
+    ("float_mm", "float, mean", "mm", 1),
+    ("jerk_m_per_s3", "jerk, mean", "m/s^3", 0),
+    ("jerk_max_m_per_s3", "jerk, largest", "m/s^3", 0),
+    ("root_step_max_mm", "root's largest step", "mm", 1),
+    ("joint_speed_max_rad_per_s", "fastest joint", "rad/s", 1),
+)
+#: Rows of faults of one kind that are printed.
+ROWS = 6
+
+
+def run_on(path: Path, fix: bool, target: Path | None, json: bool, reading: Reading) -> int:
+    """Examines, mends and writes where asked to; exit code 0 whatever was found."""
+    if fix != (target is not None):
+        hint = f"Write poise doctor {path} --fix -o OUT"
+        raise PoiseError("--fix needs -o OUT" if fix else "-o OUT needs --fix", hint=hint)
+    if target is not None:
+        _check_target(path, target)
+    from poise.kin import examine, heal
+    from poise.motion import write_clip
+
+    clip = reading.read(path)
+    found = examine(clip)
+    facts: dict[str, Any] = {"clip": str(path), "frames": clip.frames, "fps": clip.fps}
+    facts |= found.to_dict()
+    if target is None:
+        _tell(json, facts, str(path), found)
+        return 0
+    healed = heal(clip)
+    write_clip(healed, target)
+    left = examine(healed)
+    facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
+    _tell(json, facts, str(path), found)
+    if not json:
+        _compare(found, left)
+        _written(target, clip, healed, found, left)
+    return 0
+
+
+def _check_target(path: Path, target: Path) -> None:
+    from poise.motion.io.formats import WRITERS
+
+    if target.exists() and path.exists() and target.samefile(path):
+        raise PoiseError("the clip would be written over itself", target, "Give OUT another name")
+    if target.suffix.lower() not in WRITERS:
+        raise PoiseError(
+            f"a clip cannot be written as '{target.suffix or target.name}'",
+            target,
+            f"Suffixes that can be written: {', '.join(WRITERS)}",
+        )
+
+
+def _tell(json: bool, facts: dict[str, Any], title: str, found: Examination) -> None:
+    if json:
+        say_json(facts)
+        return
+    if not found.judged:
+        say("No human body is told by the joints' names, so feet and floor were not judged.")
+    if not found.faults:
+        say(f"{title}: nothing wrong was found.")
+        return
+    table(title, ("fault", "joint", "frames", "size", "with --fix"), _rows(found), left=2)
+
+
+def _rows(found: Examination) -> list[tuple[str, str, str, str, str]]:
+    from poise.kin import by_kind
+    from poise.kin.faults import KINDS
+
+    rows = []
+    for name, faults in by_kind(found.faults).items():
+        kind = KINDS[name]
+        worst = sorted(faults, key=lambda f: -f.size)[:ROWS]
+        for fault in faults if len(faults) <= ROWS else worst:
+            frames = f"{fault.start}" + (f"-{fault.stop}" if fault.stop > fault.start else "")
+            mended = kind.repair or "only told"
+            rows.append((name, fault.joint or "whole body", frames, _size(fault), mended))
+        if len(faults) > ROWS:
+            rows.append((name, f"and {len(faults) - ROWS} more", "", "", ""))
+    return rows
+
+
+def _size(fault: Fault) -> str:
+    from poise.kin.faults import KINDS
+
+    unit = KINDS[fault.kind].unit
+    number = f"{fault.size:.3g} {unit}".strip()
+    return f"{number}, {fault.detail}" if fault.detail else number
+
+
+def _compare(found: Examination, left: Examination) -> None:
+    from poise.kin import by_kind
+
+    rows = []
+    before, after = by_kind(found.faults), by_kind(left.faults)
+    for name in before | after:
+        count = str(len(before.get(name, ()))), str(len(after.get(name, ())))
+        rows.append((f"{name}, spells", "", *count))
+    for key, title, unit, digits in FIGURES:
+        values = [e.figures[key] for e in (found, left)]
+        rows.append((title, unit, *("-" if v is None else f"{v:,.{digits}f}" for v in values)))
+    table("", ("", "", "before", "after"), rows, left=2)
+
+
+def _written(target: Path, clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:
+    if healed is clip:
+        say(f"{target}: nothing had to be mended; written as it was read.")
+        return
+    dropped = clip.frames - healed.frames
+    frames = f", {dropped} repeated frames left out" if dropped else ""
+    say(f"{target}: {len(found.faults)} faults before, {len(left.faults)} after{frames}.")

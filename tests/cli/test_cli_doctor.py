@@ -1,0 +1,139 @@
+"""`poise doctor CLIP` and the guesses of `poise info`: what they print, write and refuse."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_clips import bvh, put
+
+from poise.cli.main import main
+from poise.motion import read_clip, shifted, write_clip
+
+WALK = Path(str(files("poise") / "data/walk.bvh"))
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The walk, 6 cm too high, with a jump of half a metre in its middle."""
+    clip = shifted(read_clip(WALK), (0.0, 0.0, 0.06))
+    path = np.array(clip.root_pos)
+    path[43:, 0] += 0.5
+    target = tmp_path_factory.mktemp("doctor") / "broken.bvh"
+    write_clip(clip.replaced(root_pos=path), target)
+    return target
+
+
+def said(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
+    assert main([str(a) for a in argv]) == 0
+    out, complained = capsys.readouterr()
+    assert complained == ""
+    return out
+
+
+def test_a_clean_clip_is_told_to_be_clean(capsys: pytest.CaptureFixture[str]) -> None:
+    assert said(capsys, "doctor", WALK) == f"{WALK}: nothing wrong was found.\n"
+
+
+def test_faults_are_listed_with_joint_frames_and_size(broken: Path, capsys) -> None:
+    text = said(capsys, "doctor", broken)
+    row = next(line for line in text.splitlines() if "teleport" in line)
+    assert "Hips" in row and " 43 " in row and "0.5" in row
+    assert "float" in text and "whole body" in text and "6" in text
+
+
+def test_json_holds_every_fault(broken: Path, capsys) -> None:
+    facts = json.loads(said(capsys, "doctor", broken, "--json"))
+    assert facts["frames"] == 86 and facts["judged"]
+    jump = next(f for f in facts["faults"] if f["kind"] == "teleport")
+    assert (jump["joint"], jump["start"], jump["unit"], jump["repairable"]) == ("Hips", 43, "m", True)
+    assert "fixed" not in facts
+
+
+def test_fix_writes_the_clip_without_its_faults(broken: Path, tmp_path: Path, capsys) -> None:
+    target = tmp_path / "mended.bvh"
+    facts = json.loads(said(capsys, "doctor", broken, "--fix", "-o", target, "--json"))
+    assert len(facts["faults"]) >= 2 and facts["fixed"]["faults"] == []
+    again = json.loads(said(capsys, "doctor", target, "--json"))
+    assert again["faults"] == []
+    mended, original = read_clip(target), read_clip(WALK)
+    assert mended.skeleton.names == original.skeleton.names and mended.fps == original.fps
+    assert np.linalg.norm(mended.positions() - original.positions(), axis=-1).max() < 0.03
+
+
+def test_fix_shows_before_and_after(broken: Path, tmp_path: Path, capsys) -> None:
+    text = said(capsys, "doctor", broken, "--fix", "-o", tmp_path / "mended.bvh")
+    row = next(line for line in text.splitlines() if "teleport, spells" in line)
+    assert [c.strip() for c in row.split("│")[3:5]] == ["1", "0"]
+    assert "0 after" in text.splitlines()[-1]
+
+
+def test_a_clean_clip_is_written_as_it_was_read(tmp_path: Path, capsys) -> None:
+    target = tmp_path / "same.bvh"
+    assert "nothing had to be mended" in said(capsys, "doctor", WALK, "--fix", "-o", target)
+    a, b = read_clip(WALK), read_clip(target)
+    np.testing.assert_allclose(a.positions(), b.positions(), atol=1e-6)
+    np.testing.assert_allclose(a.rot, b.rot, atol=1e-6)
+
+
+def test_mistakes_are_refused(refused, broken: Path, tmp_path: Path) -> None:
+    refused("doctor", broken, "--fix", words=("--fix needs -o OUT",))
+    refused("doctor", broken, "-o", "x.bvh", words=("-o OUT needs --fix",))
+    refused("doctor", "--fix", words=("no clip was given",))
+    refused("doctor", broken, "--fix", "-o", broken, words=("over itself",))
+    refused("doctor", broken, "--fix", "-o", tmp_path / "a.xyz", words=("'.xyz'", ".bvh"))
+    refused("doctor", tmp_path / "none.bvh", words=("no such file",))
+    refused("info", WALK, "--ground", "low", words=("--ground", "'low'"))
+
+
+def test_a_body_that_is_not_told_is_said_so(tmp_path: Path, capsys) -> None:
+    text = said(capsys, "doctor", put(tmp_path, "tiny.bvh", bvh()))
+    assert "No human body is told" in text
+
+
+def test_every_guess_has_evidence_and_a_way_to_override_it(capsys) -> None:
+    facts = json.loads(said(capsys, "info", WALK, "--json"))
+    guesses = {g["what"]: g for g in facts["guesses"]}
+    assert list(guesses) == ["up", "unit", "fps", "rest pose", "sides", "feet", "ground"]
+    assert all(g["evidence"] and g["override"] for g in guesses.values())
+    assert guesses["up"]["value"] == "Y" and guesses["unit"]["value"] == 0.01
+    assert guesses["rest pose"]["value"] == "T-pose" and guesses["sides"]["value"] == "as named"
+    assert guesses["feet"]["value"] == "LeftFoot, RightFoot" and abs(guesses["ground"]["value"]) < 0.02
+    text = said(capsys, "info", WALK)
+    assert "[--up Y|Z]" in text and "[--ground METRES" in text
+
+
+def test_what_is_stated_is_no_guess(capsys) -> None:
+    argv = ("info", WALK, "--up", "Y", "--unit", "0.01", "--fps", "60", "--json")
+    facts = json.loads(said(capsys, *argv))
+    why = {g["what"]: g["evidence"] for g in facts["guesses"]}
+    assert (why["up"], why["unit"]) == ("Stated with --up", "Stated with --unit")
+    # Played twice as fast, a walk does not fly, so that gravity has no say.
+    assert why["fps"] == "Stated with --fps"
+
+
+def test_the_floor_can_be_stated_or_taken_from_the_soles(broken: Path, capsys) -> None:
+    def ground(*more: str) -> float:
+        facts = json.loads(said(capsys, "info", broken, "--json", *more))
+        return next(g["value"] for g in facts["guesses"] if g["what"] == "ground")
+
+    assert ground() == pytest.approx(0.06, abs=0.02)
+    assert ground("--ground", "auto") == pytest.approx(0.0, abs=1e-3)
+    assert ground("--ground", "0.04") == pytest.approx(ground() - 0.04, abs=1e-6)
+
+
+def test_sides_can_be_exchanged(tmp_path: Path, capsys) -> None:
+    target = tmp_path / "swapped.bvh"
+    assert main(["convert", str(WALK), str(target), "--swap-sides"]) == 0
+    capsys.readouterr()
+    facts = json.loads(said(capsys, "info", target, "--json"))
+    sides = next(g for g in facts["guesses"] if g["what"] == "sides")
+    assert sides["value"] == "exchanged" and sides["override"] == "--swap-sides"
+    assert "left and right" in said(capsys, "doctor", target) or "sides" in said(
+        capsys, "doctor", target
+    )
+    facts = json.loads(said(capsys, "doctor", target, "--swap-sides", "--json"))
+    assert facts["faults"] == []
