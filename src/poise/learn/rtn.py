@@ -102,12 +102,14 @@ class RTNObjective:
         feet = list(self.net.layout.feet)
         path = torch.cat((truth[:, past - 1 : past], pos), 1)[:, :, feet]
         moved = (torch.diff(path, dim=1).square().sum(-1) + 1e-10).sqrt()
+        verdict = sum(((d(fake) - 1).square().mean() for d in self.critics), torch.zeros(()))
         parts = {
             "quat": functional.l1_loss(steps.rot, batch.rot[:, gap]),
             "pos": ((pos - truth[:, gap]) / self.std).abs().mean(),
             "root": ((steps.root - batch.root[:, gap]) / self.std[0]).abs().mean(),
             "contact": functional.l1_loss(steps.contact, batch.contact[:, gap]),
-            "adversarial": 0.5 * sum(((d(fake) - 1).square().mean() for d in self.critics), torch.zeros(())),
+            "adversarial": 0.5
+            * sum(((d(fake) - 1).square().mean() for d in self.critics), torch.zeros(())),
             "slide": 100 * (moved * steps.contact.detach()).mean(),
         }
         total = sum((getattr(c, k) * v for k, v in parts.items()), torch.zeros(()))

@@ -1,7 +1,7 @@
 """The recurrent transition network of Harvey et al., "Robust Motion In-betweening", 2020.
 
-Three encoders (state, offset to the target, target), a time-to-arrival embedding, scheduled target noise,
-one LSTM, a decoder of velocities, and two critics. Frame after frame it says what changes:
+Three encoders (state, offset to the target, target), a time-to-arrival embedding, scheduled target
+noise, one LSTM, a decoder of velocities, and two critics. Frame after frame it says what changes:
 
     h = LSTM([E_s(q, v, c); E_o(r_T - r, q_T - q); E_q(q_T)] + z_tta),  (dq, dr, c) = D(h)
 
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.nets.between import _linear as linear
+from poise.nets.between import linear
 from poise.nets.transition import (
     Filled,
     Known,
@@ -43,7 +43,7 @@ class RTNConfig:
     decoder: tuple[int, int] = (512, 256)
     past: int = 10
     longest: int = 30
-    """P_max, the longest transition of the training; times to arrival are clamped at past + P_max - 5."""
+    """P_max, the longest transition trained; times to arrival are clamped at past + P_max - 5."""
     noise: float = 0.5
     """Deviation of the target noise."""
 
