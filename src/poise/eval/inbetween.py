@@ -31,8 +31,8 @@ class Protocol:
 
     name: of the data, printed with every figure. past: frames that are seen. lengths: of transitions.
     test_window, test_offset: windows of 10 + 45 + 10 frames every 40. train_window, train_offset: those
-    of which the deviations of L2P are taken. final, validation: regular expressions found in names of clips
-    held out for the final figures and for choices; all other clips are for training.
+    of which the deviations of L2P are taken. final, validation: regular expressions found in names of
+    clips held out for the final figures and for choices; all other clips are for training.
     """
 
     name: str

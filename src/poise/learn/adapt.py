@@ -119,7 +119,7 @@ def adapt(
     return own
 
 
-def adapt_each(net: N, known: Known, length: int, config: Adaptation | None = None) -> Filled:
+def adapt_each(net: nn.Module, known: Known, length: int, config: Adaptation | None = None) -> Filled:
     """Transitions of a network adapted anew to every single sequence, as one gap of a user needs it."""
     config = config or Adaptation()
     parts = []
@@ -132,7 +132,7 @@ def adapt_each(net: N, known: Known, length: int, config: Adaptation | None = No
 
 
 def choose_iterations(
-    net: N,
+    net: nn.Module,
     known: Known,
     length: int,
     score: Callable[[Filled], float],

@@ -176,15 +176,16 @@ def _after(
     return sampled(root[b:], rot[b:], step * torch.arange(1, count + 1).double())
 
 
-def _with_after(net: Between, known: Known, length: int, after: tuple[Tensor, Tensor], noise):
+def _with_after(
+    net: Between, known: Known, length: int, after: tuple[Tensor, Tensor], noise: torch.Generator | None
+) -> Transition:
+    """A transition that also sees what comes after the keyframe it leads to."""
     past, more = known.past_root.shape[1], len(after[0])
-    hole = (
-        known.target_root.new_zeros(1, length, 3),
-        known.target_rot[:, None].expand(1, length, -1, -1),
-    )
+    target = known.target_rot[:, None]
+    hole = (known.target_root.new_zeros(1, length, 3), target.expand(1, length, -1, -1))
     later = [x.unsqueeze(0).float() for x in after]
     root = torch.cat((known.past_root, hole[0], known.target_root[:, None], later[0]), 1)
-    rot = torch.cat((known.past_rot, hole[1], known.target_rot[:, None], later[1]), 1)
+    rot = torch.cat((known.past_rot, hole[1], target, later[1]), 1)
     seen = torch.ones(past + length + 1 + more, dtype=torch.bool)
     seen[past : past + length] = False
     filled = net.complete(root, rot, seen, known.offsets, noise)
