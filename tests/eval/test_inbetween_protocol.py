@@ -67,9 +67,8 @@ def read_text(path, most):
             offsets.append([float(w) for w in words[1:]])
         elif words[0] == "CHANNELS":
             orders.append("".join(w[0] for w in words[2:] if w.endswith("rotation")))
-        elif words[0] == "}":
-            if stack.pop() == -2:
-                end = False
+        elif words[0] == "}" and stack.pop() == -2:
+            end = False
     rows = [[float(w) for w in line.split()] for line in lines[at + 3 : at + 3 + most]]
     root, quats = [], []
     for row in rows:

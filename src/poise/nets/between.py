@@ -89,7 +89,7 @@ def neighbours(known: Tensor) -> Neighbours:
         torch.where(before < 0, after, before),
         torch.where(after > len(known) - 1, before, after),
     )
-    share = (t - before) / (after - before).clamp_min(1)
+    share = ((t - before) / (after - before).clamp_min(1)).clamp(0.0, 1.0) * (after > before)
     return Neighbours(before, after, share)
 
 

@@ -98,7 +98,8 @@ def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> 
     """The split of a library, its statistics and labels."""
     protocol = config.protocol
     train = protocol.split(bank, "train")
-    std = deviation(train, protocol)
+    # What never moves in a library has no deviation to divide by.
+    std = deviation(train, protocol).clamp_min(1e-3)
     layout = Layout(bank.parents, bank.feet, bank.facing)
     data = frame_data(train, layout, std, config.contacts)
     held = None

@@ -58,22 +58,31 @@ def lock_feet(
     pos, quat = tree_world(parents, offsets, root, rot)
     out, index = rot.clone(), {j: k for k, j in enumerate(feet)}
     for leg in legs_of(parents, feet):
-        shift = torch.zeros_like(root)
-        weight = torch.zeros(len(root), dtype=root.dtype)
-        for joint in {leg.ankle, leg.toe}:
-            for a, b in _spells(contact[:, index[joint]]):
-                own = _held(pos[:, joint], a, b, free) - pos[a:b, joint]
-                shift[a:b] += own
-                weight[a:b] += 1
-        held = weight > 0
-        shift = shift / weight.clamp_min(1).unsqueeze(-1)
-        shift = _faded(shift, held, blend)
-        size = shift.norm(dim=-1, keepdim=True)
-        shift = shift * (_MOST / size.clamp_min(1e-9)).clamp(max=1.0) * free.to(shift).unsqueeze(-1)
-        moving = size.squeeze(-1) * free.to(shift) > 1e-6
+        heel, heel_held = _wish(pos[:, leg.ankle], contact[:, index[leg.ankle]], free)
+        tip, tip_held = _wish(pos[:, leg.toe], contact[:, index[leg.toe]], free)
+        # Where only one end of the foot stands, the whole foot goes along with it.
+        held = heel_held | tip_held
+        heel, tip = torch.where(heel_held[:, None], heel, tip), torch.where(tip_held[:, None], tip, heel)
+        heel, tip = (_limited(_faded(x, held, blend), free) for x in (heel, tip))
+        moving = (heel.norm(dim=-1) + tip.norm(dim=-1)) > 1e-9
         if bool(moving.any()):
-            _bend(leg, parents, pos[moving], quat[moving], shift[moving], out, moving)
+            goals = pos[:, leg.ankle] + heel, pos[:, leg.toe] + tip
+            _bend(leg, parents, pos, quat, goals, out, moving)
     return out
+
+
+def _wish(path: Tensor, contact: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """How far a foot joint `(T, 3)` would have to be moved to stand still, and the frames `(T)`."""
+    shift, held = torch.zeros_like(path), torch.zeros_like(free)
+    for a, b in _spells(contact):
+        shift[a:b] = _held(path, a, b, free) - path[a:b]
+        held[a:b] = True
+    return shift, held
+
+
+def _limited(shift: Tensor, free: Tensor) -> Tensor:
+    size = shift.norm(dim=-1, keepdim=True)
+    return shift * (_MOST / size.clamp_min(1e-9)).clamp(max=1.0) * free.to(shift).unsqueeze(-1)
 
 
 def _spells(flags: Tensor, least: int = 2) -> list[tuple[int, int]]:
@@ -114,11 +123,14 @@ def _faded(shift: Tensor, held: Tensor, blend: int) -> Tensor:
 
 
 def _bend(
-    leg: Leg, parents: Sequence[int], pos: Tensor, quat: Tensor, shift: Tensor, out: Tensor, rows: Tensor
-) -> None:
-    """Moves the ankles by `shift (M, 3)`: hips and knees turn, the feet's world rotations stay."""
+    leg: Leg, parents: Sequence[int], all_pos: Tensor, all_quat: Tensor, goals: tuple[Tensor, Tensor],
+    out: Tensor, rows: Tensor,
+) -> None:  # fmt: skip
+    """Brings ankles and toes to their goals `(T, 3)` in the frames `rows`: hips and knees turn as two
+    bones do, and the foot turns towards where its toe should be."""
+    pos, quat = all_pos[rows], all_quat[rows]
+    goal, tip = goals[0][rows], goals[1][rows]
     hip, knee, ankle = pos[:, leg.hip], pos[:, leg.knee], pos[:, leg.ankle]
-    goal = ankle + shift
     a, b = (knee - hip).norm(dim=-1), (ankle - knee).norm(dim=-1)
     way = goal - hip
     reach = torch.minimum(way.norm(dim=-1), _REACH * (a + b))
@@ -132,9 +144,12 @@ def _bend(
     new_ankle = hip + reach.unsqueeze(-1) * way
     hip_w = quat_mul(turn_between(knee - hip, new_knee - hip), quat[:, leg.hip])
     knee_w = quat_mul(turn_between(ankle - knee, new_ankle - new_knee), quat[:, leg.knee])
+    foot_w = quat[:, leg.ankle]
+    if leg.toe != leg.ankle:
+        foot_w = quat_mul(turn_between(pos[:, leg.toe] - ankle, tip - new_ankle), foot_w)
     above = quat[:, parents[leg.hip]]
     for joint, parent, own in (
-        (leg.hip, above, hip_w), (leg.knee, hip_w, knee_w), (leg.ankle, knee_w, quat[:, leg.ankle])
+        (leg.hip, above, hip_w), (leg.knee, hip_w, knee_w), (leg.ankle, knee_w, foot_w)
     ):  # fmt: skip
         new = quat_mul(quat_conj(parent), own)
         old = out[rows, joint]

@@ -49,8 +49,9 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
         y(1) = x(0) + (x(0) - x(-1)),   y(n) = x(n+1) - (x(n+2) - x(n+1)),
 
     and for rotations the same in turns. What that asks for is added to the frames between and fades
-    over `blend` frames. With one frame between, or where only one kept frame is at an end, there is no
-    second speed to meet: one frame takes the mean of both wishes, a lone keyframe is met in place.
+    over `blend` frames. A lone kept frame at the end has no speed of its own: what is missing from where
+    the motion leads to it is made up over the last `blend` frames. A single frame between two moving
+    ends takes the mean of both wishes.
 
     Args:
         root `(T, 3)`, rot `(T, J, 4)`: kept frames, generated frames, kept frames.
@@ -74,6 +75,14 @@ def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tupl
         shift += weight[:, None] * (place - root[before + at])
         apart = quat_to_rotvec(quat_mul(pose, quat_conj(rot[before + at])))
         turn += weight[:, None, None] * apart
+    if after == 1 and n > 1:
+        # y(i) += s(i) (x(n+1) - (2 y(n) - y(n-1))),  s from 0 to 1 along a smooth step
+        t = (torch.arange(n, dtype=root.dtype) - (n - 1 - min(blend, n - 1))).clamp_min(0)
+        t = t / (min(blend, n - 1) + 1)
+        ease = t * t * (3 - 2 * t)
+        place, pose = _ahead(root, rot, before + n - 2, before + n - 1)
+        shift += ease[:, None] * (root[before + n] - place)
+        turn += ease[:, None, None] * quat_to_rotvec(quat_mul(rot[before + n], quat_conj(pose)))
     root[gap] += shift
     rot[gap] = normalize(quat_mul(rotvec_to_quat(turn), rot[gap]))
     return root, unwrap_quats(rot)
