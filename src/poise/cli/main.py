@@ -23,6 +23,7 @@ VERBS = {
     "body": "the physical body that is made for a clip: masses, hinges, gains",
     "imitate": "give one clip a body: train, simulate, score, report",
     "train": "train a recipe on one clip or a library, and no more",
+    "inbetween": "fill the frames between keyframes of a clip with a trained network",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
@@ -118,7 +119,7 @@ def welcome() -> None:
     wide = max(len(line) for line, _ in _FIRST)
     lines += [f"  {line:<{wide}}  {why}" for line, why in _FIRST]
     lines += ["", "All commands:"]
-    lines += [f"  {verb:<8} {what}" for verb, what in VERBS.items()]
+    lines += [f"  {verb:<9} {what}" for verb, what in VERBS.items()]
     lines += ["", "poise COMMAND --help tells its options; poise --version the version."]
     sys.stdout.write("\n".join(lines) + "\n")
 

@@ -11,11 +11,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import say
 from poise.cli.options import Body, Reading, Training
+from poise.cli.train_inbetween import Network
 from poise.cli.training import Job, command_line
 from poise.errors import PoiseError, did_you_mean
 
 #: Recipes that can be trained.
-RECIPES = ("residual-force",)
+RECIPES = ("residual-force", "inbetween")
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Options:
     """Train a recipe on one clip or on several clips of one skeleton, and no more."""
 
     recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
-    """residual-force."""
+    """residual-force, or inbetween."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
     clips: Annotated[
@@ -31,6 +32,7 @@ class Options:
     ] = ()
     """Motion files."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    network: OmitArgPrefixes[Network] = field(default_factory=Network)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
@@ -40,6 +42,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     o = options
     if o.recipe not in RECIPES:
         raise PoiseError(f"there is no recipe '{o.recipe}'. {did_you_mean(o.recipe, RECIPES)}")
+    if o.recipe == "inbetween":
+        return _inbetween(o, argv)
     if not o.clips:
         raise PoiseError("no clip was given", hint=f"Write poise train {o.recipe} CLIP -o RUNDIR")
     again = command_line("train", argv)
@@ -57,3 +61,15 @@ def run(options: Options, argv: Sequence[str]) -> int:
         say(f"Trained {result.last.seconds:.0f} s, {result.last.samples:,} samples")
     say(str(o.out))
     return 0
+
+
+def _inbetween(o: Options, argv: Sequence[str]) -> int:
+    """A network instead of a character: only some of the options have a meaning."""
+    from poise.cli.train_inbetween import run as train
+
+    if o.clips:
+        hint = "Write poise train inbetween --library DIR -o RUNDIR"
+        raise PoiseError("the recipe inbetween learns from a folder, not from single clips", hint=hint)
+    o.training.check()
+    t, again = o.training, command_line("train", argv)
+    return train(o.network, o.out, t.minutes, t.seed, t.iterations, t.threads, t.resume, again)

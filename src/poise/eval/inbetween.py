@@ -31,7 +31,7 @@ class Protocol:
 
     name: of the data, printed with every figure. past: frames that are seen. lengths: of transitions.
     test_window, test_offset: windows of 10 + 45 + 10 frames every 40. train_window, train_offset: those
-    of which the deviations of L2P are taken. final, validation: regular expressions found in the names of
+    of which the deviations of L2P are taken. final, validation: regular expressions found in names of
     clips held out for the final figures and for choices; all other clips are for training.
     """
 
@@ -46,7 +46,7 @@ class Protocol:
     train_offset: int = 20
 
     def part_of(self, clip: str) -> str:
-        """"final", "validation" or "train"."""
+        """ "final", "validation" or "train"."""
         if re.search(self.final, clip):
             return "final"
         held = self.validation is not None and re.search(self.validation, clip)
@@ -164,9 +164,7 @@ def truth_rows(test: TestSet) -> list[Row]:
 
 
 @torch.no_grad()
-def predict(
-    net: TransitionNet, test: TestSet, length: int, batch: int = 256
-) -> tuple[Filled, float]:
+def predict(net: TransitionNet, test: TestSet, length: int, batch: int = 256) -> tuple[Filled, float]:
     """Transitions of all windows in float32 where the network has weights, and seconds a sequence."""
     begun = time.perf_counter()
     dtype = next((p.dtype for p in net.parameters()), test.root.dtype)
@@ -207,6 +205,8 @@ def markdown(name: str, methods: Mapping[str, Sequence[Row]]) -> str:
         lines += ["| method | " + " | ".join(map(str, lengths)) + " |"]
         lines += ["|---" * (len(lengths) + 1) + "|"]
         for method, rows in methods.items():
-            lines.append(f"| {method} | " + " | ".join(form.format(getattr(r, key)) for r in rows) + " |")
+            lines.append(
+                f"| {method} | " + " | ".join(form.format(getattr(r, key)) for r in rows) + " |"
+            )
         lines.append("")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """Test-time adaptation of an in-betweening network (Skeleton2Humanoid, section 3.2, Eqs. 1, 2 and 4).
 
-Only what the network itself says is used, never the truth: where it predicts that a foot stands, the foot
-should not move, and the root should take the shorter way.
+Only what the network itself says is used, never the truth: where it predicts that a foot stands, the
+foot should not move, and the root should take the shorter way.
 
     L_contact = sum_t sum_f |p_f(t+1) - p_f(t)| contact_f(t+1)      (1)    t = 0 .. T-2, f: ankles, toes
     L_smooth  = sum_t ||r(t+1) - r(t)||_2                           (2)
@@ -119,8 +119,8 @@ def adapt(
     return own
 
 
-def adapt_each(net: N, known: Known, length: int, config: Adaptation | None = None) -> Filled:
-    """Transitions of a network adapted anew to every single sequence, as a user with one gap needs it."""
+def adapt_each(net: nn.Module, known: Known, length: int, config: Adaptation | None = None) -> Filled:
+    """Transitions of a network adapted anew to every single sequence, as one gap of a user needs it."""
     config = config or Adaptation()
     parts = []
     for i in range(len(known.target_root)):
@@ -132,7 +132,7 @@ def adapt_each(net: N, known: Known, length: int, config: Adaptation | None = No
 
 
 def choose_iterations(
-    net: N,
+    net: nn.Module,
     known: Known,
     length: int,
     score: Callable[[Filled], float],

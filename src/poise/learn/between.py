@@ -59,7 +59,9 @@ class BetweenObjective:
         plain = [p for p in net.parameters() if p.ndim <= 1]
         groups = [{"params": decayed, "weight_decay": config.weight_decay},
                   {"params": plain, "weight_decay": 0.0}]  # fmt: skip
-        self.optimizers = {"net": torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98), fused=True)}
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            "net": torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98), fused=True)
+        }
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
 
     def modules(self) -> Mapping[str, torch.nn.Module]:

@@ -25,8 +25,8 @@ class Windows(NamedTuple):
 class FrameData:
     """All frames of a training set, one clip after another, float32; metres, Z up.
 
-    root `(F, 3)`, rot `(F, J, 4)` wxyz local, contact `(F, K)` of each foot joint, offsets `(C, J, 3)` of
-    each clip, first `(C + 1)` where clips begin. std `(J, 3)` m: the deviations that L2P divides by.
+    root `(F, 3)`, rot `(F, J, 4)` wxyz local, contact `(F, K)` of each foot joint, offsets `(C, J, 3)`
+    of each clip, first `(C + 1)` where clips begin. std `(J, 3)` m: the deviations that L2P divides by.
     """
 
     layout: Layout

@@ -12,7 +12,7 @@ from torch.nn import functional
 from poise.learn.between import schedule
 from poise.learn.frames import Sampler, Windows
 from poise.nets.rtn import RTN, Critic, Steps
-from poise.nets.transition import Known, into_place, joint_positions, place_of
+from poise.nets.transition import Known, continued, into_place, joint_positions, place_of
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,8 @@ class RTNObjective:
             for group in optimizer.param_groups:
                 group["lr"] = c.lr * share
         batch = self._placed(batch)
-        known = Known(
-            batch.root[:, :past], batch.rot[:, :past], batch.root[:, -1], batch.rot[:, -1], batch.offsets
-        )
+        goal = continued(batch.rot[:, -1:], batch.rot[:, past - 1])[:, 0]
+        known = Known(batch.root[:, :past], batch.rot[:, :past], batch.root[:, -1], goal, batch.offsets)
         steps = self.net(known, length, self.net.draw(c.batch, generator))
         truth = joint_positions(self.net.layout, batch.offsets, batch.root, batch.rot)
         pos = joint_positions(self.net.layout, batch.offsets, steps.root, steps.rot)
@@ -102,12 +101,13 @@ class RTNObjective:
         feet = list(self.net.layout.feet)
         path = torch.cat((truth[:, past - 1 : past], pos), 1)[:, :, feet]
         moved = (torch.diff(path, dim=1).square().sum(-1) + 1e-10).sqrt()
+        verdict = sum(((d(fake) - 1).square().mean() for d in self.critics), torch.zeros(()))
         parts = {
             "quat": functional.l1_loss(steps.rot, batch.rot[:, gap]),
             "pos": ((pos - truth[:, gap]) / self.std).abs().mean(),
             "root": ((steps.root - batch.root[:, gap]) / self.std[0]).abs().mean(),
             "contact": functional.l1_loss(steps.contact, batch.contact[:, gap]),
-            "adversarial": 0.5 * sum(((d(fake) - 1).square().mean() for d in self.critics), torch.zeros(())),
+            "adversarial": 0.5 * verdict,
             "slide": 100 * (moved * steps.contact.detach()).mean(),
         }
         total = sum((getattr(c, k) * v for k, v in parts.items()), torch.zeros(()))
@@ -141,4 +141,5 @@ class RTNObjective:
         at = self.net.config.past - 1
         place = place_of(batch.root[:, at], batch.rot[:, at], self.net.layout.facing)
         root, rot = into_place(batch.root, batch.rot, place)
-        return batch._replace(root=root, rot=rot)
+        # One sign for a whole window, whose quaternions are continuous.
+        return batch._replace(root=root, rot=rot * self.net.signs(rot[:, at]).unsqueeze(1))

@@ -208,9 +208,7 @@ def facing_axis(bank: FrameBank, most: int = 4000) -> tuple[float, float, float]
     The mean over frames of R^-1 (toe - ankle), made orthogonal to the mean of R^-1 up.
     """
     rows = torch.arange(0, bank.frames, max(1, bank.frames // most))
-    pos = tree_positions(
-        bank.parents, bank.offsets[bank.clip_of(rows)], bank.root[rows], bank.rot[rows]
-    )
+    pos = tree_positions(bank.parents, bank.offsets[bank.clip_of(rows)], bank.root[rows], bank.rot[rows])
     inverse = quat_conj(bank.rot[rows, 0])
     ahead = torch.zeros_like(bank.root[rows])
     for ankle, toe in zip(bank.feet[::2], bank.feet[1::2], strict=False):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, cast
 
 import torch
@@ -18,7 +19,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.nets.transition import Filled, Known, Layout, continued, into_place, out_of_place, place_of
+from poise.nets.transition import (
+    Filled,
+    Known,
+    Layout,
+    continued,
+    into_place,
+    out_of_place,
+    place_of,
+)
 from poise.spatial import matrix_kinematics, matrix_to_quat, quat_to_matrix, quat_to_sixd, sixd_to_matrix
 from poise.spatial import slerp as arc
 
@@ -80,7 +89,7 @@ def neighbours(known: Tensor) -> Neighbours:
         torch.where(before < 0, after, before),
         torch.where(after > len(known) - 1, before, after),
     )
-    share = (t - before) / (after - before).clamp_min(1)
+    share = ((t - before) / (after - before).clamp_min(1)).clamp(0.0, 1.0) * (after > before)
     return Neighbours(before, after, share)
 
 
@@ -95,7 +104,9 @@ class Between(nn.Module):
     feature_mean: Tensor
     feature_std: Tensor
 
-    def __init__(self, layout: Layout, config: BetweenConfig | None = None, *, generator: torch.Generator):
+    def __init__(
+        self, layout: Layout, config: BetweenConfig | None = None, *, generator: torch.Generator
+    ):
         super().__init__()
         self.layout, self.config = layout, config or BetweenConfig()
         c, joints = self.config, layout.joints
@@ -109,9 +120,12 @@ class Between(nn.Module):
         self.refiner = _Encoder(more, self.outputs, c.refine, c, generator) if c.refine else None
         if c.latent:
             self.posterior = nn.ModuleList(
-                [_linear(self.features, c.width, generator), _linear(c.width, 2 * c.latent, generator, 0.1)]
+                [
+                    linear(self.features, c.width, generator),
+                    linear(c.width, 2 * c.latent, generator, 0.1),
+                ]
             )
-            self.code = _linear(c.latent, c.width, generator)
+            self.code = linear(c.latent, c.width, generator)
 
     @torch.no_grad()
     def calibrate(self, root: Tensor, rot: Tensor, offsets: Tensor) -> None:
@@ -126,7 +140,9 @@ class Between(nn.Module):
         return self._joined(root, quat_to_sixd(rot), quat_to_matrix(rot), offsets)
 
     def _joined(self, root: Tensor, sixd: Tensor, mats: Tensor, offsets: Tensor) -> Tensor:
-        pos = matrix_kinematics(self.layout.parents, offsets.unsqueeze(1), torch.zeros_like(root), mats)[0]
+        pos = matrix_kinematics(self.layout.parents, offsets.unsqueeze(1), torch.zeros_like(root), mats)[
+            0
+        ]
         return torch.cat((root, sixd.flatten(-2), pos.flatten(-2)), -1)
 
     def draw(self, count: int, noise: torch.Generator) -> Tensor:
@@ -147,7 +163,8 @@ class Between(nn.Module):
 
         Args:
             root `(N, T, 3)`, rot `(N, T, J, 4)`: in the place of the last frame before the first gap;
-                unknown frames are not looked at. known `(T)` bool, the same for all. offsets `(N, J, 3)`.
+                unknown frames are not looked at. known `(T)` bool, the same for all.
+            offsets: `(N, J, 3)`.
             code: `(N, latent)` where a variant is asked for.
         """
         near = neighbours(known)
@@ -191,7 +208,9 @@ class Between(nn.Module):
         gap = refined or first
         own, turned = out_of_place(gap.root, matrix_to_quat(gap.mats), place)
         turned = continued(turned, rot[:, 0])
-        pos = matrix_kinematics(self.layout.parents, offsets.unsqueeze(1), own, quat_to_matrix(turned))[0]
+        pos = matrix_kinematics(self.layout.parents, offsets.unsqueeze(1), own, quat_to_matrix(turned))[
+            0
+        ]
         return Filled(own, turned, gap.contact.sigmoid(), pos)
 
     def fill(self, known: Known, length: int, noise: torch.Generator | None = None) -> Filled:
@@ -211,7 +230,7 @@ class Between(nn.Module):
 def last_before_gap(known: Tensor) -> int:
     """The last known frame before the first unknown one that has any before it."""
     rows = [int(i) for i in known.nonzero()]
-    for a, b in zip(rows, rows[1:], strict=False):
+    for a, b in pairwise(rows):
         if b > a + 1:
             return a
     return rows[-1]
@@ -223,12 +242,12 @@ class _Encoder(nn.Module):
     def __init__(self, features: int, outputs: int, layers: int, c: BetweenConfig, g: torch.Generator):
         super().__init__()
         self.reach, self.heads = c.reach, c.heads
-        self.enter = _linear(features + 1, c.width, g)
-        self.time = nn.Sequential(_linear(64, c.width, g), nn.GELU(), _linear(c.width, c.width, g))
+        self.enter = linear(features + 1, c.width, g)
+        self.time = nn.Sequential(linear(64, c.width, g), nn.GELU(), linear(c.width, c.width, g))
         self.bias = nn.Parameter(torch.zeros(c.heads, 2 * c.reach + 1))
         self.layers = nn.ModuleList([_Layer(c, layers, g) for _ in range(layers)])
         self.norm = nn.LayerNorm(c.width)
-        self.leave = _linear(c.width, outputs, g, 0.0)
+        self.leave = linear(c.width, outputs, g, 0.0)
 
     def forward(self, x: Tensor, known: Tensor, near: Neighbours, extra: Tensor | None) -> Tensor:
         flag = known.to(x)[:, None].expand(*x.shape[:-1], 1)
@@ -249,10 +268,10 @@ class _Layer(nn.Module):
         super().__init__()
         self.heads = c.heads
         self.norm1, self.norm2 = nn.LayerNorm(c.width), nn.LayerNorm(c.width)
-        self.mix = _linear(c.width, 3 * c.width, g)
-        self.out = _linear(c.width, c.width, g, 1 / math.sqrt(2 * layers))
-        self.up = _linear(c.width, c.feedforward, g)
-        self.down = _linear(c.feedforward, c.width, g, 1 / math.sqrt(2 * layers))
+        self.mix = linear(c.width, 3 * c.width, g)
+        self.out = linear(c.width, c.width, g, 1 / math.sqrt(2 * layers))
+        self.up = linear(c.width, c.feedforward, g)
+        self.down = linear(c.feedforward, c.width, g, 1 / math.sqrt(2 * layers))
 
     def forward(self, h: Tensor, bias: Tensor) -> Tensor:
         n, t, width = h.shape
@@ -269,7 +288,7 @@ def _waves(x: Tensor, count: int) -> Tensor:
     return torch.cat((angle.sin(), angle.cos()), -1)
 
 
-def _linear(a: int, b: int, generator: torch.Generator, scale: float = 1.0) -> nn.Linear:
+def linear(a: int, b: int, generator: torch.Generator, scale: float = 1.0) -> nn.Linear:
     """A linear layer from a generator of its own: Xavier uniform times `scale`, no bias at first."""
     layer = cast(nn.Linear, nn.utils.skip_init(nn.Linear, a, b))
     bound = scale * math.sqrt(6 / (a + b))

@@ -1,7 +1,7 @@
 """The recurrent transition network of Harvey et al., "Robust Motion In-betweening", 2020.
 
-Three encoders (state, offset to the target, target), a time-to-arrival embedding, scheduled target noise,
-one LSTM, a decoder of velocities, and two critics. Frame after frame it says what changes:
+Three encoders (state, offset to the target, target), a time-to-arrival embedding, scheduled target
+noise, one LSTM, a decoder of velocities, and two critics. Frame after frame it says what changes:
 
     h = LSTM([E_s(q, v, c); E_o(r_T - r, q_T - q); E_q(q_T)] + z_tta),  (dq, dr, c) = D(h)
 
@@ -17,11 +17,12 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.nets.between import _linear as linear
+from poise.nets.between import linear
 from poise.nets.transition import (
     Filled,
     Known,
     Layout,
+    continued,
     into_place,
     joint_positions,
     out_of_place,
@@ -43,7 +44,7 @@ class RTNConfig:
     decoder: tuple[int, int] = (512, 256)
     past: int = 10
     longest: int = 30
-    """P_max, the longest transition of the training; times to arrival are clamped at past + P_max - 5."""
+    """P_max, the longest transition trained; times to arrival are clamped at past + P_max - 5."""
     noise: float = 0.5
     """Deviation of the target noise."""
 
@@ -99,6 +100,7 @@ class RTN(nn.Module):
 
     velocity_std: Tensor
     offset_std: Tensor
+    usual_rot: Tensor
 
     def __init__(self, layout: Layout, config: RTNConfig | None = None, *, generator: torch.Generator):
         super().__init__()
@@ -119,12 +121,17 @@ class RTN(nn.Module):
         # Roots enter and leave in units of how much they vary (the paper uses raw centimetres).
         self.register_buffer("velocity_std", torch.full((3,), 0.02))
         self.register_buffer("offset_std", torch.full((3,), 0.5))
+        # q and -q are one rotation, but not one input: signs are those nearest to the usual rotation.
+        self.register_buffer("usual_rot", torch.tensor([1.0, 0, 0, 0]).repeat(layout.joints, 1))
 
     @torch.no_grad()
     def calibrate(self, root: Tensor, rot: Tensor, offsets: Tensor) -> None:
-        """Takes the scale of root velocities and offsets from windows `(N, T, ...)`."""
+        """Takes the scale of root velocities and offsets, and usual rotations, from windows."""
         place = place_of(root[:, 0], rot[:, 0], self.layout.facing)
-        root, _ = into_place(root, rot, place)
+        root, rot = into_place(root, rot, place)
+        flat = rot.flatten(0, 1)
+        # The mean of rotations: the main axis of sum q q^T, which is blind to signs.
+        self.usual_rot.copy_(torch.linalg.eigh(torch.einsum("nja,njb->jab", flat, flat))[1][..., -1])
         self.velocity_std.copy_(torch.diff(root, dim=1).flatten(0, 1).std(0).clamp_min(1e-3))
         self.offset_std.copy_((root - root[:, :1]).flatten(0, 1).std(0).clamp_min(1e-2))
 
@@ -180,9 +187,15 @@ class RTN(nn.Module):
     def seen(self, known: Known) -> Known:
         """The same as seen from the last known frame, where `forward` wants it."""
         place = place_of(known.past_root[:, -1], known.past_rot[:, -1], self.layout.facing)
-        past = into_place(known.past_root, known.past_rot, place)
+        root, rot = into_place(known.past_root, known.past_rot, place)
         goal = into_place(known.target_root.unsqueeze(1), known.target_rot.unsqueeze(1), place)
-        return Known(*past, goal[0][:, 0], goal[1][:, 0], known.offsets)
+        rot = rot * self.signs(rot[:, -1]).unsqueeze(1)
+        return Known(root, rot, goal[0][:, 0], continued(goal[1], rot[:, -1])[:, 0], known.offsets)
+
+    def signs(self, rot: Tensor) -> Tensor:
+        """1 or -1 `(N, J, 1)`, with which rotations `(N, J, 4)` are nearest to the usual ones."""
+        dots = (rot * self.usual_rot).sum(-1, keepdim=True)
+        return torch.where(dots < 0, -torch.ones_like(dots), torch.ones_like(dots))
 
     def draw(self, count: int, noise: torch.Generator) -> Tensor:
         """Target noise `(count, 512)` of standard normals."""
@@ -194,6 +207,7 @@ class RTN(nn.Module):
         draw = None if noise is None else self.draw(len(known.target_root), noise)
         steps = self(self.seen(known), length, draw)
         root, rot = out_of_place(steps.root, steps.rot, place)
+        rot = continued(rot, known.past_rot[:, -1])
         return Filled(root, rot, steps.contact, joint_positions(self.layout, known.offsets, root, rot))
 
 

@@ -121,4 +121,3 @@ def continued(rot: Tensor, before: Tensor) -> Tensor:
     dots = (path[:, 1:] * path[:, :-1]).sum(-1)
     signs = torch.where(dots < 0, -1.0, 1.0).to(rot.dtype).cumprod(1)
     return rot * signs.unsqueeze(-1)
-

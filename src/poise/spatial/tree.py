@@ -45,7 +45,8 @@ def _levels(parents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], tuple[int,
         depth[j] = 0 if parent < 0 else depth[parent] + 1
     rows = [tuple(j for j, d in enumerate(depth) if d == k) for k in range(max(depth) + 1)]
     return tuple(
-        (row, tuple(rows[k - 1].index(parents[j]) if k else 0 for j in row)) for k, row in enumerate(rows)
+        (row, tuple(rows[k - 1].index(parents[j]) if k else 0 for j in row))
+        for k, row in enumerate(rows)
     )
 
 

@@ -1,0 +1,94 @@
+"""`poise inbetween`: fills the frames between keyframes of a clip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.console import notes, say, tell
+from poise.cli.options import Reading
+from poise.errors import PoiseError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make everything between keyframes of a clip anew; keyframes and all other frames stay."""
+
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
+    """The motion file that holds the keyframes."""
+    keyframes: Annotated[str, arg(metavar="0,30,45")]
+    """Frames that stay, counted from 0, in rising order; frames outside of them stay too."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
+    """The motion file to write; its suffix names the format (.bvh)."""
+    model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """A trained network: a run folder of poise train inbetween, or a model file."""
+    samples: Annotated[int, arg(metavar="N")] = 1
+    """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others are variants."""
+    foot_lock: bool = True
+    """Hold feet where the network says that they stand."""
+    adapt: Annotated[int, arg(metavar="N")] = 0
+    """Iterations of test-time adaptation for each gap."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of the variants."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+def run(options: Options, argv: Sequence[str]) -> int:
+    """Reads, fills, writes."""
+    from poise.learn.adapt import Adaptation
+    from poise.motion.io import write_clip
+    from poise.synth.gaps import check_keyframes
+    from poise.synth.inbetween import Filling, fill_keyframes
+
+    o = options
+    keys = frames_of(o.keyframes)
+    if not 0 <= o.adapt <= 1000:
+        raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}")
+    if o.out.exists() and o.clip.exists() and o.out.samefile(o.clip):
+        raise PoiseError("the clip would be written over itself", o.out, "Give --out another name")
+    clip = o.reading.read(o.clip)
+    check_keyframes(keys, clip.frames, str(o.clip))
+    model = model_of(o.model)
+    adaptation = Adaptation(iterations=o.adapt) if o.adapt else None
+    filling = Filling(o.samples, o.foot_lock, adaptation=adaptation, seed=o.seed)
+    filled = fill_keyframes(clip, keys, model, filling)
+    for warning in filled.warnings:
+        tell(f"warning: {warning}.", "yellow")
+    for k, made in enumerate(filled.clips):
+        path = o.out if o.samples == 1 else o.out.with_name(f"{o.out.stem}-{k}{o.out.suffix}")
+        write_clip(made, path)
+        say(f"{path}: {made.frames} frames at {made.fps:.5g} fps, keyframes {o.keyframes}")
+    notes(clip.skeleton.source.notes)
+    return 0
+
+
+def frames_of(text: str) -> tuple[int, ...]:
+    """(0, 30, 45) from "0,30,45"."""
+    try:
+        return tuple(int(word) for word in text.replace(" ", "").split(","))
+    except ValueError:
+        hint = "Write for example --keyframes 0,30,45"
+        raise PoiseError(
+            f"--keyframes needs whole numbers with commas, got '{text}'", hint=hint
+        ) from None
+
+
+def model_of(folder: Path | None):
+    """The model named, or the one that came with Poise."""
+    from importlib.resources import files
+
+    from poise.learn.model import MODEL, load_model
+
+    if folder is not None:
+        return load_model(folder)
+    shipped = Path(str(files("poise"))) / "data" / "inbetween" / MODEL
+    if not shipped.exists():
+        raise PoiseError(
+            "no in-betweening network came with this installation",
+            hint="Train one with poise train inbetween --library DIR -o RUN, and give --model RUN",
+        )
+    return load_model(shipped)

@@ -1,0 +1,118 @@
+"""`poise train inbetween`: an in-betweening network from a folder of clips."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from rich.progress import BarColumn, Progress, TextColumn
+from tyro.conf import arg
+
+from poise.cli.console import err, notes, say, tell
+from poise.cli.output import claimed
+from poise.cli.progress import EVERY_S, clock
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.learn.inbetween import BlockStats
+
+
+@dataclass(frozen=True)
+class Network:
+    """What only the recipe inbetween knows."""
+
+    library: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """inbetween: the folder of clips of one skeleton to learn from."""
+    net: Literal["transformer", "rtn"] = "transformer"
+    """inbetween: the network; rtn is that of Harvey et al. 2020."""
+    hold_out: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
+    """inbetween: clips whose names match are kept for validation figures."""
+    never: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
+    """inbetween: clips whose names match are not used at all."""
+
+
+def run(network: Network, out: Path, minutes: float, seed: int, steps: int | None, threads: int,
+        resume: bool, again: str) -> int:  # fmt: skip
+    """Trains until the last step or Ctrl-C."""
+    import os
+    import re
+
+    import torch
+
+    from poise.recipes.inbetween import RUN_FILE, Inbetween, begin, train
+
+    if network.library is None:
+        hint = "Write poise train inbetween --library DIR -o RUNDIR"
+        raise PoiseError("the recipe inbetween needs --library", hint=hint)
+    for name, text in (("hold-out", network.hold_out), ("never", network.never)):
+        try:
+            re.compile(text or "")
+        except re.error as problem:
+            raise PoiseError(f"--{name} is no regular expression ({problem})") from None
+    if (out / RUN_FILE).exists() and not resume:
+        raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    torch.set_num_threads(threads or cores)
+    config = Inbetween(
+        net=network.net, name=network.library.name, seed=seed, validation=network.hold_out,
+        final=network.never or r"(?!)",
+    )  # fmt: skip
+    with claimed(out):
+        task, steps = begin(out, network.library, config, minutes, steps, tell)
+    used = len(task.data.first) - 1
+    say(f"{used} clips, {task.data.frames:,} frames to learn from; {steps:,} steps")
+    notes(task.notes)
+    with showing() as show:
+        _, stats, stopped = train(task, out, steps, None, show)
+    if stopped:
+        tell("Stopped; the training so far is saved. Go on with:")
+        tell(f"  {again}")
+        return 130
+    if stats is None:
+        say(f"{out} had reached its last step before; nothing was trained.")
+    else:
+        say(f"Trained {stats.seconds:.0f} s, {stats.samples:,} windows")
+    say(str(out))
+    return 0
+
+
+def figures(stats: BlockStats) -> str:
+    """What one block of steps says."""
+    said = [f"{stats.samples_per_s:,.0f} windows/s", f"loss {stats.parts['loss']:.3f}"]
+    said += [
+        f"{k.split('/')[1]} {v:.3f}" for k, v in stats.parts.items() if k.startswith("validation/l2p")
+    ]
+    return "  ".join(said)
+
+
+@contextlib.contextmanager
+def showing() -> Iterator[Callable[[BlockStats], None]]:
+    """A bar in a terminal, a line now and then elsewhere."""
+    console, last = err(), [float("-inf")]
+
+    def times(stats: BlockStats) -> str:
+        return f"step {stats.step:,} of {stats.steps:,}, {clock(stats.left)} left"
+
+    if not console.is_terminal:
+
+        def line(stats: BlockStats) -> None:
+            if time.monotonic() - last[0] >= EVERY_S or stats.step >= stats.steps:
+                last[0] = time.monotonic()
+                tell(f"{times(stats)}  {figures(stats)}")
+
+        yield line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("training", total=1.0, what="")
+
+        def show(stats: BlockStats) -> None:
+            bar.update(
+                task, completed=stats.step / stats.steps, what=f"{times(stats)}  {figures(stats)}"
+            )
+
+        yield show

@@ -1,0 +1,200 @@
+"""Fills the frames between keyframes of a clip with a trained network, at the clip's own rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.errors import PoiseError
+from poise.learn.adapt import Adaptation, adapt
+from poise.learn.model import InbetweenModel
+from poise.motion.clip import Clip
+from poise.motion.windows import still_root, without_still_root
+from poise.nets.between import Between
+from poise.nets.transition import Filled as Transition
+from poise.nets.transition import Known
+from poise.spatial import slerp
+from poise.synth.footlock import lock_feet
+from poise.synth.gaps import Gap, check_keyframes, split_gaps
+from poise.synth.seams import meet, sampled
+
+#: Bones whose directions differ by more than this (mean over joints, cosine) belong to another rig.
+_SAME_RIG = 0.94
+
+
+@dataclass(frozen=True)
+class Filling:
+    """How gaps are filled.
+
+    samples: clips to make; the first is the network's best guess, the others are variants.
+    foot_lock: hold feet where the network says that they stand. blend_s: seconds over which the ends of
+    a gap are brought to the speed of the kept motion. adaptation: test-time adaptation of each gap.
+    """
+
+    samples: int = 1
+    foot_lock: bool = True
+    blend_s: float = 0.2
+    adaptation: Adaptation | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """The clips, and what the user should know."""
+
+    clips: tuple[Clip, ...]
+    warnings: tuple[str, ...]
+
+
+def fill_keyframes(
+    clip: Clip, keyframes: Sequence[int], model: InbetweenModel, filling: Filling | None = None
+) -> Filled:
+    """The clip with everything between its keyframes made anew; all other frames stay as they are.
+
+    Frames before the first keyframe are what the network sees of the past, frames after the last one
+    are reached in their own speed. Keyframes themselves stay exactly as they are.
+
+    Raises:
+        PoiseError: keyframes that make no sense, or a skeleton that the model does not know.
+    """
+    filling = filling or Filling()
+    if not 1 <= filling.samples <= 1000:
+        raise PoiseError(f"the number of samples must be 1 to 1000, got {filling.samples}")
+    keys = check_keyframes(keyframes, clip.frames, clip.name)
+    check_skeleton(clip, model)
+    step = clip.fps / model.fps
+    gaps, inserted, warnings = split_gaps(keys, (model.longest + 1) * step - 1)
+    own = without_still_root(clip)
+    root, rot = own.tensors()
+    for k in inserted:
+        a, b = max(x for x in keys if x < k), min(x for x in keys if x > k)
+        t = torch.tensor((k - a) / (b - a), dtype=root.dtype)
+        root[k] = root[a] + t * (root[b] - root[a])
+        rot[k] = slerp(rot[a], rot[b], t.expand(rot.shape[1]))
+    clips = []
+    for sample in range(filling.samples):
+        noise = None
+        if sample:
+            noise = torch.Generator().manual_seed(filling.seed * 100_003 + sample)
+        path = _filled(root.clone(), rot.clone(), gaps, keys, own, model, filling, noise)
+        name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
+        clips.append(_as_clip(clip, own, *path, name))
+    return Filled(tuple(clips), tuple(warnings))
+
+
+def check_skeleton(clip: Clip, model: InbetweenModel) -> None:
+    """Refuses a clip whose joints are not the model's, or stand in other rest directions."""
+    own = without_still_root(clip).skeleton
+    hint = "Retarget the clip to the model's skeleton, or train a model on clips of this one"
+    if own.names != model.names or own.parents != model.layout.parents:
+        here = [n for n in own.names if n not in model.names]
+        more = f" ('{here[0]}' is unknown to the model)" if here else ""
+        raise PoiseError(
+            f"its skeleton has {len(own)} joints that are not the model's {len(model.names)}{more}",
+            clip.name, hint,
+        )  # fmt: skip
+    a, b = np.array(own.offsets[1:]), model.offsets.double().numpy()[1:]
+    sizes = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    alike = (a * b).sum(-1)[sizes > 1e-9] / sizes[sizes > 1e-9]
+    if len(alike) and alike.mean() < _SAME_RIG:
+        raise PoiseError("its joints have the model's names but another rest pose", clip.name, hint)
+
+
+@torch.no_grad()
+def _filled(
+    root: Tensor, rot: Tensor, gaps: list[Gap], keys: tuple[int, ...], own: Clip,
+    model: InbetweenModel, filling: Filling, noise: torch.Generator | None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    offsets = torch.tensor(np.array(own.skeleton.offsets))
+    blend = max(1, round(filling.blend_s * own.fps))
+    for gap in gaps:
+        a, b = gap
+        new_root, new_rot, contact = _transition(root, rot, gap, keys, own, model, filling, noise)
+        root[a + 1 : b], rot[a + 1 : b] = new_root, new_rot
+        # Two frames before, and after the gap where they are kept, say how fast it must be met.
+        low = max(0, a - 1)
+        high = min(len(root), b + 2) if b >= keys[-1] else b + 1
+        if filling.foot_lock:
+            free = torch.zeros(high - low, dtype=torch.bool)
+            free[a + 1 - low : b - low] = True
+            stands = torch.zeros(high - low, contact.shape[1], dtype=torch.bool)
+            stands[a + 1 - low : b - low] = contact > 0.5
+            # A keyframe next to a standing foot is where that foot stands.
+            stands[a - low], stands[b - low] = stands[a + 1 - low], stands[b - 1 - low]
+            rot[low:high] = lock_feet(
+                model.layout.parents, model.layout.feet, offsets, root[low:high], rot[low:high],
+                stands, free, blend,
+            )  # fmt: skip
+        met = meet(root[low:high], rot[low:high], a + 1 - low, high - b, blend)
+        root[a + 1 : b], rot[a + 1 : b] = met[0][a + 1 - low : b - low], met[1][a + 1 - low : b - low]
+    return root, rot
+
+
+def _transition(
+    root: Tensor, rot: Tensor, gap: Gap, keys: tuple[int, ...], own: Clip,
+    model: InbetweenModel, filling: Filling, noise: torch.Generator | None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """What the network makes of one gap, at the clip's own frames."""
+    a, b = gap
+    # The gap is cut into whole steps near the model's rate, so that both its ends lie on the grid.
+    length = max(1, round((b - a) * model.fps / own.fps) - 1)
+    step = (b - a) / (length + 1)
+    past = min(model.past, 1 + int(a / step + 1e-6))
+    before = sampled(root[: a + 1], rot[: a + 1], a - step * torch.arange(past - 1, -1, -1).double())
+    known = Known(
+        *(x.unsqueeze(0).float() for x in (*before, root[b], rot[b])),
+        torch.tensor(np.array(own.skeleton.offsets), dtype=torch.float32).unsqueeze(0),
+    )
+    net = model.net
+    if filling.adaptation is not None:
+        net = adapt(net, known, length, filling.adaptation)
+    after = _after(root, rot, b, keys, step, model)
+    if isinstance(net, Between) and after is not None:
+        filled = _with_after(net, known, length, after, noise)
+    else:
+        filled = net.fill(known, length, noise)
+    grid_root = torch.cat((before[0], filled.root[0].double(), root[b : b + 1]))
+    grid_rot = torch.cat((before[1], filled.rot[0].double(), rot[b : b + 1]))
+    at = torch.arange(a + 1, b).double()
+    places = past - 1 + (at - a) / step
+    new_root, new_rot = sampled(grid_root, grid_rot, places)
+    nearest = ((at - a) / step).round().long().clamp(1, length) - 1
+    return new_root, new_rot, filled.contact[0][nearest]
+
+
+def _after(
+    root: Tensor, rot: Tensor, b: int, keys: tuple[int, ...], step: float, model: InbetweenModel
+) -> tuple[Tensor, Tensor] | None:
+    """Frames after the last keyframe at the model's rate, where the clip has any that are kept."""
+    count = min(model.past - 1, int((len(root) - 1 - b) / step + 1e-6))
+    if b < keys[-1] or count < 1:
+        return None
+    return sampled(root[b:], rot[b:], step * torch.arange(1, count + 1).double())
+
+
+def _with_after(
+    net: Between, known: Known, length: int, after: tuple[Tensor, Tensor], noise: torch.Generator | None
+) -> Transition:
+    """A transition that also sees what comes after the keyframe it leads to."""
+    past, more = known.past_root.shape[1], len(after[0])
+    target = known.target_rot[:, None]
+    hole = (known.target_root.new_zeros(1, length, 3), target.expand(1, length, -1, -1))
+    later = [x.unsqueeze(0).float() for x in after]
+    root = torch.cat((known.past_root, hole[0], known.target_root[:, None], later[0]), 1)
+    rot = torch.cat((known.past_rot, hole[1], target, later[1]), 1)
+    seen = torch.ones(past + length + 1 + more, dtype=torch.bool)
+    seen[past : past + length] = False
+    filled = net.complete(root, rot, seen, known.offsets, noise)
+    return Transition(*(v[:, past : past + length] for v in filled))
+
+
+def _as_clip(clip: Clip, own: Clip, root: Tensor, rot: Tensor, name: str) -> Clip:
+    """The result on the clip's own skeleton, a still root included."""
+    turned = rot.numpy()
+    if still_root(clip):
+        turned = np.concatenate((np.array(clip.rot[:, :1]), turned), 1)
+    return clip.replaced(root_pos=root.numpy(), rot=turned, name=name, cyclic=False)
