@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from toy_windows import SMALL, bank, known, layout, moved
 
 from poise.errors import PoiseError
 from poise.nets.between import Between, BetweenConfig, last_before_gap, neighbours, parameter_count
 from poise.nets.transition import Layout, joint_positions
 from poise.spatial import quat_rotate, slerp
+from toy_windows import SMALL, bank, known, layout, moved
 
 
 def network(config: BetweenConfig = SMALL, seed: int = 0, awake: bool = True) -> Between:

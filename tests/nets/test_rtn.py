@@ -6,12 +6,12 @@ import math
 
 import pytest
 import torch
-from toy_windows import SMALL_RTN, bank, known, layout, moved
 
 from poise.nets.between import parameter_count
 from poise.nets.rtn import PLU, RTN, Critic, RTNConfig, arrival_embedding, noise_scale
 from poise.nets.transition import Layout
 from poise.spatial import quat_rotate
+from toy_windows import SMALL_RTN, bank, known, layout, moved
 
 
 def network(config: RTNConfig = SMALL_RTN, seed: int = 0) -> RTN:
