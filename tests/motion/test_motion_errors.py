@@ -279,7 +279,7 @@ def test_files_that_are_no_motion(tmp_path: Path) -> None:
         refusal(put(tmp_path, "a.fbx", b"Kaydara FBX Binary  \0"))
         == f": FBX files are not read yet. {READABLE}"
     )
-    for suffix, name in ((".glb", "glTF"), (".usd", "USD")):
+    for suffix, name in ((".usd", "USD"), (".vmd", "VMD")):
         path = put(tmp_path, f"a{suffix}", b"\1P\2\3")
         assert refusal(path) == f": {name} files are not read yet. {READABLE}"
     path = put(tmp_path, "a.xyz", "hello")
