@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from poise.body import Anatomy
-from poise.body.parts import plain_name
 from poise.motion import Clip
 from poise.motion.info import sampled
+from poise.motion.role_words import name_words
 
 #: Share of frames by which the votes of the geometry must agree before they contradict the names.
 SURE = 0.5
@@ -59,12 +59,13 @@ def exchanged_sides(clip: Clip, anatomy: Anatomy) -> bool:
 def swap_sides(clip: Clip) -> Clip:
     """The clip with the names of left and right joints exchanged; joints without a twin keep theirs."""
     names = clip.skeleton.names
-    keys = [plain_name(n) for n in names]
+    words = [name_words(n) for n in names]
+    keys = [(w.side, w.tokens, w.number) for w in words]
     twin = {"left": "right", "right": "left"}
     out = list(names)
-    for j, (side, core) in enumerate(keys):
-        other = (twin.get(side, ""), core)
-        if side and keys.count(other) == 1 and keys.count((side, core)) == 1:
+    for j, (side, *rest) in enumerate(keys):
+        other = (twin.get(side, ""), *rest)
+        if side and keys.count(other) == 1 and keys.count(keys[j]) == 1:
             out[j] = names[keys.index(other)]
     note = "The names of left and right joints were exchanged, as stated with --swap-sides"
     skeleton = replace(clip.skeleton, names=tuple(out))
