@@ -19,7 +19,7 @@ from poise.learn.checkpoint import LATEST, load_checkpoint, remove_partial, save
 from poise.learn.frames import FrameData, Sampler
 from poise.learn.guard import TrainingError
 from poise.learn.log import Log
-from poise.learn.run import _interruptible as interruptible
+from poise.learn.run import interruptible
 from poise.learn.state import (
     State,
     load_module,

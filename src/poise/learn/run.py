@@ -89,7 +89,7 @@ def run(
     stats: IterationStats | None = None
     stop = until.reached(trainer)
     try:
-        with _interruptible() as interrupt:
+        with interruptible() as interrupt:
             while not any_of(trainer.comm, stop or interrupt.is_set()):
                 stats = trainer.iterate()
                 stop = until.reached(trainer)
@@ -162,7 +162,7 @@ class _Keeper:
 
 
 @contextmanager
-def _interruptible() -> Iterator[threading.Event]:
+def interruptible() -> Iterator[threading.Event]:
     """An event that the first Ctrl-C sets; the second raises `KeyboardInterrupt`.
 
     Only the main thread may catch signals; elsewhere the event is never set.

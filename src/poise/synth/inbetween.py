@@ -145,10 +145,9 @@ def _transition(
     step = (b - a) / (length + 1)
     past = min(model.past, 1 + int(a / step + 1e-6))
     before = sampled(root[: a + 1], rot[: a + 1], a - step * torch.arange(past - 1, -1, -1).double())
-    known = Known(
-        *(x.unsqueeze(0).float() for x in (*before, root[b], rot[b])),
-        torch.tensor(np.array(own.skeleton.offsets), dtype=torch.float32).unsqueeze(0),
-    )
+    offsets = torch.tensor(np.array(own.skeleton.offsets))
+    seen = [x.unsqueeze(0).float() for x in (*before, root[b], rot[b], offsets)]
+    known = Known(seen[0], seen[1], seen[2], seen[3], seen[4])
     net = model.net
     if filling.adaptation is not None:
         net = adapt(net, known, length, filling.adaptation)
