@@ -64,7 +64,9 @@ def test_a_file_that_cannot_be_written_is_refused_before_any_work(
 ) -> None:
     assert main(["imitate", str(clip), "-o", str(tmp_path / "moved.fbx")]) == 2
     assert "cannot be written as '.fbx'" in capsys.readouterr().err and not list(tmp_path.glob("moved*"))
-    assert main(["imitate", str(clip), "-o", str(clip)]) == 2
+    same = str(tmp_path / "walk.bvh")
+    assert main(["convert", str(clip), same]) == 0
+    assert main(["imitate", same, "-o", same]) == 2
     assert "written over itself" in capsys.readouterr().err
 
 
