@@ -1,8 +1,9 @@
-"""The motion prior: its numbers by hand, its buffers, its place in a trainer, and going on bit for bit."""
+"""The motion prior: numbers by hand, buffers, its place in a trainer, and going on bit for bit."""
 
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import replace
 
 import pytest
@@ -106,6 +107,9 @@ def test_windows_never_cross_the_end_of_an_episode():
     history.add(torch.tensor([[9.0], [10.0], [11.0]]))
     assert history.full().tolist() == [0, 2]
     assert history.windows(history.full()).tolist() == [[4, 9], [8, 11]]
+    nan = float("nan")
+    history.restart(torch.tensor([0, 2]), torch.tensor([[[nan], [nan]], [[1.0], [2.0]]]))
+    assert history.full().tolist() == [2]
     with pytest.raises(PoiseError, match="shape"):
         history.add(torch.zeros(3, 2))
 
@@ -204,12 +208,59 @@ def test_the_prior_teaches_a_direction_that_the_task_does_not_know():
     policy = trainer.policy()
     obs = torch.rand(200, 4, generator=rng(5)) * 2 - 1
     before = policy.act(obs).mean(0)
-    stats = [trainer.iterate() for _ in range(40)]
+    stats = [trainer.iterate() for _ in range(25)]
     after = trainer.policy().act(obs).mean(0)
     # 0.1 per step is the action 0.5 along x.
     wish = torch.tensor([0.5, 0.0])
     assert float((after - wish).norm()) < 0.5 * float((before - wish).norm())
     assert stats[0].style["demo_accuracy"] > 0.6
+
+
+class Pair:
+    """One of two "processes" in two threads, which wait for each other at every sum."""
+
+    size, local_size = 2, 2
+
+    def __init__(self, rank: int, shared: dict[int, torch.Tensor], gate: threading.Barrier):
+        self.rank, self.shared, self.gate = rank, shared, gate
+
+    def sum_(self, x: torch.Tensor) -> torch.Tensor:
+        self.shared[self.rank] = x.clone()
+        self.gate.wait(20)
+        x.copy_(self.shared[0] + self.shared[1])
+        self.gate.wait(20)
+        return x
+
+    def gather(self, data: bytes) -> list[bytes]:
+        return [data]
+
+
+def test_processes_share_one_discriminator():
+    gate, shared, amps = threading.Barrier(2), {}, {}
+
+    def work(rank: int) -> None:
+        env = StyleEnv(16, seed=rank)
+        amp = Amp(env, to_the_right, AMP, seed=3, comm=Pair(rank, shared, gate))
+        env.reset()
+        for _ in range(2):
+            amp.begin(6)
+            for _ in range(6):
+                step = env.step(torch.zeros(16, 2) + rank)
+                amp.step(step.terminated | step.truncated)
+            amp.reward(torch.zeros(6, 16))
+            numbers = amp.update()
+        amps[rank] = (amp, numbers)
+
+    threads = [threading.Thread(target=work, args=(r,)) for r in range(2)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    (a, numbers), (b, same) = amps[0], amps[1]
+    assert numbers == same
+    for name, value in a.net.state_dict().items():
+        assert torch.equal(value, b.net.state_dict()[name]), name
+    assert not torch.equal(a.replay.data, b.replay.data)
 
 
 def test_what_cannot_be_is_refused():

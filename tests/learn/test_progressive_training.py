@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,12 +15,14 @@ from toy_point_env import PointEnv
 from poise.errors import PoiseError
 from poise.learn import (
     LATEST,
+    CloneConfig,
     PolicyBundle,
     PPOConfig,
     Step,
     Trainer,
     Until,
     WarmStart,
+    clone,
     columns_of,
     compose,
     first_column,
@@ -38,6 +41,13 @@ def rng(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+@cache
+def stages_once(lateral: bool) -> PolicyBundle:
+    start = "random" if lateral else "copy"
+    second = train(next_column(first(lateral), start, generator=rng(1))).policy()
+    return train(next_column(second, start, generator=rng(2))).policy()
+
+
 def train(bundle: PolicyBundle, iterations: int = 2, **changes) -> Trainer:
     trainer = Trainer(PointEnv(32), replace(TOY, **changes), 0, "point", warm_start=bundle)
     for _ in range(iterations):
@@ -50,9 +60,7 @@ def first(lateral: bool = False) -> PolicyBundle:
 
 
 def stages(lateral: bool = False) -> PolicyBundle:
-    start = "random" if lateral else "copy"
-    second = train(next_column(first(lateral), start, generator=rng(1))).policy()
-    return train(next_column(second, start, generator=rng(2))).policy()
+    return stages_once(lateral).copy()
 
 
 KINDS = {
@@ -161,6 +169,43 @@ def test_a_critic_goes_on_in_the_next_stage():
     assert later.samples == trainer.samples and later.iterate().samples == 2 * 32 * 12 + 32 * 12
 
 
+class ToTarget:
+    """A teacher that walks to the target."""
+
+    def act(self, obs: Tensor) -> Tensor:
+        return obs[:, 2:] - obs[:, :2]
+
+
+CLONE = CloneConfig(rounds=1, steps=20, epochs=(20, 10), minibatch=256, lr=1e-2, critic_steps=8)
+
+
+@pytest.mark.parametrize("lateral", [False, True])
+def test_a_teacher_teaches_only_what_is_not_frozen(lateral):
+    bundle, wish = stages(lateral), ToTarget().act(OBS)
+
+    def taught(start: PolicyBundle) -> PolicyBundle:
+        warm, stats = clone(PointEnv(32), ToTarget(), CLONE, TOY, start=start)
+        assert Trainer(PointEnv(32), TOY, warm_start=warm).iterate().samples > stats[-1].samples
+        return warm.policy
+
+    def changed(one: PolicyBundle, other: PolicyBundle) -> set[str]:
+        a, b = one.state(), other.state()
+        return {k for k in a if not torch.equal(a[k], b[k])}
+
+    def error(b: PolicyBundle) -> float:
+        return float((b.act(OBS) - wish).norm())
+
+    column = taught(bundle)
+    learns = "policy/mean.columns.2", "policy/mean.laterals.2"
+    assert changed(bundle, column) == {k for k in bundle.state() if k.startswith(learns)}
+    assert error(column) < 0.3 * error(bundle)
+    # One of three primitives now does what the teacher does, and a composer is taught to choose it.
+    for whole in (compose(column, generator=rng()), compose(column, "means", "relu", generator=rng())):
+        composer = taught(whole)
+        assert changed(whole, composer) == {k for k in whole.state() if "mean.layers" in k}
+        assert error(composer) < 0.5 * error(whole), (error(composer), error(whole), error(column))
+
+
 class Bandit(PointEnv):
     """One step per episode: the sign of the first observation says which of two actions is right."""
 
@@ -198,7 +243,7 @@ def test_the_composer_is_better_than_its_best_primitive(combine, weights):
     best = max(worth(primitive(whole, k)) for k in range(2))
     config = replace(TOY, horizon=8, policy_lr=5e-3, epochs=4, gamma=0.0)
     trainer = Trainer(Bandit(64), config, warm_start=whole)
-    for _ in range(40):
+    for _ in range(25):
         trainer.iterate()
     assert 0.4 < best < 0.6
     assert worth(trainer.policy()) > best + 0.3, (worth(trainer.policy()), best)

@@ -251,8 +251,10 @@ class PPO:
 
     def mean(self, obs: Tensor) -> Tensor:
         """Mean actions of normalised `obs (N, O)` by the products of the update, with gradients."""
-        mean = self.actor.policy.mean
-        return half_forward(mean, obs) if self._half else mean(obs)
+        policy = self.actor.policy
+        context = policy.context(obs)
+        mean, _ = policy.distribution(obs.bfloat16() if self._half else obs, context)
+        return policy.drive(mean, context)
 
     def _fit_value(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
         """One epoch of the critic; the sum of its losses."""

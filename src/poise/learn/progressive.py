@@ -98,7 +98,6 @@ def compose(
     as the primitives'. joint: all learn together, from a fresh normaliser if there is no other.
     """
     net, log_std = _columns(bundle).copy(), primitive_log_std(bundle)
-    net.log_std.copy_(log_std)
     hidden = net.hidden if hidden is None else hidden
     policy = Composer(
         net,

@@ -94,8 +94,9 @@ class FeatureSource(Protocol):
 
     def past(self, rows: Tensor, count: int) -> Tensor | None:
         """`(n, count, F)` of the new episodes that the last `step` began in `rows (n,)`: the frames up
-        to the start and, last, the start itself, as the clips have them. None if there are none, such
-        as after a fall; those rows then have no prior until they have moved for `count` frames."""
+        to the start and, last, the start itself, as the clips have them. NaN for rows without, such
+        as those that start fallen, or None if there are none at all; those have no style reward of
+        their own until they have moved for `count` frames."""
         ...
 
 

@@ -38,11 +38,13 @@ class History:
         return self.frames[rows].flatten(1)
 
     def restart(self, rows: Tensor, past: Tensor | None) -> None:
-        """Forgets the episodes of `rows (n,)`; new ones begin with `past (n, W, F)`, or with nothing."""
+        """Forgets the episodes of `rows (n,)`; new ones begin with `past (n, W, F)`, or with nothing
+        where that is None or, for single rows, not a number."""
         self.seen[rows] = 0
         if past is not None:
-            self.frames[rows] = past
-            self.seen[rows] = self.frames.shape[1]
+            known = ~past.flatten(1).isnan().any(1)
+            self.frames[rows[known]] = past[known]
+            self.seen[rows[known]] = self.frames.shape[1]
 
     def state(self) -> State:
         """Copies of all tensors."""

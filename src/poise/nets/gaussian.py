@@ -80,6 +80,11 @@ class GaussianPolicy(nn.Module):
         """A, the width of an action."""
         return self.num_drawn
 
+    @property
+    def action_log_std(self) -> Tensor:
+        """log sigma `(A,)` of the actions, as a scale for errors; the same in all states."""
+        return self.log_std
+
     def context(self, obs: Tensor) -> Tensor | None:
         """What parts that do not learn say of normalised `obs (N, O)`: `(N, C)`, or None if nothing.
 

@@ -102,6 +102,7 @@ class Composer(GaussianPolicy):
         super().__init__(scores, std, learn_std)
         self.primitives, self.combine, self.weights, self.joint = primitives, combine, weights, joint
         self.primitives.requires_grad_(joint)
+        self.primitives.log_std.copy_(log_std)
         if combine == "product":
             self.log_std = nn.Parameter(log_std.clone(), requires_grad=False)
         with torch.no_grad():
@@ -117,6 +118,11 @@ class Composer(GaussianPolicy):
     def num_actions(self) -> int:
         """A, the width of an action."""
         return self.primitives.num_out
+
+    @property
+    def action_log_std(self) -> Tensor:
+        """log sigma `(A,)` of the primitives' actions, in the mean."""
+        return self.primitives.log_std.mean(0)
 
     def weight(self, obs: Tensor) -> Tensor:
         """The mean weights `(N, K)` of the primitives for normalised observations `(N, O)`."""
