@@ -100,7 +100,7 @@ def test_mining_goes_on_and_refuses_what_does_not_fit():
     with pytest.raises(PoiseError, match="odds above 0"):
         HardNegatives(2, base=torch.tensor([1.0, 0.0]))
     for bad in ({"rule": "harsh"}, {"union": "all"}, {"floor": 2.0}, {"floor": 0.0}, {"memory": 0}):
-        with pytest.raises(PoiseError, match="MiningConfig|memory"):
+        with pytest.raises(PoiseError, match=r"MiningConfig|memory"):
             MiningConfig(**bad)  # type: ignore[arg-type]
 
 

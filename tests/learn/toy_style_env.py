@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import torch
-from toy_point_env import PointEnv
 from torch import Tensor
+from toy_point_env import PointEnv
 
 from poise.learn import Step
 

@@ -54,7 +54,7 @@ class Discriminator(nn.Module):
 
 
 def gradient_penalty(net: Discriminator, x: Tensor) -> tuple[Tensor, Tensor]:
-    """mean_n ||dD/dx_n||^2 over normalised windows `x (N, W F)`, a scalar with gradients; and D `(N,)`."""
+    """mean_n ||dD/dx_n||^2 of normalised windows `x (N, W F)`, a scalar with gradients; and D `(N,)`."""
     x = x.detach().requires_grad_()
     logit = net.logit(x)
     (slope,) = torch.autograd.grad(logit.sum(), x, create_graph=True)
