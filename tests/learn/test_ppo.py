@@ -19,7 +19,7 @@ from poise.learn import (
     load_policy,
     run,
 )
-from poise.learn.ppo import clipped_surrogate
+from poise.learn.losses import clipped_surrogate
 from poise.learn.rollout import Episodes, collect
 from poise.nets import gaussian_kl
 

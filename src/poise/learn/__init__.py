@@ -1,14 +1,18 @@
 """Reinforcement learning on any `VecEnv`; it knows neither the simulator nor the character."""
 
+from poise.learn.amp import Amp, AmpConfig
 from poise.learn.checkpoint import BEST, LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.clone import CloneConfig, CloneStats, clone
 from poise.learn.config import PPOConfig
+from poise.learn.converge import Convergence, ConvergenceConfig, Decision
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
 from poise.learn.log import Log
+from poise.learn.mining import HardNegatives, MiningConfig
 from poise.learn.policy import PolicyBundle, WarmStart, load_policy
 from poise.learn.ppo import PPO, UpdateStats
-from poise.learn.protocols import Policy, Step, Teacher, VecEnv
+from poise.learn.progressive import columns_of, compose, first_column, next_column, primitive
+from poise.learn.protocols import DemoSampler, FeatureSource, Policy, Step, Style, Teacher, VecEnv
 from poise.learn.rollout import Rollout
 from poise.learn.run import RunResult, Until, run
 from poise.learn.train import IterationStats, Trainer
@@ -18,16 +22,26 @@ __all__ = [
     "LAST_GOOD",
     "LATEST",
     "PPO",
+    "Amp",
+    "AmpConfig",
     "CloneConfig",
     "CloneStats",
+    "Convergence",
+    "ConvergenceConfig",
+    "Decision",
+    "DemoSampler",
+    "FeatureSource",
+    "HardNegatives",
     "IterationStats",
     "Log",
+    "MiningConfig",
     "PPOConfig",
     "Policy",
     "PolicyBundle",
     "Rollout",
     "RunResult",
     "Step",
+    "Style",
     "Teacher",
     "Trainer",
     "TrainingError",
@@ -37,9 +51,14 @@ __all__ = [
     "WarmStart",
     "check_fits",
     "clone",
+    "columns_of",
+    "compose",
+    "first_column",
     "gae",
     "load_checkpoint",
     "load_policy",
+    "next_column",
+    "primitive",
     "run",
     "save_checkpoint",
 ]

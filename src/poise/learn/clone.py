@@ -85,6 +85,7 @@ def clone(
     ppo: PPOConfig | None = None,
     seed: int = 0,
     on_round: Callable[[CloneStats], bool | None] | None = None,
+    start: PolicyBundle | None = None,
 ) -> tuple[WarmStart, tuple[CloneStats, ...]]:
     """A policy (and critic) that acts like `teacher`, ready for `Trainer(warm_start=...)`.
 
@@ -95,6 +96,8 @@ def clone(
         teacher: acts for the environment's present state.
         ppo: the network sizes, action noise sigma, discount and critic settings.
         on_round: called after each round; returning False ends the cloning there.
+        start: the policy that is taught, of which a copy is made, such as a column or a composer of
+            `poise.learn.progressive`, whose frozen parts stay; by default a new perceptron.
 
     The same seed on the same environment gives the same bits. Numbers that are not finite raise a
     `TrainingError`.
@@ -102,7 +105,7 @@ def clone(
     config, ppo = config or CloneConfig(), ppo or PPOConfig()
     begun = time.perf_counter()
     device = torch.device(env.device)
-    learner = PPO(env.num_obs, env.num_actions, ppo, seed, device)
+    learner = PPO(env.num_obs, env.num_actions, ppo, seed, device, actor=start)
     fitter = _Fitter(learner, config, (config.rounds + 1) * config.steps * env.num_envs, seed)
     stats: list[CloneStats] = []
     obs = env.reset()
@@ -132,7 +135,9 @@ class _Fitter:
         self.obs = torch.empty(capacity, actor.num_obs, device=device)
         self.action = torch.empty(capacity, actor.num_actions, device=device)
         self.shuffle = make_generator(seed, "clone shuffle", device)
-        self.params = list(actor.policy.mean.parameters())
+        # The action noise is not taught.
+        names = actor.policy.named_parameters()
+        self.params = [p for name, p in names if p.requires_grad and name != "log_std"]
         self.optimizer = torch.optim.Adam(self.params, lr=config.lr, fused=True)
 
     def add(self, obs: Tensor, action: Tensor) -> None:
@@ -146,7 +151,7 @@ class _Fitter:
         """Some passes over everything; the loss of the last one."""
         policy, norm = self.actor.policy, self.actor.norm
         norm.freeze()
-        scale = (-policy.log_std.detach()).exp()
+        scale = (-policy.action_log_std.detach()).exp()
         parts = max(1, round(self.size / self.config.minibatch))
         mean = 0.0
         for epoch in range(epochs):
@@ -185,7 +190,7 @@ def _gather(
     noise = make_generator(seed, f"clone noise {round_}", obs.device)
     n, beta = env.num_envs, config.beta**round_
     levels = torch.tensor(config.noise, device=obs.device)[torch.arange(n) % len(config.noise)]
-    std = student.policy.log_std.exp()
+    std = student.policy.action_log_std.exp()
 
     def drawn(count: int) -> Tensor:
         return torch.rand(count, generator=noise, device=obs.device) < beta
@@ -218,7 +223,8 @@ def _gather(
 def _fit_critic(env: VecEnv, learner: PPO, config: CloneConfig, obs: Tensor, seed: int) -> State:
     """The critic's state after learning the lambda-returns of the student's own episodes."""
     device = torch.device(env.device)
-    rollout = Rollout(config.critic_steps, env.num_envs, env.num_obs, env.num_actions, device)
+    drawn = learner.actor.policy.num_drawn
+    rollout = Rollout(config.critic_steps, env.num_envs, env.num_obs, drawn, device)
     episodes = Episodes(env.num_envs, device)
     policy, norm = learner.actor.policy, learner.actor.norm
     collect(env, policy, norm, rollout, obs, episodes, make_generator(seed, "clone critic", device))

@@ -26,7 +26,7 @@ from poise.nets import RunningNorm
 #: What `torchrun` tells each of its processes.
 LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 # Parts of a trainer's state that each process has for itself; the rest is the same in all.
-_OWN = ("env/", "generator/noise", "trainer/obs", "trainer/episode_")
+_OWN = ("env/", "generator/noise", "trainer/obs", "trainer/episode_", "style/own/")
 
 
 class Comm(Protocol):

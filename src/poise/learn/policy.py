@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from poise.errors import PoiseError
 from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
-from poise.learn.state import State, load_module, prefixed, take
-from poise.nets import MLP, GaussianPolicy, RunningNorm
+from poise.learn.state import State, load_module, prefixed
+from poise.nets import MLP, Composer, GaussianPolicy, ProgressiveNet, RunningNorm
 
 
 @dataclass(eq=False)
@@ -21,7 +22,8 @@ class PolicyBundle:
     """A policy that acts on raw observations; it satisfies the `Policy` protocol.
 
     norm: the observations' normaliser. policy: the Gaussian over actions.
-    shape: what rebuilds the networks (hidden, activation, obs_clip). meta: the checkpoint's data.
+    shape: what rebuilds the networks (hidden, activation, obs_clip and, but for a single perceptron, its
+    kind with what `poise.learn.progressive` adds). meta: the checkpoint's data.
     """
 
     norm: RunningNorm
@@ -47,25 +49,70 @@ class PolicyBundle:
         shape = {"hidden": list(hidden), "activation": activation, "obs_clip": obs_clip}
         return cls(RunningNorm(num_obs, obs_clip), GaussianPolicy(mean, std, learn_std), shape)
 
+    @classmethod
+    def rebuild(cls, num_obs: int, num_actions: int, shape: Mapping[str, Any]) -> PolicyBundle:
+        """An untrained policy of a checkpoint's `shape`; its state is to be loaded.
+
+        Raises:
+            PoiseError: a kind of policy that this version does not know.
+        """
+        rng = torch.Generator().manual_seed(0)
+        hidden, activation, clip = tuple(shape["hidden"]), shape["activation"], shape["obs_clip"]
+        # Policies of before there were kinds are perceptrons.
+        kind = shape.get("kind", "perceptron")
+        if kind == "perceptron":
+            return cls.make(num_obs, num_actions, hidden, activation, 1.0, obs_clip=clip, generator=rng)
+        if kind not in ("progressive", "composer"):
+            raise PoiseError(
+                f"a policy of the kind '{kind}' is unknown",
+                hint="Use the version of Poise that saved it",
+            )
+        lateral = shape["lateral"]
+        net = ProgressiveNet(num_obs, hidden, num_actions, activation, lateral, generator=rng)
+        for _ in range(shape["columns"] - 1):
+            net.add("random", rng)
+        norm = RunningNorm(num_obs, clip)
+        if kind == "progressive":
+            # Frozen columns keep the normaliser they were trained with, and the others share it.
+            norm.fixed = len(net) > 1
+            return cls(norm, GaussianPolicy(net, 1.0), dict(shape))
+        policy = Composer(
+            net,
+            torch.zeros(len(net), num_actions),
+            tuple(shape["composer_hidden"]),
+            activation,
+            shape["combine"],
+            shape["weights"],
+            joint=shape["joint"],
+            generator=rng,
+        )
+        norm.fixed = not policy.joint
+        return cls(norm, policy, dict(shape))
+
     @property
     def num_obs(self) -> int:
         """O, the width of an observation."""
-        return self.policy.mean.num_in
+        return self.policy.num_obs
 
     @property
     def num_actions(self) -> int:
         """A, the width of an action."""
-        return self.policy.mean.num_out
+        return self.policy.num_actions
+
+    @property
+    def learns_itself(self) -> bool:
+        """Whether training goes on with these very networks and not with a perceptron of the config."""
+        return self.shape.get("kind", "perceptron") != "perceptron"
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
         """The mean action `(N, A)` for raw observations `(N, O)`."""
-        return self.policy.forward(self.norm.forward(obs))
+        return self.policy.act(self.norm.forward(obs))
 
     @torch.no_grad()
     def sample(self, obs: Tensor, generator: torch.Generator) -> Tensor:
         """An action `(N, A)` drawn as in training."""
-        return self.policy.sample(self.norm(obs), generator)[0]
+        return self.policy.act(self.norm(obs), generator)
 
     def to(self, device: torch.device | str) -> PolicyBundle:
         """Moves it to where it shall act; returns itself."""
@@ -103,7 +150,9 @@ class PolicyBundle:
 class WarmStart:
     """What reinforcement learning may start from.
 
-    policy: weights and observation statistics. critic: `PPO.state()` entries under "critic/" and
+    policy: weights and observation statistics; one that is no plain perceptron, such as a column or a
+    composer of `poise.learn.progressive`, is itself what goes on learning, whatever sizes and action
+    noise the config has. critic: `PPO.state()` entries under "critic/" and
     "return_norm/", or None for an untrained critic. samples, seconds: what it cost to make.
     """
 
@@ -126,17 +175,7 @@ def load_policy(
     """
     tensors, meta = load_checkpoint(path)
     check_fits(meta, path, character=character, num_obs=num_obs, num_actions=num_actions)
-    shape = meta["policy"]
-    std = tuple(take(tensors, "policy/log_std").exp().tolist())
-    bundle = PolicyBundle.make(
-        meta["num_obs"],
-        meta["num_actions"],
-        tuple(shape["hidden"]),
-        shape["activation"],
-        std,
-        obs_clip=shape["obs_clip"],
-        generator=torch.Generator().manual_seed(0),
-    )
+    bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
     bundle.load_state(tensors)
     bundle.meta = meta
     return bundle

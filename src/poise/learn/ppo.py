@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from poise.errors import PoiseError
 from poise.learn.config import PPOConfig
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
+from poise.learn.losses import Drawn, explained_variance, policy_loss
 from poise.learn.parallel import ALONE, Comm, average_gradients, moments, noise_name, shared_statistics
 from poise.learn.policy import PolicyBundle
 from poise.learn.rollout import Rollout
@@ -30,10 +32,9 @@ from poise.learn.state import (
 )
 from poise.nets import (
     MLP,
+    GaussianPolicy,
     RunningNorm,
     bfloat16_is_fast,
-    gaussian_entropy,
-    gaussian_kl,
     gaussian_log_prob,
     half_forward,
 )
@@ -68,17 +69,8 @@ class _Batch(NamedTuple):
     obs: Tensor
     advantage: Tensor
     target: Tensor
-    action: Tensor
-    log_prob: Tensor
-    mean: Tensor
-    log_std: Tensor
-
-
-def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """The policy loss: -mean min(r A, clip(r, 1 - e, 1 + e) A) with r = pi / pi_old; a scalar."""
-    ratio = (log_prob - old_log_prob).exp()
-    clipped = ratio.clamp(1 - clip, 1 + clip)
-    return -torch.minimum(ratio * advantage, clipped * advantage).mean()
+    old: Drawn
+    context: Tensor | None
 
 
 class PPO:
@@ -90,6 +82,7 @@ class PPO:
         seed: seeds the first weights, the action noise and the shuffling, each apart.
         device: where everything lives.
         comm: the processes that learn together; the config's `minibatch` counts all of them.
+        actor: the policy that learns, of which a copy is made, in place of the config's perceptron.
     """
 
     def __init__(
@@ -100,19 +93,18 @@ class PPO:
         seed: int,
         device: torch.device | str = "cpu",
         comm: Comm = ALONE,
+        actor: PolicyBundle | None = None,
     ):
         self.config, self.comm = config, comm
         init = make_generator(seed, "weights")
-        self.actor = PolicyBundle.make(
-            num_obs,
-            num_actions,
-            config.policy_hidden,
-            config.activation,
-            config.std,
-            config.learn_std,
-            config.obs_clip,
-            generator=init,
-        )
+        if actor is None:
+            sizes = (config.policy_hidden, config.activation, config.std, config.learn_std)
+            self.actor = PolicyBundle.make(num_obs, num_actions, *sizes, config.obs_clip, generator=init)
+        else:
+            found, want = (actor.num_obs, actor.num_actions), (num_obs, num_actions)
+            if found != want:
+                raise PoiseError(f"the policy has {found} observations and actions, the task {want}")
+            self.actor = actor.copy()
         self.critic = MLP(num_obs, config.value_hidden, 1, config.activation, generator=init).to(device)
         self.return_norm = RunningNorm(1, clip=math.inf).to(device)
         self.actor.norm.to(device)
@@ -178,7 +170,7 @@ class PPO:
         before = self.state()
         try:
             self.estimate(rollout, threads > 1)
-            explained = _explained_variance(self.comm, rollout.returns, rollout.value)
+            explained = explained_variance(self.comm, rollout.returns, rollout.value)
             if self.config.normalise_returns:
                 self._rescale_critic(rollout.returns)
             sums, kl = self._fit(rollout, train_policy, threads > 1)
@@ -194,7 +186,7 @@ class PPO:
             clip_fraction=sums["clip fraction"],
             policy_grad_norm=sums["policy gradient"],
             explained_variance=explained,
-            std=float(self.actor.policy.log_std.detach().exp().mean()),
+            std=float(_noise(self.actor.policy, rollout).detach().exp().mean()),
             policy_lr=self.optimizer.param_groups[0]["lr"],
         )
 
@@ -204,24 +196,25 @@ class PPO:
         """All epochs; the mean of each sum and the KL of the last epoch of the policy."""
         config, kl = self.config, 0.0
         advantage = rollout.advantage.flatten()
-        obs = rollout.obs[:-1].flatten(0, 1)
-        action, old_mean, log_prob = rollout.action.flatten(0, 1), rollout.mean, rollout.log_prob
-        if self._half:
-            # The old policy in the arithmetic of the new one, so that both are equal at first.
-            obs, policy = obs.bfloat16(), self.actor.policy
-            with torch.no_grad():
-                old_mean = half_forward(policy.mean, obs)
-                log_prob = gaussian_log_prob(action, old_mean, policy.log_std)
-        mean, std = moments(self.comm, advantage)
-        batch = _Batch(
-            obs,
-            (advantage - mean) / (std + 1e-8),
-            self.return_norm(rollout.returns.view(-1, 1)),
-            action,
-            log_prob.flatten(),
-            old_mean.reshape(action.shape),
-            self.actor.policy.log_std.detach().clone(),
+        obs, policy = rollout.obs[:-1].flatten(0, 1), self.actor.policy
+        old = Drawn(
+            rollout.action.flatten(0, 1),
+            rollout.log_prob.flatten(),
+            rollout.mean.flatten(0, 1),
+            _noise(policy, rollout).detach().clone(),
         )
+        with torch.no_grad():
+            # What never changes in an update is looked up in it.
+            context = policy.context(obs)
+            if self._half:
+                # The old policy in the arithmetic of the new one, so that both are equal at first.
+                obs = obs.bfloat16()
+                mean, log_std = policy.distribution(obs, context)
+                log_prob = gaussian_log_prob(old.action, mean, log_std)
+                old = Drawn(old.action, log_prob, mean, log_std.detach().clone())
+        mean, std = moments(self.comm, advantage)
+        target = self.return_norm(rollout.returns.view(-1, 1))
+        batch = _Batch(obs, (advantage - mean) / (std + 1e-8), target, old, context)
         parts = max(1, round(rollout.samples * self.comm.size / config.minibatch))
         # Processes that share gradients make the same calls in the same order, so in one thread.
         parallel = parallel and self.comm.size == 1
@@ -258,19 +251,17 @@ class PPO:
 
     def mean(self, obs: Tensor) -> Tensor:
         """Mean actions of normalised `obs (N, O)` by the products of the update, with gradients."""
-        mean = self.actor.policy.mean
-        return half_forward(mean, obs) if self._half else mean(obs)
-
-    def _net(self, net: MLP, batch: _Batch, index: Tensor) -> Tensor:
-        """The network's output for some samples, multiplied as the config wants it."""
-        obs = batch.obs.index_select(0, index)
-        return half_forward(net, obs) if self._half else net(obs)
+        policy = self.actor.policy
+        context = policy.context(obs)
+        mean, _ = policy.distribution(obs.bfloat16() if self._half else obs, context)
+        return policy.drive(mean, context)
 
     def _fit_value(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
         """One epoch of the critic; the sum of its losses."""
         total = batch.target.new_zeros(())
         for index in indices:
-            value = self._net(self.critic, batch, index)
+            obs = batch.obs.index_select(0, index)
+            value = half_forward(self.critic, obs) if self._half else self.critic(obs)
             loss = (value - batch.target.index_select(0, index)).square().mean()
             self.value_optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -287,13 +278,13 @@ class PPO:
         given = self.config.policy_grad_norm
         limit = math.inf if given is None else given
         for index in indices:
-            loss, *terms = self._policy_loss(
-                self._net(self.actor.policy.mean, batch, index),
+            obs = batch.obs.index_select(0, index)
+            context = None if batch.context is None else batch.context.index_select(0, index)
+            loss, *terms = policy_loss(
+                self.config,
+                *self.actor.policy.distribution(obs, context),
                 batch.advantage.index_select(0, index),
-                batch.action.index_select(0, index),
-                batch.log_prob.index_select(0, index),
-                batch.mean.index_select(0, index),
-                batch.log_std,
+                batch.old.take(index),
             )
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -302,30 +293,6 @@ class PPO:
             self.optimizer.step()
             sums += torch.stack([*terms, norm])
         return sums
-
-    def _policy_loss(
-        self,
-        mean: Tensor,
-        advantage: Tensor,
-        action: Tensor,
-        old_log_prob: Tensor,
-        old_mean: Tensor,
-        old_log_std: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The loss to descend, and for the log: itself, the KL and the share of clipped ratios."""
-        config, log_std = self.config, self.actor.policy.log_std
-        log_prob = gaussian_log_prob(action, mean, log_std)
-        loss = clipped_surrogate(log_prob, old_log_prob, advantage, config.clip)
-        if config.entropy_weight:
-            loss = loss - config.entropy_weight * gaussian_entropy(log_std)
-        if config.bound_weight:
-            excess = (mean.abs() - config.bound_limit).relu()
-            loss = loss + config.bound_weight * excess.square().sum(-1).mean()
-        with torch.no_grad():
-            kl = gaussian_kl(old_mean, old_log_std, mean, log_std).mean()
-            # |r - 1| > e
-            clipped = ((log_prob - old_log_prob).expm1().abs() > config.clip).float().mean()
-        return loss, loss.detach(), kl, clipped
 
     @torch.no_grad()
     def _rescale_critic(self, returns: Tensor) -> None:
@@ -395,6 +362,6 @@ class PPO:
         set_generator(self.shuffle, take(state, "generator/shuffle"))
 
 
-def _explained_variance(comm: Comm, returns: Tensor, value: Tensor) -> float:
-    spread = float(moments(comm, returns)[1])
-    return 1 - (float(moments(comm, returns - value)[1]) / spread) ** 2 if spread > 0 else 0.0
+def _noise(policy: GaussianPolicy, rollout: Rollout) -> Tensor:
+    """log sigma of the actions: the policy's own `(D,)`, or what followed from each state `(T N, D)`."""
+    return policy.log_std if rollout.log_std is None else rollout.log_std.flatten(0, 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -65,6 +65,80 @@ class VecEnv(Protocol):
 
     def close(self) -> None:
         """Frees threads and memory; calling it twice is allowed."""
+        ...
+
+
+class FeatureSource(Protocol):
+    """What a motion prior asks of an environment beside the `VecEnv`: features of how it moves.
+
+    PHC's 196 are: root height, root rotation (6D) and velocities (3 + 3) in the heading frame, joint
+    rotations (6D), hinge velocities, hands and feet in the heading frame; any others will do.
+    """
+
+    num_envs: int
+    """N, the number of rows."""
+    device: torch.device
+    """Where the features live."""
+
+    @property
+    def num_features(self) -> int:
+        """F, the width of the features of one frame."""
+        ...
+
+    def features(self) -> Tensor:
+        """`(N, F)` float32 of the states that the last `step` reached, before any automatic reset.
+
+        It needs to stay valid only until the next call of `step`.
+        """
+        ...
+
+    def past(self, rows: Tensor, count: int) -> Tensor | None:
+        """`(n, count, F)` of the new episodes that the last `step` began in `rows (n,)`: the frames up
+        to the start and, last, the start itself, as the clips have them. NaN for rows without, such
+        as those that start fallen, or None if there are none at all; those have no style reward of
+        their own until they have moved for `count` frames."""
+        ...
+
+
+class DemoSampler(Protocol):
+    """Draws windows of the clips, as `FeatureSource` would see them."""
+
+    def __call__(self, count: int, generator: torch.Generator) -> Tensor:
+        """`(count, W F)` float32, oldest frame first; drawn by `generator`, which lives on the CPU."""
+        ...
+
+
+class Style(Protocol):
+    """What a trainer asks of a reward that it learns itself, such as `Amp`."""
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """JSON data that a checkpoint must share for its state to be loaded."""
+        ...
+
+    def begin(self, horizon: int) -> None:
+        """Before a rollout of `horizon` steps."""
+        ...
+
+    def step(self, done: Tensor) -> None:
+        """After each step of the environment; `done (N,)` bool says where an episode ended."""
+        ...
+
+    def reward(self, task: Tensor) -> Tensor:
+        """The total reward `(T, N)` of the rollout, whose task reward is `task (T, N)`."""
+        ...
+
+    def update(self) -> dict[str, float]:
+        """Learns from the rollout; numbers for the log."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """Copies of everything that a bit-exact continuation needs; what differs between processes
+        that train together lies under "own/"."""
+        ...
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from what `state` returned."""
         ...
 
 

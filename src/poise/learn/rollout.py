@@ -8,29 +8,29 @@ import torch
 from torch import Tensor
 
 from poise.learn.guard import check_finite
-from poise.learn.protocols import VecEnv
+from poise.learn.protocols import Style, VecEnv
 from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
 
 
 class Rollout:
     """One batch of experience: T steps by N rows, reused every iteration.
 
-    `obs (T+1, N, O)` normalised, the last row follows the last step; `action`, `mean (T, N, A)`;
+    `obs (T+1, N, O)` normalised, the last row follows the last step; `action`, `mean (T, N, D)` as they
+    were drawn, `log_std (T, N, D)` or None where the deviation is the same in all states;
     `log_prob`, `reward`, `value`, `next_value`, `advantage`, `returns (T, N)`; `terminated`,
     `truncated (T, N)` bool. `cut_at (K,)` are the flat indices t N + n of the steps that were
     truncated and `cut_obs (K, O)` the normalised observations that they reached. `terms` are the
     means of the environment's log.
     """
 
-    def __init__(
-        self, horizon: int, num_envs: int, num_obs: int, num_actions: int, device: torch.device
-    ):
+    def __init__(self, horizon: int, num_envs: int, num_obs: int, num_drawn: int, device: torch.device):
         def make(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(*shape, dtype=dtype, device=device)
 
         T, N = horizon, num_envs
         self.obs = make(T + 1, N, num_obs)
-        self.action, self.mean = make(T, N, num_actions), make(T, N, num_actions)
+        self.action, self.mean = make(T, N, num_drawn), make(T, N, num_drawn)
+        self.log_std: Tensor | None = None
         self.log_prob, self.reward = make(T, N), make(T, N)
         self.value, self.next_value = make(T, N), make(T, N)
         self.advantage, self.returns = make(T, N), make(T, N)
@@ -88,18 +88,23 @@ def collect(
     obs: Tensor,
     episodes: Episodes,
     noise: torch.Generator,
+    style: Style | None = None,
 ) -> Tensor:
     """Fills the rollout's `obs` to `truncated` with on-policy steps from the raw `obs (N, O)`.
 
     Raw observations are gathered in `norm`, which is not frozen here. Returns the raw observation
-    to go on from. A number that is not finite raises a `TrainingError`.
+    to go on from. A number that is not finite raises a `TrainingError`. `style` watches; the rewards are
+    the environment's.
     """
     episodes.begin()
     logs: list[Mapping[str, float]] = []
     cut_at: list[Tensor] = []
     cut_obs: list[Tensor] = []
+    log_stds: list[Tensor] = []
     horizon, num_envs = rollout.reward.shape
     std, started = policy.log_std.exp(), float(norm.count) > 0
+    if style is not None:
+        style.begin(horizon)
     # All noise of the iteration at once, into the place where the actions will stand.
     standard_normal(rollout.action, noise)
     check_finite("observation", obs)
@@ -110,9 +115,14 @@ def collect(
         else:
             norm.observe(obs)
             rollout.obs[t] = norm(obs)
-        rollout.mean[t] = policy(rollout.obs[t])
+        context = policy.context(rollout.obs[t])
+        rollout.mean[t], log_std = policy.distribution(rollout.obs[t], context)
+        if log_std.dim() > 1:
+            log_stds.append(log_std)
+            std = log_std.exp()
         # a = mean + sigma z
-        step = env.step(rollout.action[t].mul_(std).add_(rollout.mean[t]))
+        drawn = rollout.action[t].mul_(std).add_(rollout.mean[t])
+        step = env.step(policy.drive(drawn, context))
         check_finite("observation", step.obs)
         check_finite("reward", step.reward, step.log)
         rollout.reward[t], rollout.terminated[t] = step.reward, step.terminated
@@ -123,12 +133,16 @@ def collect(
             check_finite("final observation of a timed-out episode", reached)
             cut_at.append(rows + t * num_envs)
             cut_obs.append(norm(reached))
+        if style is not None:
+            style.step(step.terminated | step.truncated)
         failed = step.terminated if step.failed is None else step.failed
         episodes.count(step.reward, step.terminated, step.truncated, failed)
         logs.append(step.log)
         obs = step.obs
     rollout.obs[horizon] = norm(obs)
-    rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, policy.log_std))
+    rollout.log_std = torch.stack(log_stds) if log_stds else None
+    spread = policy.log_std if rollout.log_std is None else rollout.log_std
+    rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, spread))
     rollout.cut_at = torch.cat([rollout.cut_at[:0], *cut_at])
     rollout.cut_obs = torch.cat([rollout.cut_obs[:0], *cut_obs])
     rollout.terms = {name: sum(log[name] for log in logs) / horizon for name in logs[0]}

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from poise.learn.parallel import (
 )
 from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
-from poise.learn.protocols import VecEnv
+from poise.learn.protocols import Style, VecEnv
 from poise.learn.rollout import Episodes, Rollout, collect
 from poise.learn.state import State, load_module, prefixed, take, under
 
@@ -42,7 +42,7 @@ class IterationStats:
     samples: int
     """Control steps learned from, over all iterations."""
     reward: float
-    """Mean reward per control step."""
+    """Mean reward of the task per control step; that of a style is under "update/style_reward"."""
     episode_length: float
     """Mean control steps of the episodes that ended in this iteration; if none did, of the last
     iteration where one did (NaN before the first)."""
@@ -61,6 +61,8 @@ class IterationStats:
     """Training time since the first iteration, over all resumed runs."""
     collect_seconds: float
     update_seconds: float
+    style: Mapping[str, float] = field(default_factory=dict)
+    """Numbers of a learned style reward, if there is one."""
 
     @property
     def samples_per_s(self) -> float:
@@ -72,6 +74,7 @@ class IterationStats:
         names = ("iteration", "samples", "reward", "episode_length", "episode_reward", "failure_rate")
         row: dict[str, float] = {name: getattr(self, name) for name in (*names, "episodes")}
         row |= {f"update/{k}": v for k, v in dataclasses.asdict(self.update).items()}
+        row |= {f"update/{k}": v for k, v in self.style.items()}
         row |= {f"env/{k}": v for k, v in self.terms.items()}
         return row | {
             "time/seconds": self.seconds,
@@ -92,7 +95,8 @@ class Trainer:
             one is refused.
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
         warm_start: a policy whose weights and observation statistics to start from, or a `WarmStart`
-            that may bring a critic and counts what it cost; the action noise stays the config's.
+            that may bring a critic and counts what it cost; the action noise stays the config's. A
+            column or a composer (`poise.learn.progressive`) is itself what learns, with its own noise.
         update_threads: with more than one, policy and critic are trained side by side, while the
             environment's own threads rest; the numbers are the same.
         comm: the processes that train together, each with a trainer and environments of its own but
@@ -109,16 +113,19 @@ class Trainer:
         warm_start: PolicyBundle | WarmStart | None = None,
         update_threads: int = 1,
         comm: Comm = ALONE,
+        style: Style | None = None,
     ):
         self.env, self.config, self.seed = env, config or PPOConfig(), seed
-        self.update_threads, self.comm = update_threads, comm
+        self.update_threads, self.comm, self.style = update_threads, comm, style
         self.character, self.metadata = character, dict(metadata or {})
-        self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device, comm)
         start = WarmStart(warm_start) if isinstance(warm_start, PolicyBundle) else warm_start
+        actor = start.policy if start is not None and start.policy.learns_itself else None
+        self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device, comm, actor)
         if start is not None:
             _take_over(self.ppo, start)
+        drawn = self.ppo.actor.policy.num_drawn
         self.rollout = Rollout(
-            self.config.horizon, env.num_envs, env.num_obs, env.num_actions, torch.device(env.device)
+            self.config.horizon, env.num_envs, env.num_obs, drawn, torch.device(env.device)
         )
         self.episodes = Episodes(env.num_envs, torch.device(env.device))
         self.iteration = 0
@@ -152,15 +159,21 @@ class Trainer:
         ppo, rollout = self.ppo, self.rollout
         with shared_statistics(self.comm, ppo.actor.norm), together(self.comm, TrainingError):
             self._obs = collect(
-                self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise
-            )
+                self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise,
+                self.style,
+            )  # fmt: skip
+            task = float(rollout.reward.mean())
+            if self.style is not None:
+                rollout.reward.copy_(self.style.reward(rollout.reward))
         collected = time.perf_counter()
+        # The style first: if it fails, the policy is still that of the last good iteration.
+        style = {} if self.style is None else self.style.update()
         train_policy = self.iteration >= self.config.critic_warmup
         update = ppo.update(rollout, train_policy, self.update_threads)
         done = time.perf_counter()
         self.iteration += 1
         self.samples += rollout.samples * self.comm.size
-        reward, seconds, terms = self._share(float(rollout.reward.mean()), done - start, rollout.terms)
+        reward, seconds, terms = self._share(task, done - start, rollout.terms)
         self.seconds += seconds
         ended = self.episodes
         if ended.finished:
@@ -181,6 +194,7 @@ class Trainer:
             collect_seconds=collected - start,
             update_seconds=done - collected,
             batch=rollout.samples * self.comm.size,
+            style=style,
         )
 
     def _share(
@@ -226,7 +240,9 @@ class Trainer:
             "trainer/episode_reward": self.episodes.total.clone(),
             "trainer/counters": torch.tensor(counters, dtype=torch.float64),
         }
-        return gather_state(self.comm, self.ppo.state() | prefixed("env", self.env.state()) | own)
+        style = {} if self.style is None else prefixed("style", self.style.state())
+        env = prefixed("env", self.env.state())
+        return gather_state(self.comm, self.ppo.state() | env | style | own)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from what `state` returned, with the same environment and network sizes."""
@@ -239,6 +255,8 @@ class Trainer:
                 hint="Resume with the number of environments and the terms it was saved with",
             )
         self.ppo.load_state(state)
+        if self.style is not None:
+            self.style.load_state(under("style", state))
         self.env.load_state(under("env", state))
         self._obs = obs.to(device, copy=True)
         self.episodes.length.copy_(take(state, "trainer/episode_length"))
@@ -258,6 +276,7 @@ class Trainer:
             "processes": self.comm.size,
             "seed": self.seed,
             "config": dataclasses.asdict(self.config),
+            "style": None if self.style is None else self.style.shape,
             "iteration": self.iteration,
             "samples": self.samples,
             "seconds": self.seconds,
@@ -284,16 +303,24 @@ class Trainer:
             num_actions=self.env.num_actions,
             num_envs=self.env.num_envs * self.comm.size,
             policy=self.ppo.actor.shape,
+            style=None if self.style is None else self.style.shape,
         )
+        if self.style is None and meta.get("style") is not None:
+            raise PoiseError(
+                "the checkpoint was trained with a learned style reward, this run has none",
+                path,
+                "Use the settings it was made with, or start a new run in another folder",
+            )
         self.load_state(tensors)
         return meta
 
 
 def _take_over(ppo: PPO, start: WarmStart) -> None:
     """Copies weights and statistics of a warm start into a fresh learner."""
-    norm, mean = start.policy.norm.state_dict(), start.policy.policy.mean.state_dict()
-    load_module(ppo.actor.norm, prefixed("norm", norm), "norm")
-    load_module(ppo.actor.policy.mean, prefixed("policy/mean", mean), "policy/mean")
+    if not start.policy.learns_itself:
+        norm, mean = start.policy.norm.state_dict(), start.policy.policy.mean.state_dict()
+        load_module(ppo.actor.norm, prefixed("norm", norm), "norm")
+        load_module(ppo.actor.policy.mean, prefixed("policy/mean", mean), "policy/mean")
     if start.critic is not None:
         load_module(ppo.critic, start.critic, "critic")
         load_module(ppo.return_norm, start.critic, "return_norm")

@@ -9,21 +9,26 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.nets.mlp import MLP
+from poise.nets.half import MeanNet, half_forward
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log density of `x (..., A)` under N(mean, diag(exp(log_std))^2), summed over A: `(...)`.
 
     log p = -1/2 sum_i ((x_i - mu_i) / sigma_i)^2 - sum_i log sigma_i - A/2 log 2 pi
+
+    `log_std` is one number, `(A,)` for all rows, or `(..., A)`.
     """
     z = (x - mean) * (-log_std).exp()
-    constant = log_std.expand(x.shape[-1]).sum() + 0.5 * x.shape[-1] * math.log(2 * math.pi)
+    # One deviation for all rows is summed once.
+    logs = log_std.sum(-1) if log_std.dim() > 1 else log_std.expand(x.shape[-1]).sum()
+    constant = logs + 0.5 * x.shape[-1] * math.log(2 * math.pi)
     return -0.5 * (z * z).sum(-1) - constant
 
 
 def gaussian_entropy(log_std: Tensor) -> Tensor:
-    """Entropy in nats, summed over the actions: sum_i (log sigma_i + 1/2 log(2 pi e)); a scalar."""
+    """Entropy in nats, summed over the actions, `(...)` of `log_std (..., A)`:
+    sum_i (log sigma_i + 1/2 log(2 pi e))."""
     return (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
 
 
@@ -39,13 +44,16 @@ def gaussian_kl(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Te
 class GaussianPolicy(nn.Module):
     """A policy pi(a | s) = N(mean(s), diag(sigma)^2) with a sigma that does not depend on s.
 
+    PPO asks of a policy `context`, `distribution` and `drive`. Another kind (`nets.Composer`) may draw
+    something else than the action, of a sigma that depends on s.
+
     Args:
         mean: the network of the mean; its output layer should start small (`last_scale=0.1`).
         std: sigma, one number or one per action.
         learn_std: whether log sigma is a parameter to learn or a constant.
     """
 
-    def __init__(self, mean: MLP, std: float | Sequence[float], learn_std: bool = False):
+    def __init__(self, mean: MeanNet, std: float | Sequence[float], learn_std: bool = False):
         super().__init__()
         stds = torch.as_tensor(std, dtype=torch.float64).reshape(-1)
         if len(stds) not in (1, mean.num_out) or not bool((stds > 0).all()):
@@ -57,23 +65,63 @@ class GaussianPolicy(nn.Module):
         log_std = stds.expand(mean.num_out).log().float().clone()
         self.log_std = nn.Parameter(log_std, requires_grad=learn_std)
 
+    @property
+    def num_obs(self) -> int:
+        """O, the width of an observation."""
+        return self.mean.num_in
+
+    @property
+    def num_drawn(self) -> int:
+        """D, the width of what is drawn and learned."""
+        return self.mean.num_out
+
+    @property
+    def num_actions(self) -> int:
+        """A, the width of an action."""
+        return self.num_drawn
+
+    @property
+    def action_log_std(self) -> Tensor:
+        """log sigma `(A,)` of the actions, as a scale for errors; the same in all states."""
+        return self.log_std
+
+    def context(self, obs: Tensor) -> Tensor | None:
+        """What parts that do not learn say of normalised `obs (N, O)`: `(N, C)`, or None if nothing.
+
+        It is computed once where `distribution` is asked for again and again.
+        """
+        return None
+
+    def distribution(self, obs: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean `(N, D)` and log sigma, `(D,)` or `(N, D)`, of what is drawn, with gradients.
+
+        Normalised `obs (N, O)` in bfloat16 are multiplied as `half_forward` does.
+        """
+        half = obs.dtype == torch.bfloat16
+        return (half_forward(self.mean, obs) if half else self.mean.forward(obs)), self.log_std
+
+    def drive(self, drawn: Tensor, context: Tensor | None = None) -> Tensor:
+        """The action `(N, A)` that something drawn `(N, D)` stands for."""
+        return drawn
+
     def forward(self, obs: Tensor) -> Tensor:
-        """The mean action `(..., A)` for normalised observations `(..., O)`."""
-        return self.mean.forward(obs)
+        """The mean `(..., D)` for normalised observations `(..., O)`."""
+        return self.distribution(obs)[0]
 
     def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """A drawn action and the mean action, each `(..., A)`."""
-        mean = self.mean(obs)
+        """Something drawn and the mean, each `(..., D)`."""
+        mean, log_std = self.distribution(obs)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-        return mean + noise * self.log_std.exp(), mean
+        return mean + noise * log_std.exp(), mean
 
     def act(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A drawn action `(..., A)`, or the mean action without a generator."""
-        return self.mean(obs) if generator is None else self.sample(obs, generator)[0]
+        drawn = self.forward(obs) if generator is None else self.sample(obs, generator)[0]
+        return self.drive(drawn, self.context(obs))
 
-    def log_prob(self, obs: Tensor, action: Tensor) -> Tensor:
-        """log pi(action | obs), `(...)`."""
-        return gaussian_log_prob(action, self.mean(obs), self.log_std)
+    def log_prob(self, obs: Tensor, drawn: Tensor) -> Tensor:
+        """log pi(drawn | obs), `(...)`."""
+        return gaussian_log_prob(drawn, *self.distribution(obs))
 
     def entropy(self) -> Tensor:
         """Entropy of pi in nats, the same for all observations; a scalar."""

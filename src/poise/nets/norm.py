@@ -21,6 +21,9 @@ class RunningNorm(nn.Module):
         clip: bound of |y|; infinity for none.
         window: number of samples that are remembered at most, for a stream that drifts; with None
             every sample counts the same for ever.
+
+    With `fixed` set, new samples are ignored: networks that no longer learn keep what they were
+    taught with.
     """
 
     count: Tensor
@@ -31,7 +34,7 @@ class RunningNorm(nn.Module):
 
     def __init__(self, size: int, clip: float = 5.0, window: float | None = None):
         super().__init__()
-        self.clip, self.window = clip, window
+        self.clip, self.window, self.fixed = clip, window, False
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("m2", torch.zeros(size, dtype=torch.float64))
@@ -67,6 +70,8 @@ class RunningNorm(nn.Module):
     @torch.no_grad()
     def merge(self, n_b: float, mean_b: Tensor, m2_b: Tensor) -> None:
         """Merges `n_b` samples of mean `mean_b` and summed squared deviation `m2_b`, `(size)` each."""
+        if self.fixed:
+            return
         # n = n_a + n_b;  d = mean_b - mean_a
         n_a = self.count
         n = n_a + n_b
@@ -83,7 +88,7 @@ class RunningNorm(nn.Module):
     @torch.no_grad()
     def freeze(self) -> None:
         """Takes the gathered statistics into use; without samples it changes nothing."""
-        if float(self.count) == 0:
+        if self.fixed or float(self.count) == 0:
             return
         std = (self.m2 / self.count).sqrt()
         self.shift.copy_(self.mean)
