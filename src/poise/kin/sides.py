@@ -63,8 +63,8 @@ def swap_sides(clip: Clip) -> Clip:
     keys = [(w.side, w.tokens, w.number) for w in words]
     twin = {"left": "right", "right": "left"}
     out = list(names)
-    for j, (side, *rest) in enumerate(keys):
-        other = (twin.get(side, ""), *rest)
+    for j, (side, tokens, number) in enumerate(keys):
+        other = (twin.get(side, ""), tokens, number)
         if side and keys.count(other) == 1 and keys.count(keys[j]) == 1:
             out[j] = names[keys.index(other)]
     note = "The names of left and right joints were exchanged, as stated with --swap-sides"
