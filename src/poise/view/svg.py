@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-COLORS = ("#e0692e", "#3b7ddd", "#7a5cd6", "#1f9d75", "#c2417c", "#8a8f98")
+COLORS = ("#e0692e", "#3b7ddd", "#7a5cd6", "#1f9d75", "#c2417c", "#8a8f98", "#a88a00")
 """One colour per series, in order; readable on white and on near-black."""
 
 _W, _H = 560, 300
@@ -129,7 +129,9 @@ def line_plot(
     x1 = x1 if x1 > x0 else x0 + 1.0
     y0, y1 = _range(ys, zero)
     left, end = 58.0, _W - (58.0 if right else 16.0)
-    up = (12.0 if inline else 62.0) + (34.0 if top else 0.0)
+    # The key has three names a row; from the third row on it pushes the plot down.
+    more = 0.0 if inline else 16.0 * max(0, (len(lines) - 1) // 3 - 1)
+    up = (12.0 if inline else 62.0) + (34.0 if top else 0.0) + more
     down = _H - 46.0
 
     def px(v: Any) -> Any:
