@@ -10,10 +10,19 @@ import torch
 
 import toy_human
 from poise.errors import PoiseError
-from poise.kin import limb_of, match_positions, shortest_arc, two_bone
-from poise.kin.limbs import frame_quat, soft_reach
+from poise.kin import limb_of, match_positions, two_bone
+from poise.kin.limbs import soft_reach
 from poise.motion import read_clip
-from poise.spatial import forward_kinematics, normalize, quat_angle, quat_conj, quat_mul, quat_rotate
+from poise.spatial import (
+    forward_kinematics,
+    frame_quat,
+    normalize,
+    quat_angle,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    shortest_arc,
+)
 
 
 def rand(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -16,7 +16,7 @@ from poise.kin.ik_body import IkBody, ik_body
 from poise.kin.ik_config import CORRECTIONS, IkConfig
 from poise.kin.ik_paper import paper_humanoid
 from poise.kin.ik_polish import PolishConfig, Polished, polish
-from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, shortest_arc, two_bone
+from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
 from poise.kin.retarget import RetargetConfig, retarget
 from poise.kin.retarget_report import RetargetReport
 from poise.kin.sides import swap_sides
@@ -74,7 +74,6 @@ __all__ = [
     "qpos_velocity",
     "relaxed_stance",
     "retarget",
-    "shortest_arc",
     "support_of",
     "swap_sides",
     "two_bone",

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.kin.limbs import shortest_arc
 from poise.kin.standing import Stances, World, hinge_axis, identity, mean_pose, pose_positions, rest_axes
 from poise.motion import Clip, Roles, Skeleton
 from poise.motion.roles import SIDES
@@ -22,6 +21,7 @@ from poise.spatial import (
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
+    shortest_arc,
 )
 
 #: Where a skeleton has no toes: how far ahead of the ankle it treads, and how high such a point and the

@@ -16,12 +16,12 @@ from poise.motion import Skeleton
 from poise.spatial import (
     axis_angle_to_quat,
     forward_kinematics,
-    matrix_to_quat,
     normalize,
     quat_conj,
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
+    shortest_arc,
 )
 
 #: The share of a limb's length over which it slows down before it is straight.
@@ -91,33 +91,6 @@ def soft_reach(distance: Tensor, l1: Tensor, l2: Tensor, soft: float = SOFT) -> 
     s = (soft * length).clamp_min(1e-12)
     eased = length - s * torch.exp(-((distance - length + s) / s).clamp_min(0.0))
     return torch.maximum(torch.where(distance > length - s, eased, distance), (l1 - l2).abs())
-
-
-def shortest_arc(a: Tensor, b: Tensor) -> Tensor:
-    """wxyz `(..., 4)` of the smallest turn that brings direction `a (..., 3)` onto `b`.
-
-    Opposite directions turn by half a turn about some axis across; a zero vector gives the identity.
-    """
-    a, b = normalize(a), normalize(b)
-    dot = (a * b).sum(-1, keepdim=True)
-    # q = (1 + a . b, a x b) normalised
-    turn = torch.cat((1.0 + dot, torch.linalg.cross(a, b)), -1)
-    half = torch.cat((torch.zeros_like(dot), _across(a)), -1)
-    one = torch.zeros_like(turn)
-    one[..., 0] = 1.0
-    known = (a.norm(dim=-1, keepdim=True) > 0.5) & (b.norm(dim=-1, keepdim=True) > 0.5)
-    return normalize(torch.where(known, torch.where(dot < -1.0 + 1e-12, half, turn), one))
-
-
-def frame_quat(axis: Tensor, normal: Tensor) -> Tensor:
-    """wxyz of the frame whose x lies along `axis (..., 3)` and whose z is `normal` made square to it.
-
-    Two such frames of one bone, at rest and now, give its rotation: now * rest^-1.
-    """
-    x = _direction(axis)
-    z = normal - (normal * x).sum(-1, keepdim=True) * x
-    z = torch.where(z.norm(dim=-1, keepdim=True) < 1e-9, _across(x), normalize(z))
-    return matrix_to_quat(torch.stack((x, torch.linalg.cross(z, x), z), -1))
 
 
 def limb_of(skeleton: Skeleton, joint: int | str) -> Limb:

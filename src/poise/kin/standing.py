@@ -12,7 +12,6 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.kin.contacts import contact_labels
-from poise.kin.limbs import shortest_arc
 from poise.motion import Clip, Roles
 from poise.motion.info import sampled
 from poise.motion.roles import SIDES
@@ -25,6 +24,7 @@ from poise.spatial import (
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
+    shortest_arc,
 )
 
 #: Cosine of the largest angle between a limb and where it hangs in a rest pose that a person could hold.
