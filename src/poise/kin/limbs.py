@@ -14,6 +14,7 @@ from poise.body import find_anatomy
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 from poise.spatial import (
+    across,
     axis_angle_to_quat,
     forward_kinematics,
     normalize,
@@ -71,7 +72,7 @@ def two_bone(
     d = soft_reach(line.norm(dim=-1), l1, l2, soft)
     side = pole - (pole * along).sum(-1, keepdim=True) * along
     lost = side.norm(dim=-1, keepdim=True) < 1e-9 * (1.0 + pole.norm(dim=-1, keepdim=True))
-    side = normalize(torch.where(lost, _across(along), side))
+    side = normalize(torch.where(lost, across(along), side))
     a = (l1.square() - l2.square() + d.square()) / (2.0 * d.clamp_min(1e-9))
     a = torch.minimum(torch.maximum(a, -l1), l1)
     h = (l1.square() - a.square()).clamp_min(0.0).sqrt()
@@ -200,7 +201,7 @@ def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor
     own = quat_rotate_inv(upper_quat, cross)
     usual = own.sum(0)
     if float(usual.norm()) < 1e-6 * len(own):
-        usual = _across(quat_rotate_inv(upper_quat, upper)[0])
+        usual = across(quat_rotate_inv(upper_quat, upper)[0])
     usual = normalize(usual).expand_as(own)
     size = own.norm(dim=-1, keepdim=True)
     # Full weight on the moment's own axis from 2 * STRAIGHT on.
@@ -232,12 +233,3 @@ def _direction(v: Tensor) -> Tensor:
     """`v (..., 3)` at unit length; a zero vector points down."""
     down = torch.tensor([0.0, 0.0, -1.0], dtype=v.dtype)
     return torch.where(v.norm(dim=-1, keepdim=True) < 1e-12, down, normalize(v))
-
-
-def _across(v: Tensor) -> Tensor:
-    """Some unit vector `(..., 3)` square to `v (..., 3)`."""
-    x, y, z = v.abs().unbind(-1)
-    # The world axis along which v is smallest is never parallel to it.
-    least = torch.stack((x, y, z), -1).argmin(-1)
-    helper = torch.eye(3, dtype=v.dtype)[least]
-    return normalize(torch.linalg.cross(v, helper))

@@ -127,7 +127,7 @@ def transfer(
     moves = dict((b, a) for a, b in joints.direct)
     shared = _shared(joints, here, there, turned)
     hips = joints.target.joint("hips")
-    above = _above(target, hips if hips is not None else 0)
+    above = target.ancestors(hips if hips is not None else 0)
     world: list[Tensor] = []
     for j, parent in enumerate(target.parents):
         if j in moves:
@@ -158,15 +158,6 @@ def _middle(pos: Tensor, joints: JointMap, side: int) -> Tensor:
     """`(T, 3)` m, the middle between the hip joints of the source (0) or target (1)."""
     pairs = [joints.limb_pair(f"{s}_thigh") for s in ("left", "right")]
     return sum((pos[:, p[side]] for p in pairs if p is not None), torch.zeros(())) / 2
-
-
-def _above(skeleton: Skeleton, joint: int) -> set[int]:
-    out: set[int] = set()
-    joint = skeleton.parents[joint]
-    while joint >= 0:
-        out.add(joint)
-        joint = skeleton.parents[joint]
-    return out
 
 
 def _shared(joints: JointMap, here: CommonPose, there: CommonPose, turned: Tensor) -> dict[int, Tensor]:

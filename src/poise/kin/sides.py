@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from poise.body import Anatomy
 from poise.motion import Clip
 from poise.motion.info import sampled
 from poise.motion.role_words import name_words
+from poise.spatial import quat_rotate
 
 #: Share of frames by which the votes of the geometry must agree before they contradict the names.
 SURE = 0.5
@@ -90,7 +92,7 @@ def _forwards(
         if toe is not None:
             way += _across(pos[:, toe] - pos[:, foot], up)
         elif foot in tips:
-            way += _across(_rotate(quat[:, foot], np.array(tips[foot])), up)
+            way += _across(_world(quat[:, foot], tips[foot]), up)
     if np.linalg.norm(way, axis=-1).max() > 0.01:
         out["feet"] = way
     bend = np.zeros_like(up)
@@ -110,10 +112,10 @@ def _forwards(
     return out
 
 
-def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    u = q[:, 1:]
-    t = 2.0 * np.cross(u, v)
-    return v + q[:, :1] * t + np.cross(u, t)
+def _world(quat: np.ndarray, tip: tuple[float, float, float]) -> np.ndarray:
+    """`(S, 3)` m, a joint's own vector `tip` in the world."""
+    turns = torch.tensor(quat)
+    return quat_rotate(turns, torch.tensor(tip, dtype=turns.dtype).expand(len(turns), 3)).numpy()
 
 
 def _across(v: np.ndarray, up: np.ndarray) -> np.ndarray:

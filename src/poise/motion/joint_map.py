@@ -176,18 +176,10 @@ def _row(j: int, direct: Mapping[int, int], source: Roles, target: Roles) -> Map
 def _check_order(source: Skeleton, target: Skeleton, direct: Mapping[int, int]) -> None:
     """Refuses pairs that turn the hierarchy round."""
 
-    def above(skeleton: Skeleton, joint: int) -> set[int]:
-        out: set[int] = set()
-        joint = skeleton.parents[joint]
-        while joint >= 0:
-            out.add(joint)
-            joint = skeleton.parents[joint]
-        return out
-
     for b, a in direct.items():
-        for b_up in above(target, b) & direct.keys():
+        for b_up in direct.keys() & set(target.ancestors(b)):
             a_up = direct[b_up]
-            if a in above(source, a_up) or a == a_up:
+            if a in source.ancestors(a_up) or a == a_up:
                 raise PoiseError(
                     f"the mapping turns the hierarchy round: '{target.names[b_up]}' carries "
                     f"'{target.names[b]}' in the target, but their '{source.names[a_up]}' hangs below "

@@ -126,6 +126,15 @@ class Skeleton:
         """Indices of the joints whose parent is `joint`."""
         return tuple(j for j, p in enumerate(self.parents) if p == joint)
 
+    def ancestors(self, joint: int) -> tuple[int, ...]:
+        """Indices of the joints above `joint`, its parent first."""
+        out: list[int] = []
+        joint = self.parents[joint]
+        while joint >= 0:
+            out.append(joint)
+            joint = self.parents[joint]
+        return tuple(out)
+
     def rest_positions(self) -> np.ndarray:
         """`(J, 3)` m, joint positions with every rotation at identity and the root at the origin."""
         out = np.zeros((len(self), 3))
