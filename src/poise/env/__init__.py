@@ -1,13 +1,16 @@
 """Environments: imitation as a list of terms over many simulated worlds."""
 
-from poise.env.env import ImitationEnv, TaskConfig
+from poise.env.env import ImitationEnv
 from poise.env.expert import Expert, ExpertConfig, Plan, make_plan
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.gym import GymEnv, GymVectorEnv
+from poise.env.recovery import Recovery
 from poise.env.reference import Reference
+from poise.env.task import EnvStep, TaskConfig
 
 __all__ = [
     "DoneTerm",
+    "EnvStep",
     "Expert",
     "ExpertConfig",
     "Frame",
@@ -16,6 +19,7 @@ __all__ = [
     "ImitationEnv",
     "ObsTerm",
     "Plan",
+    "Recovery",
     "Reference",
     "RewardTerm",
     "TaskConfig",

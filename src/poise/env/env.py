@@ -2,68 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from poise.control import Drive, HelpSchedule, PDTargets, Residual, Wrench
+from poise.control import Drive, Wrench
 from poise.env.budget import HelpBudget
-from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm, placed
+from poise.env.frame import Frame, Pose, placed
 from poise.env.means import Means
 from poise.env.record import TensorFunction, record
+from poise.env.recoveries import Recoveries
+from poise.env.recovery import FALLEN, point_goal, root_distance, toward
 from poise.env.reference import FIELDS, Reference
 from poise.env.starts import Starts
 from poise.env.style import ClipFeatures, ClipWindows
+from poise.env.task import EnvStep, TaskConfig
 from poise.env.terms.evaluate import Seen, Terms, seen_by, sim_pose
 from poise.errors import PoiseError
 from poise.sim import Backend, NanGuard
-
-
-class EnvStep(NamedTuple):
-    """One control step; see `poise.learn.protocols.Step` for what the learner reads in it.
-
-    obs, final_obs `(N, O)`; reward `(N,)`; terminated (failed, or the clip was done to its end),
-    truncated (time-out), failed `(N,)` bool; log: means by name.
-    `obs` lies in a buffer that the next step fills again.
-    """
-
-    obs: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-    final_obs: Tensor
-    log: Mapping[str, float]
-    failed: Tensor
-
-
-@dataclass(frozen=True)
-class TaskConfig:
-    """Imitation as terms.
-
-    obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
-    of residual force, None for plain DeepMimic. help: how its limits change while episodes are
-    counted, which is with auto_reset alone; None leaves them. horizon: control steps until an episode
-    times out. finish: what a clip done to its end is worth, in rewards of its last step; a discount g
-    makes g / (1 - g) of a character that goes on as it ended. first: share of the episodes that begin
-    on their clip's frame 0, as evaluations do. style: what a motion prior sees of a frame, terms that
-    look at `frame.sim` alone, see `ImitationEnv.features`. auto_reset: start a new episode where one
-    ended (off while evaluating).
-    """
-
-    obs: tuple[ObsTerm, ...]
-    rewards: tuple[RewardTerm, ...]
-    dones: tuple[DoneTerm, ...]
-    pd: PDTargets
-    residual: Residual | None = None
-    help: HelpSchedule | None = None
-    horizon: int = 300
-    finish: float = 0.0
-    first: float = 0.0
-    style: tuple[ObsTerm, ...] = ()
-    auto_reset: bool = True
 
 
 class ImitationEnv:
@@ -122,6 +77,10 @@ class ImitationEnv:
         asking = (*task.obs, *task.rewards, *task.dones)
         self._torqued = any(getattr(term.fn, "uses_torque", False) for term in asking)
         self._torques = self._bind_torques()
+        self.recoveries: Recoveries | None = None
+        if task.recovery is not None:
+            self.recoveries = Recoveries(task.recovery, backend, reference.humanoid, task.pd, seed)
+        self._no_table = torch.zeros(n, 0, device=here)
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         self._terms = Terms(*terms, placed(task.style, here), self._frame_of, self._ends, here, fused)
         self.reset_to(self.clip, self.frame)
@@ -150,16 +109,24 @@ class ImitationEnv:
     def weights(self, odds: Tensor) -> None:
         self._starts.weights = odds
 
-    def reset_to(self, clip: Tensor, frame: Tensor) -> Tensor:
+    def reset_to(self, clip: Tensor, frame: Tensor, kind: Tensor | None = None) -> Tensor:
         """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
 
         Frames past the end of a cyclic clip are where its later cycles are.
+
+        kind: `(N,)` kinds of `poise.env.recovery`, in a task with it; None begins tracked episodes.
         """
         self.clip.copy_(clip)
         self.frame.copy_(frame)
         self.age.zero_()
         self.action.zero_()
-        self.backend.write(None, *self.reference.coordinates(self.clip, self.frame))
+        start = self.reference.coordinates(self.clip, self.frame)
+        if self.recoveries is not None:
+            kinds = torch.zeros(self.num_envs, dtype=torch.long) if kind is None else kind
+            start = self.recoveries.begin(slice(None), kinds, *start, self._starts.rng)
+        elif kind is not None:
+            raise PoiseError("this task knows no falls", hint="Set TaskConfig.recovery")
+        self.backend.write(None, *start)
         self._aim()
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
@@ -168,14 +135,25 @@ class ImitationEnv:
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
-        self.backend.write(ids, *self.reference.coordinates(pick, frame))
-        self._goal_rows[ids] = self.reference.rows(pick, frame + 1)
-        self._goal[ids] = self.reference.gather_packed(pick, frame + 1)
+        start, ahead = self.reference.coordinates(pick, frame), frame + 1
+        if self.recoveries is not None:
+            rng = self._starts.rng
+            start = self.recoveries.begin(ids, self.recoveries.draw(len(ids), rng), *start, rng)
+            ahead = self._ahead()[ids]
+        self.backend.write(ids, *start)
+        self._goal_rows[ids] = self.reference.rows(pick, ahead)
+        self._goal[ids] = self.reference.gather_packed(pick, ahead)
 
     def _aim(self) -> None:
         """Looks up where the reference goes from here."""
-        self._goal_rows = self.reference.rows(self.clip, self.frame + 1)
-        self._goal = self.reference.gather_packed(self.clip, self.frame + 1, self._goal_rows)
+        ahead = self._ahead()
+        self._goal_rows = self.reference.rows(self.clip, ahead)
+        self._goal = self.reference.gather_packed(self.clip, ahead, self._goal_rows)
+
+    def _ahead(self) -> Tensor:
+        """`(N,)` frames that the references will be at after the next step."""
+        held = None if self.recoveries is None else self.recoveries.held
+        return self.frame + 1 if held is None else self.frame + 1 - held.long()
 
     # --- stepping -----------------------------------------------------------------------------
 
@@ -193,16 +171,20 @@ class ImitationEnv:
         else:
             self.backend.step(self.substeps)
         self._counts += 1
-        ref = self._goal
-        self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame)
+        ref, held = self._goal, None if self.recoveries is None else self.recoveries.tick(self.frame)
+        self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame, held)
         final, scores, ends, self._style = self._terms.judge(self._seen(ref, self._goal))
         reward, self.imitation, *values = scores.unbind(0)
         self.terms = {t.name: v for t, v in zip(self.task.rewards, values, strict=True)}
         failed, terminated, truncated = ends.unbind(0)
+        if self.recoveries is not None:
+            apart = root_distance(self.reference.unpacked(ref).pos, self.backend.state.xpos[:, 1:])
+            rng = self._starts.rng if self.task.auto_reset else None
+            self.recoveries.judge(ends, apart, self.age >= self.task.horizon, rng)
         if self.task.finish:
             reward = torch.where(terminated & ~failed, reward * (1.0 + self.task.finish), reward)
-        obs = final
-        log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n)
+        obs, more = final, self.recoveries and self.recoveries.shares()
+        log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n, more)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
             self.help.count(len(ids), int(failed.sum()) if len(ids) else 0)
@@ -213,14 +195,18 @@ class ImitationEnv:
                 obs[ids] = self._terms.observe(self._seen(ref, self._goal[ids], ids))
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
 
-    def _ends(self, seen: Seen, failed: Tensor) -> tuple[Tensor, Tensor]:
-        """Which episodes are terminated and which are truncated."""
+    def _ends(self, seen: Seen, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Which episodes failed, are terminated and are truncated."""
         # A clip that is done to its end is a finished task, whose remaining return is stated: as many
         # steps like the last as `finish` says, since with nothing to come the last moments would not
         # matter and characters would fall in them. To bootstrap there would rest on a state whose
         # value is never learned, and the policy comes to exploit it.
-        terminated = failed | (self.reference.place(seen.ref).end > 0)
-        return terminated, (seen.age >= self.task.horizon) & ~terminated
+        done = self.reference.place(seen.ref).end > 0
+        if self.task.recovery is not None:
+            free = seen.recovery[:, 1] == 0
+            failed, done = failed & free, done & free
+        terminated = failed | done
+        return failed, terminated, (seen.age >= self.task.horizon) & ~terminated
 
     def _apply(self) -> None:
         """Turns the action into what drives the characters, held over the control step."""
@@ -287,7 +273,8 @@ class ImitationEnv:
         """What the terms are worked out from, of all worlds or of the worlds `ids`."""
         s = self.backend.state
         fields = s.qpos, s.qvel, s.xpos, s.xquat, s.cvel, s.subtree_com
-        seen = Seen(*fields, *self._torques, ref, ahead, self.action, self.age)
+        table = self._no_table if self.recoveries is None else self.recoveries.table
+        seen = Seen(*fields, *self._torques, ref, ahead, self.action, self.age, table)
         if ids is None:
             return seen
         # The reference is that of the worlds `ids` already.
@@ -298,21 +285,27 @@ class ImitationEnv:
         place, extra = reference.place(seen.ref), seen.action[:, self.hinges :]
         # The hinges' part of the generalized forces, after the root's six.
         torque = (seen.actuator + seen.damper)[:, 6:].float() if self._torqued else None
+        sim, ref = sim_pose(seen, reference.local, self._roots), reference.unpacked(seen.ref)
+        ahead, point, recovery = reference.unpacked(seen.ahead), None, self.task.recovery
+        if recovery is not None:
+            point = point_goal(sim, ref, seen.recovery[:, 2], recovery.switch)
+            ahead = toward(sim, ahead, point.far, recovery.reach)
         return Frame(
-            sim_pose(seen, reference.local, self._roots),
-            reference.unpacked(seen.ref),
-            reference.unpacked(seen.ahead),
+            sim,
+            ref,
+            ahead,
             place.phase,
             extra,
             residual.regularizer(extra) if residual else torch.ones_like(place.phase),
             place.low,
             seen.age,
             torque,
+            point,
         )
 
     def _frame(self) -> Frame:
         """What the terms see of all worlds, from nothing but where they are."""
-        packed = (self.reference.gather_packed(self.clip, self.frame + k) for k in (0, 1))
+        packed = (self.reference.gather_packed(self.clip, k) for k in (self.frame, self._ahead()))
         return self._frame_of(self._seen(*packed))
 
     def _observe(self) -> Tensor:
@@ -340,7 +333,11 @@ class ImitationEnv:
     def past(self, rows: Tensor, count: int) -> Tensor | None:
         """`(n, count, F)` of the clips up to the starts of the new episodes in `rows (n,)`; NaN where a
         clip begins later, None if all do."""
-        return self._clip_features.past(self.clip[rows], self.frame[rows], count)
+        past = self._clip_features.past(self.clip[rows], self.frame[rows], count)
+        if past is not None and self.recoveries is not None:
+            # Whoever lies on the floor has not come there with the clip.
+            past[(self.recoveries.kind[rows] & FALLEN).bool()] = torch.nan
+        return past
 
     def demos(self, frames: int) -> ClipWindows:
         """Draws windows of so many frames of the clips, by the odds with which episodes draw clips."""
@@ -361,6 +358,7 @@ class ImitationEnv:
             "help": self.help.state(),
             "weights": self.weights,
             "rng": self._starts.rng.get_state(),
+            **({} if self.recoveries is None else self.recoveries.state()),
         }
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -373,6 +371,8 @@ class ImitationEnv:
         for name in ("clip", "frame", "age", "action"):
             getattr(self, name).copy_(state[name])
         self.help.load_state(state["help"])
+        if self.recoveries is not None:
+            self.recoveries.load_state(state)
         self._aim()
         if "weights" in state:  # States of former versions are without; their odds never changed.
             self.weights = state["weights"]

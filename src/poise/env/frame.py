@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -51,6 +51,18 @@ class LazyPose(Pose):
         return value
 
 
+class PointGoal(NamedTuple):
+    """Where the reference's root is from the character's, in a task with recovery.
+
+    far `(N,)` bool: so far away that the goal is a point. distance, before `(N,)` m: between the roots,
+    now and one control step earlier.
+    """
+
+    far: Tensor
+    distance: Tensor
+    before: Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """Everything that a term may use; tensors only.
@@ -60,7 +72,8 @@ class Frame:
     residual `(N, k)`: unscaled residual action of the last step. reg `(N,)`: its regularizer.
     min_height `(N,)` m: lowest root height of the reference clip.
     age `(N,)`: control steps since the episode began. torque `(N, n)` N m: what servos and damping
-    exert on each hinge at the end of the step, where a term asks for it (`uses_torque`).
+    exert on each hinge at the end of the step, where a term asks for it (`uses_torque`). point: how far
+    the character is, in a task with recovery; `ahead` is a point there for those who are far.
     """
 
     sim: Pose
@@ -72,6 +85,7 @@ class Frame:
     min_height: Tensor
     age: Tensor | None = None
     torque: Tensor | None = None
+    point: PointGoal | None = None
 
 
 TermFunction = Callable[..., Tensor]
@@ -100,7 +114,8 @@ class RewardTerm:
     weight: above 0 for a reward, whose values lie in [0, 1]; below 0 for a cost, whose values are at
     least 0 and have a unit of their own, such as W.
     imitation: whether the term counts for the imitation reward that is reported (regularizers and costs
-    do not).
+    do not). when: always, or in a task with recovery only near the reference or far from it; elsewhere
+    it is 0. Without recovery all are near.
     """
 
     name: str
@@ -108,6 +123,7 @@ class RewardTerm:
     weight: float
     params: Mapping[str, Any] = field(default_factory=dict)
     imitation: bool = True
+    when: Literal["always", "near", "far"] = "always"
 
     def __post_init__(self) -> None:
         if self.weight < 0 and self.imitation:

@@ -12,24 +12,30 @@ from poise.control import Wrench
 
 class Means(Mapping[str, float]):
     """Means over the worlds: "reward/NAME" of every term, "imitation", the help in N and N m,
-    and the limit of its force in N.
+    the limit of its force in N, and whatever `more` there is.
 
     All of them come by one pass and one wait for the numbers, at the first that is read.
     """
 
     def __init__(
-        self, terms: Mapping[str, Tensor], imitation: Tensor, wrench: Wrench | None, limit_n: float
+        self,
+        terms: Mapping[str, Tensor],
+        imitation: Tensor,
+        wrench: Wrench | None,
+        limit_n: float,
+        more: Mapping[str, Tensor] | None = None,
     ):
-        self._parts = terms, imitation, wrench, limit_n
+        self._parts = terms, imitation, wrench, limit_n, more or {}
         self._values: dict[str, float] | None = None
 
     def _read(self) -> dict[str, float]:
         if self._values is None:
-            terms, imitation, wrench, limit_n = self._parts
+            terms, imitation, wrench, limit_n, more = self._parts
             rows = {**{f"reward/{name}": value for name, value in terms.items()}, "imitation": imitation}
             if wrench is not None:
                 rows["help/force_n"] = wrench.force.norm(dim=-1).sum(-1)
                 rows["help/torque_nm"] = wrench.torque.norm(dim=-1).sum(-1)
+            rows.update(more)
             means = torch.stack(list(rows.values())).mean(-1).tolist()
             self._values = dict(zip(rows, means, strict=True))
             if wrench is not None:

@@ -182,12 +182,19 @@ class Reference:
         """Packed poses of `rows (N)` as they stand in their clips."""
         return self._packed.index_select(0, rows)
 
-    def follow(self, rows: Tensor, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """The row after each of `rows (N)`, and its packed pose; it is frame `frame + 1` of `clip`."""
-        rows = self._after.index_select(0, rows)
+    def follow(
+        self, rows: Tensor, clip: Tensor, frame: Tensor, held: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The row after each of `rows (N)`, and its packed pose; it is frame `frame + 1` of `clip`.
+
+        held: `(N)` bool, where the rows stay and are frame `frame`.
+        """
+        after = self._after.index_select(0, rows)
+        rows = after if held is None else torch.where(held, rows, after)
         if not self.any_cyclic:
             return rows, self._packed.index_select(0, rows)
-        return rows, self.gather_packed(clip, frame + 1, rows)
+        ahead = frame + 1 if held is None else frame + 1 - held.long()
+        return rows, self.gather_packed(clip, ahead, rows)
 
     def unpacked(self, packed: Tensor) -> Pose:
         """The poses whose numbers are the rows of `packed (N, W)`, as views of it."""

@@ -22,7 +22,8 @@ class Seen(NamedTuple):
 
     actuator, damper: what servos and joint damping exert, `(N, 0)` where no term asks for torques.
     ref, ahead: packed reference poses now and one control step later, see `Reference`. action
-    `(N, A)`: the last one. age `(N)`: control steps since the episode began.
+    `(N, A)`: the last one. age `(N)`: control steps since the episode began. recovery: the table of
+    `Recoveries`, `(N, 0)` in a task without.
     """
 
     qpos: Tensor
@@ -37,6 +38,7 @@ class Seen(NamedTuple):
     ahead: Tensor
     action: Tensor
     age: Tensor
+    recovery: Tensor
 
 
 def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Pose:
@@ -87,7 +89,8 @@ class Terms:
     Args:
         frame: what the terms see, made of `Seen`.
         style: what a motion prior sees, none for none.
-        ends: which episodes are terminated and which are truncated, by what was seen and what failed.
+        ends: which episodes failed, are terminated and truncated, by what was seen and what the terms
+            call a failure.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
 
@@ -98,7 +101,7 @@ class Terms:
         dones: tuple[DoneTerm, ...],
         style: tuple[ObsTerm, ...],
         frame: Callable[[Seen], Frame],
-        ends: Callable[[Seen, Tensor], tuple[Tensor, Tensor]],
+        ends: Callable[[Seen, Tensor], tuple[Tensor, Tensor, Tensor]],
         device: torch.device,
         fused: bool = True,
     ):
@@ -108,6 +111,9 @@ class Terms:
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
         shares = [[t.weight, t.weight * t.imitation] for t in rewards]
         self._weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(device)
+        # Which terms count near the reference and which far from it.
+        counts = [[t.when != "far", t.when != "near"] for t in rewards]
+        self._near, self._far = torch.tensor(counts).reshape(-1, 2, 1).to(device).unbind(1)
         self._recorded: dict[str, TensorFunction] = {}
         self._pool: ThreadPoolExecutor | None = None
 
@@ -144,11 +150,13 @@ class Terms:
         frame = self.frame(all_seen)
         rewards = [term.fn(frame, **term.params) for term in self.rewards]
         values = torch.stack(rewards or [frame.phase])[: len(rewards)]
+        if frame.point is not None:
+            values = torch.where(torch.where(frame.point.far, self._far, self._near), values, 0.0)
         failed = torch.zeros_like(frame.phase, dtype=torch.bool)
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         scores = torch.cat((self._weights @ values, values))
-        ends = torch.stack((failed, *self.ends(all_seen, failed)))
+        ends = torch.stack(self.ends(all_seen, failed))
         return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
 
     def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:

@@ -1,0 +1,68 @@
+"""What a task is made of, and what one of its control steps gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+from poise.control import HelpSchedule, PDTargets, Residual
+from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
+from poise.env.recovery import Recovery
+from poise.errors import PoiseError
+
+
+class EnvStep(NamedTuple):
+    """One control step; see `poise.learn.protocols.Step` for what the learner reads in it.
+
+    obs, final_obs `(N, O)`; reward `(N,)`; terminated (failed, or the clip was done to its end),
+    truncated (time-out), failed `(N,)` bool; log: means by name.
+    `obs` lies in a buffer that the next step fills again.
+    """
+
+    obs: Tensor
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    final_obs: Tensor
+    log: Mapping[str, float]
+    failed: Tensor
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """Imitation as terms.
+
+    obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
+    of residual force, None for plain DeepMimic. help: how its limits change while episodes are
+    counted, which is with auto_reset alone; None leaves them. horizon: control steps until an episode
+    times out. finish: what a clip done to its end is worth, in rewards of its last step; a discount g
+    makes g / (1 - g) of a character that goes on as it ended. first: share of the episodes that begin
+    on their clip's frame 0, as evaluations do. style: what a motion prior sees of a frame, terms that
+    look at `frame.sim` alone, see `ImitationEnv.features`. auto_reset: start a new episode where one
+    ended (off while evaluating). recovery: falls and getting up, being far and coming back as part of
+    the episodes, see `poise.env.recovery`; None for episodes that begin and stay on their clip.
+    """
+
+    obs: tuple[ObsTerm, ...]
+    rewards: tuple[RewardTerm, ...]
+    dones: tuple[DoneTerm, ...]
+    pd: PDTargets
+    residual: Residual | None = None
+    help: HelpSchedule | None = None
+    horizon: int = 300
+    finish: float = 0.0
+    first: float = 0.0
+    style: tuple[ObsTerm, ...] = ()
+    auto_reset: bool = True
+    recovery: Recovery | None = None
+
+    def __post_init__(self) -> None:
+        lost = [r.name for r in self.rewards if r.when == "far"]
+        if lost and self.recovery is None:
+            raise PoiseError(
+                f"the reward '{lost[0]}' counts far from the reference alone, and nobody is ever far",
+                hint="Set TaskConfig.recovery, for instance to Recovery.phc()",
+            )
