@@ -42,6 +42,10 @@ class Recoveries:
             self._falls = fall_states(*self._made_with, self.config.drop, self.seed)
         return self._falls
 
+    def drop_anew(self, seed: int) -> None:
+        """Lets others fall when the fallen are next needed, those of `seed`."""
+        self.seed, self._falls = seed, None
+
     @property
     def kind(self) -> Tensor:
         """`(N,)` bits of each episode's kind."""
@@ -146,4 +150,4 @@ class Recoveries:
             return
         self.table.copy_(state["recovery"])
         if int(state["falls"]) != self.seed:
-            self.seed, self._falls = int(state["falls"]), None
+            self.drop_anew(int(state["falls"]))

@@ -1,0 +1,203 @@
+"""Does a character get up and come back? Recovery as Perpetual Humanoid Control tables it (Sec. 4.2).
+
+The paper starts 1,000 trials fallen, 3 m away, or both, against one clip of standing still, and counts
+those that reach the reference within 5 and 10 s. It does not say what reaching is. Here the bodies are
+on average within `near` m of their reference, and stay there for `held` s from then on; `held` s are
+simulated longer than the times asked for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from poise.env import ImitationEnv, Recovery, TaskConfig
+from poise.env.recovery import FALLEN, FAR
+from poise.errors import PoiseError
+from poise.eval.episodes import Acts
+
+#: The fail-states by name.
+KINDS: Mapping[str, int] = {"fallen": FALLEN, "far": FAR, "fallen and far": FALLEN | FAR}
+
+#: Table 4 of the paper: shares that are back within 5 and within 10 s.
+PHC_RECOVERY: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "PHC": {"fallen": (0.950, 0.988), "far": (0.837, 0.995), "fallen and far": (0.934, 0.988)},
+    "PHC keypoints": {
+        "fallen": (0.925, 0.946),
+        "far": (0.951, 0.960),
+        "fallen and far": (0.794, 0.932),
+    },
+}
+#: The times of that table, s.
+SECONDS = (5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """The trials of one kind.
+
+    kind: of `KINDS`. trials: how many. within: share that was back, of each of the card's times. median
+    and slowest: s until back, of those who came back at all; NaN if nobody did.
+    """
+
+    kind: str
+    trials: int
+    within: tuple[float, ...]
+    median: float
+    slowest: float
+
+
+@dataclass(frozen=True)
+class RecoveryCard:
+    """Recovery against one reference.
+
+    method: what was tried. reference: the clip, and frame its frame. seconds: the times. near, held:
+    what reaching is, m and s. distance: m from the reference where far trials begin. seed: of all draws.
+    """
+
+    method: str
+    reference: str
+    frame: int
+    seconds: tuple[float, ...]
+    near: float
+    held: float
+    distance: tuple[float, float]
+    seed: int
+    rows: tuple[Recovered, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON data; what is not a number is null."""
+        data = asdict(self)
+        for row in data["rows"]:
+            row.update({k: None for k in ("median", "slowest") if math.isnan(row[k])})
+        return data
+
+    def to_markdown(self) -> str:
+        """A table with the paper's rows beneath its own."""
+        times = [f"Succ-{s:g}s" for s in self.seconds]
+        kinds = [r.kind for r in self.rows]
+        head = ["method", "trials", *(f"{kind} {time}" for kind in kinds for time in times)]
+        own = [self.method, str(max(r.trials for r in self.rows))]
+        lines = [head, ["---"] * len(head), [*own, *(_share(x) for r in self.rows for x in r.within)]]
+        for name, told in PHC_RECOVERY.items():
+            found = [dict(zip(SECONDS, told.get(k, ()), strict=False)) for k in kinds]
+            cells = [_share(f.get(s, math.nan)) for f in found for s in self.seconds]
+            lines.append([f"{name} (table 4)", "1000", *cells])
+        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        low, high = self.distance
+        where = f"{low:g} m" if low == high else f"{low:g} to {high:g} m"
+        return (
+            f"{table}\n\nReference: {self.reference} from frame {self.frame}. Back: bodies on average "
+            f"within {self.near:g} m for {self.held:g} s. Far: {where} away. The paper does not say "
+            "what counts as back; its clip stands still.\n"
+        )
+
+
+def trial_task(task: TaskConfig, distance: float = 3.0, falls: int = 1000) -> TaskConfig:
+    """The task in which recovery is tried: far is exactly `distance` m, and nothing ends or begins anew.
+
+    falls: different fallen characters. The rest of `task.recovery` stays: a policy must see a point goal
+    where it learned to; a task without recovery gets the paper's.
+    """
+    recovery = task.recovery or Recovery.phc()
+    drop = replace(recovery.drop, count=falls)
+    recovery = replace(recovery, distance=(distance, distance), by_area=False, drop=drop)
+    return replace(task, auto_reset=False, recovery=recovery)
+
+
+def recovery_card(
+    make_env: Callable[[int], ImitationEnv],
+    policy: Acts,
+    trials: int = 1000,
+    *,
+    method: str = "",
+    clip: int = 0,
+    frame: int = 0,
+    kinds: Sequence[str] = tuple(KINDS),
+    seconds: Sequence[float] = SECONDS,
+    near: float = 0.5,
+    held: float = 0.5,
+    seed: int = 4242,
+    at_once: int = 250,
+) -> RecoveryCard:
+    """Trials of every kind with a deterministic policy.
+
+    Args:
+        make_env: gives an environment of N worlds with a `trial_task`.
+        clip, frame: where the reference starts. One that stands still is the paper's; a clip that ends
+            before the trials goes on standing on its last frame. It waits for the fallen as in training.
+        near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
+        at_once: trials that are simulated side by side.
+
+    Raises:
+        PoiseError: a kind that there is not, a clip that there is not, or a task without recovery.
+    """
+    unknown = [k for k in kinds if k not in KINDS]
+    if unknown or not kinds or trials < 1 or not seconds:
+        what = f"there is no fail-state '{unknown[0]}'" if unknown else "nothing is asked for"
+        raise PoiseError(what, "recovery", f"Fail-states are {', '.join(KINDS)}")
+    env = make_env(min(trials, at_once))
+    try:
+        if env.recoveries is None or env.task.auto_reset:
+            raise PoiseError("the task is none for trials of recovery", hint="Make it with trial_task")
+        if not 0 <= clip < len(env.reference.names):
+            raise PoiseError(f"there is no clip {clip}, they are 0 to {len(env.reference.names) - 1}")
+        env.reseed(seed)
+        env.recoveries.drop_anew(seed)
+        rate, rows = env.reference.rate_hz, []
+        stay = max(1, math.ceil(held * rate))
+        steps = math.ceil(max(seconds) * rate) + stay - 1
+        for kind in kinds:
+            parts = -(-trials // env.num_envs)
+            apart = [_trial(env, policy, clip, frame, KINDS[kind], steps) for _ in range(parts)]
+            back = back_after(torch.cat(apart)[:trials] < near, stay) / rate
+            rows.append(_row(kind, back, seconds))
+        name, distance = env.reference.names[clip], env.recoveries.config.distance
+    finally:
+        env.close()
+    times = tuple(float(s) for s in seconds)
+    return RecoveryCard(method, name, frame, times, near, held, distance, seed, tuple(rows))
+
+
+def write_recovery(card: RecoveryCard, path: Path) -> None:
+    """Writes the card as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(card.to_dict(), indent=2) + "\n", encoding="utf-8")
+
+
+def back_after(near: Tensor, stay: int) -> Tensor:
+    """First steps `(E,)` from which `near (E, T)` holds for `stay` steps, counted from 1; inf: none."""
+    if near.shape[1] < stay:
+        return torch.full((len(near),), math.inf)
+    runs = near.unfold(1, stay, 1).all(-1)
+    first = runs.int().argmax(1) + 1
+    return torch.where(runs.any(1), first.double(), math.inf)
+
+
+def _trial(env: ImitationEnv, policy: Acts, clip: int, frame: int, kind: int, steps: int) -> Tensor:
+    """Mean distance of the bodies from their reference after each step, m `(N, steps)` on the CPU."""
+    many = env.clip.new_ones(env.num_envs)
+    obs = env.reset_to(clip * many, frame * many, kind * many)
+    apart = []
+    for _ in range(steps):
+        obs = env.step(policy.act(obs)).final_obs
+        ref = env.reference.gather(env.clip, env.frame)
+        apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+    return torch.stack(apart, 1)
+
+
+def _row(kind: str, back: Tensor, seconds: Sequence[float]) -> Recovered:
+    came = back[back.isfinite()]
+    within = tuple(float((back <= s + 1e-9).double().mean()) for s in seconds)
+    median, slowest = (float(came.median()), float(came.max())) if len(came) else (math.nan, math.nan)
+    return Recovered(kind, len(back), within, median, slowest)
+
+
+def _share(x: float) -> str:
+    return "" if math.isnan(x) else f"{100 * x:.1f} %"
