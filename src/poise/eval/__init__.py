@@ -1,5 +1,6 @@
 """Evaluation: padded rollouts in, a score card with stable keys out."""
 
+from poise.eval.clip_figures import clip_figures
 from poise.eval.episodes import Recording, run_episodes, shapes_of, start_frames
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.scorecard import Help, ScoreCard, read_score, score_rollouts, write_score
@@ -13,6 +14,7 @@ __all__ = [
     "Row",
     "ScoreCard",
     "Threshold",
+    "clip_figures",
     "read_score",
     "run_episodes",
     "score_rollouts",
