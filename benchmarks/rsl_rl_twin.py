@@ -7,9 +7,9 @@ Writes FILE.json (both learning curves, samples/s, settings, versions) and FILE.
 samples). What is compared is the deterministic policy from 64 start frames to the clip's end, since
 rsl_rl learns how much noise it explores with and the reward of training depends on that. Each learner
 runs alone, one after the other, in turns of `--seeds` seeds; the worlds, their seeds, the rewards,
-horizon, minibatches, epochs, networks, first noise and discount are the same. What rsl_rl does in another
-way stays its own: one learning rate for both networks, clipped value loss, no scaled returns, learned
-noise. `--rsl-lr adaptive` lets it choose the rate by its KL rule.
+horizon, minibatches, epochs, networks, first noise and discount are the same. What rsl_rl does in
+another way stays its own: one learning rate for both networks, clipped value loss, no scaled returns,
+learned noise. `--rsl-lr adaptive` lets it choose the rate by its KL rule.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from poise.recipes.residual_force import ResidualForce, build
 from poise.recipes.session import evaluate
 from poise.view.svg import line_plot
 
-#: Samples, seconds of training; of the deterministic policy Succ, reward per step, joint error in mm; and
-#: the reward of the last training step, noise included.
+#: Samples, seconds of training; of the deterministic policy Succ, reward per step, joint error in mm;
+#: and the reward of the last training step, noise included.
 Curve = list[tuple[int, float, float, float, float, float]]
 
 
