@@ -10,7 +10,6 @@ import torch
 
 from poise.body import BodyTable, generate_table
 from poise.kin import anatomy_of, hold_feet, lowest_height
-from poise.kin.hold import _correction, _Sole
 from poise.kin.support import Support
 from poise.metrics import foot_slide
 from poise.motion import Clip, read_clip
@@ -113,42 +112,3 @@ def test_the_walk_is_the_same_walk(walk: Clip, table: BodyTable) -> None:
 def test_a_clip_of_two_frames_comes_back(walk: Clip, table: BodyTable) -> None:
     short = walk.replaced(root_pos=walk.root_pos[:2], rot=walk.rot[:2])
     assert hold_feet(short, table)[0] is short
-
-
-def test_the_banded_solution_is_that_of_the_plain_least_squares() -> None:
-    rng = np.random.default_rng(0)
-    frames, fps = 12, 30.0
-    ankle = torch.tensor(rng.normal(size=(frames, 3)))
-    ends = ankle[:, None] + torch.tensor(rng.normal(size=(frames, 2, 3)))
-    weight = rng.uniform(size=(frames - 1, 2))
-    shift, turn = _correction(_Sole(0, 0, ankle, ends), weight, fps)
-    from poise.kin.hold import RETURN_PER_S, SMOOTH_S
-
-    length = float((ends[0, 1] - ends[0, 0])[:2].norm())
-    length = float(np.linalg.norm((ends[0, 1] - ends[0, 0]).numpy()))
-    rows, want = [], []
-    arm = (ends - ankle[:, None]).numpy()[..., :2]
-    for t in range(frames - 1):
-        for p in range(2):
-            v = (ends[t + 1, p] - ends[t, p]).numpy()[:2] * fps
-            r = 0.5 * (arm[t, p] + arm[t + 1, p]) / length
-            for axis, across in ((0, -r[1]), (1, r[0])):
-                row = np.zeros((frames, 3))
-                row[t, axis], row[t + 1, axis] = -fps, fps
-                row[t, 2], row[t + 1, 2] = -fps * across, fps * across
-                rows.append(np.sqrt(weight[t, p]) * row.ravel())
-                want.append(-np.sqrt(weight[t, p]) * v[axis])
-    for k in range(3):
-        for t in range(frames):
-            row = np.zeros((frames, 3))
-            row[t, k] = RETURN_PER_S
-            rows.append(row.ravel())
-            want.append(0.0)
-            if 0 < t < frames - 1:
-                row = np.zeros((frames, 3))
-                row[t - 1, k], row[t, k], row[t + 1, k] = 1, -2, 1
-                rows.append(SMOOTH_S * fps**2 * row.ravel())
-                want.append(0.0)
-    x = np.linalg.lstsq(np.array(rows), np.array(want), rcond=None)[0].reshape(frames, 3)
-    assert np.abs(shift - x[:, :2]).max() < 1e-9
-    assert np.abs(turn - x[:, 2] / length).max() < 1e-9
