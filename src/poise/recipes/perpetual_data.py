@@ -94,9 +94,8 @@ def library_of(
             tell(f"{k} of {len(read)} clips placed")
     report = LibraryReport(tuple(notes[f.name] for f in files), target.words, fps)
     if not clips:
-        raise PoiseError(
-            f"none of its {len(files)} clips can be used", str(sources), report.sentences()[1]
-        )
+        what = f"none of the {len(files)} clips can be used"
+        raise PoiseError(what, hint=report.clips[-1].sentence())
     if store is not None:
         tensors, packed = pack_clips(clips)
         save_checkpoint(store, tensors, {"clips": packed, "report": report.to_dict()})
