@@ -1,6 +1,6 @@
 """A captured walk, a salsa of 43 joints and a DeepMimic clip through `poise imitate` and back.
 
-    python benchmarks/round_trip.py --data FOLDER [--minutes 5 30 4] [--work DIR]
+    python benchmarks/round_trip.py --data FOLDER [--minutes 5 25 4] [--work DIR]
 
 Foot slide and penetration of the input, of the simulation and of the written motion, with the
 character's own soles. Runs are kept in `--work` and go on where they stopped. Writes round_trip.json and
@@ -79,7 +79,7 @@ def main() -> None:
     """Runs what has not been run, writes what is there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, nargs=3, default=(5.0, 30.0, 4.0))
+    parser.add_argument("--minutes", type=float, nargs=3, default=(5.0, 25.0, 4.0))
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path("runs/round_trip"))
     args = parser.parse_args()
