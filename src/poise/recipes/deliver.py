@@ -92,7 +92,7 @@ def deliver(
     card = replace(evaluation.card, delivered=tuple(figures))
     paths["score"] = write_score(card, out / "score.json")
     paths["report"] = out / "report.html"
-    report = make_report(imitation, evaluation, curve)
+    report = make_report(imitation, replace(evaluation, card=card), curve)
     write_report(replace(report, notes=(*report.notes, *notes)), paths["report"])
     return Delivery(paths, card, tuple(notes))
 
