@@ -1,0 +1,178 @@
+"""A run of the perpetual controller in a folder: begun, trained to its end, evaluated, opened again.
+
+run/
+    run.safetensors         the clips and the settings, all that the run needs to be rebuilt
+    checkpoint.safetensors  the stage in progress with everything that decides what comes next
+    primitive-K.safetensors each primitive as it was when its stage ended
+    policy.safetensors      the policy of the finished run
+    log.csv, success.csv    the learning curve; every evaluation of every clip
+    result.json             what the finished run came to, without help
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from poise import __version__
+from poise.errors import PoiseError
+from poise.learn import Until, load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import write_atomic
+from poise.learn.run import interruptible
+from poise.motion import ClipLibrary
+from poise.motion.pack import pack_clips, unpack_clips
+from poise.recipes.expert import Beginning
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import RECIPE, Perpetual, build, from_json, to_json
+from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
+from poise.recipes.perpetual_stages import Course, Progress
+from poise.recipes.session import FINAL, RUN_FILE
+
+RESULT = "result.json"
+
+
+@dataclass(frozen=True, eq=False)
+class PerpetualResult:
+    """How a training ended.
+
+    last: the last iteration, None where nothing was left to do. interrupted: by Ctrl-C; then there is no
+    `results`, which are those of the finished policy on every clip, without help. solved: nothing
+    failed any more before the time was over. primitives: how many were trained.
+    """
+
+    last: Progress | None
+    interrupted: bool
+    solved: bool
+    primitives: int
+    results: ClipResults | None
+
+
+def begin(
+    folder: Path, library: ClipLibrary, config: Perpetual, device: str = "cpu", least: int = 2
+) -> Imitation:
+    """Builds the task and writes the run file; a folder that holds another run is refused.
+
+    Raises:
+        PoiseError: fewer clips than `least`, another run in the folder, or not enough memory.
+    """
+    if len(library) < least:
+        raise PoiseError(
+            f"a library needs at least {least} clips, got {len(library)}",
+            hint="Use poise imitate for a single clip",
+        )
+    path, said = folder / RUN_FILE, to_json(config)
+    tensors, notes = pack_clips(library.clips)
+    notes = json.loads(json.dumps(notes))
+    if path.exists():
+        _check_same(folder, said, notes)
+    imitation = build(library, config)
+    imitation.check_room(config.num_envs, device)
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        meta = {"kind": "run", "recipe": RECIPE["name"], "config": said, "clips": notes}
+        save_checkpoint(path, tensors, {**meta, "character": imitation.humanoid.identity})
+    return imitation
+
+
+def _check_same(folder: Path, config: dict[str, Any], clips: list[dict[str, Any]]) -> None:
+    _, meta = load_checkpoint(folder / RUN_FILE)
+    if meta.get("recipe") != RECIPE["name"]:
+        raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
+    found = meta["config"]
+    if found != config:
+        names = sorted(k for k in config if found.get(k) != config[k])
+        raise PoiseError(
+            f"the folder holds a run with other settings ({', '.join(names)})",
+            folder,
+            "Resume it as it is or choose another folder",
+        )
+    if meta["clips"] != clips:
+        raise PoiseError(
+            f"the folder holds a run of other clips ({len(meta['clips'])}, here are {len(clips)})",
+            folder,
+            "Give the library it was begun with, or choose another folder",
+        )
+
+
+def reopen(folder: Path) -> Imitation:
+    """The task of an existing run, rebuilt from its folder alone."""
+    tensors, meta = load_checkpoint(folder / RUN_FILE)
+    library = ClipLibrary(tuple(unpack_clips(tensors, meta["clips"])))
+    return build(library, from_json(meta["config"]))
+
+
+def train(
+    imitation: Imitation,
+    folder: Path,
+    until: Until,
+    on_iteration: Callable[[Progress], bool | None] | None = None,
+    threads: int = 0,
+    tensorboard: bool = True,
+    device: str = "cpu",
+    beginning: Beginning | None = None,
+    save_s: float = 30.0,
+) -> PerpetualResult:
+    """Trains all stages, or goes on with them, until nothing fails or a limit is reached.
+
+    Args:
+        until: limits of all stages together, over all resumed runs.
+        on_iteration: called after each; returning False ends the call as Ctrl-C does.
+        device: "cpu" or "cuda"; no part of the run.
+        save_s: seconds between checkpoints, beside those at evaluations.
+
+    Ctrl-C ends it after the present iteration with a checkpoint, a second one at once.
+    """
+    course = Course(imitation, folder, until, threads, device, tensorboard, beginning, save_s)
+    last, asked = None, False
+    try:
+        if not (course.finished or course.share >= 1):
+            # What is in it is no longer the policy of a finished run.
+            for name in (FINAL, RESULT):
+                (folder / name).unlink(missing_ok=True)
+        with interruptible() as interrupt:
+            while not (course.finished or course.share >= 1 or interrupt.is_set() or asked):
+                last = course.iterate()
+                try:
+                    asked = on_iteration is not None and on_iteration(last) is False
+                except KeyboardInterrupt:
+                    interrupt.set()
+            interrupted = asked or interrupt.is_set()
+        if last is not None:
+            course.save()
+        stopped = interrupted and not course.finished and course.share < 1
+        results = None if stopped else finish(course)
+        return PerpetualResult(last, stopped, course.finished, course.primitives, results)
+    finally:
+        course.close()
+
+
+def finish(course: Course) -> ClipResults:
+    """The policy as a file, and what it does with every clip, without help, as `result.json`."""
+    policy, t, imitation = course.policy(), course.trainer, course.imitation
+    facts = {
+        "method": imitation.config.method, "seed": imitation.config.seed, "stage": course.stage.name,
+        "primitives": course.primitives, "solved": course.finished, "iterations": course.iteration,
+    }  # fmt: skip
+    cost = {"samples": t.samples, "seconds": round(t.seconds, 1)}
+    results = evaluate_clips(imitation, policy, None, 0.0, course.threads, course.device)
+    course.history.add(course.iteration, FINAL_STAGE, 0.0, results)
+    policy.save(course.folder / FINAL, t.character, facts | cost)
+    names, owner = imitation.library.names, course.owner.tolist()
+    rows = [
+        {
+            "clip": names[c], "succeeded": bool(results.succeeded[k]), "frames": int(results.frames[k]),
+            "tracked": int(results.tracked[k]), "mpjpe_mm": round(float(results.mpjpe_mm[k]), 3),
+            "mpjpe_global_mm": round(float(results.global_mm[k]), 3), "primitive": owner[c] + 1,
+        }
+        for k, c in enumerate(results.clip.tolist())
+    ]  # fmt: skip
+    said = facts | cost | {
+        "version": __version__, "help_n": 0.0, "succ": results.rate, "clips": len(rows),
+        "mpjpe_global_mm": round(results.error_mm, 3),
+        "hardest": [names[c] for c in results.hardest(20)], "per_clip": rows,
+    }  # fmt: skip
+    write_atomic(course.folder / RESULT, json.dumps(said, indent=2, allow_nan=False).encode())
+    return results
