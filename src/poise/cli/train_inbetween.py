@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Network:
-    """What only the recipe inbetween knows."""
+    """What only the recipe inbetween knows, and the folder that others learn from, too."""
 
     library: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """inbetween: the folder of clips of one skeleton to learn from."""
+    """inbetween, perpetual: the folder of clips to learn from."""
     net: Literal["transformer", "rtn"] = "transformer"
     """inbetween: the network; rtn is that of Harvey et al. 2020."""
     hold_out: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None

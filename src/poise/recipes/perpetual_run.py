@@ -26,6 +26,7 @@ from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
+from poise.recipes.inbetween_data import motion_files, of_one_skeleton, read_all
 from poise.recipes.perpetual import RECIPE, Perpetual, build, from_json, to_json
 from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
 from poise.recipes.perpetual_stages import Course, Progress
@@ -48,6 +49,25 @@ class PerpetualResult:
     solved: bool
     primitives: int
     results: ClipResults | None
+
+
+def clips_of(
+    folder: Path, config: Perpetual, tell: Callable[[str], None] = lambda _: None
+) -> tuple[ClipLibrary, tuple[str, ...]]:
+    """The clips of a folder on one skeleton, and sentences on what was left out or changed.
+
+    Raises:
+        PoiseError: no clip can be used.
+    """
+    clips, notes = read_all(motion_files(folder), tell)
+    clips, notes = of_one_skeleton(clips, notes)
+    # Files of different folders may have one name.
+    seen: dict[str, int] = {}
+    named = []
+    for clip in clips:
+        seen[clip.name] = count = seen.get(clip.name, 0) + 1
+        named.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
+    return ClipLibrary.of(named), notes
 
 
 def begin(
