@@ -2,7 +2,7 @@
 
 from poise.control.drive import Drive
 from poise.control.inverse import ContactRule, InverseDynamics, inverse_dynamics, step_midpoints
-from poise.control.pd import PDTargets, stable_pd_torque
+from poise.control.pd import PDTargets, range_scale, stable_pd_torque
 from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
 from poise.control.schedule import HelpSchedule, LinearHelp, SuccessHelp
 from poise.control.touch import ClearanceRule, clearance
@@ -22,6 +22,7 @@ __all__ = [
     "Wrench",
     "clearance",
     "inverse_dynamics",
+    "range_scale",
     "stable_pd_torque",
     "step_midpoints",
 ]

@@ -17,11 +17,12 @@ class PDTargets:
 
     mode: "additive" u = q_ref + scale * a (RFC Sec. 5, the reference of the NEXT frame);
         "absolute" u = offset + scale * a (RFC Sec. 3).
-    scale: rad per unit of action. offset: `(n)` rad, used by "absolute" only (zeros if None).
+    scale: rad per unit of action, one for all hinges or `(n)`, see `range_scale`.
+    offset: `(n)` rad, used by "absolute" only (zeros if None, as in PHC).
     """
 
     mode: str = "additive"
-    scale: float = 1.0
+    scale: float | Tensor = 1.0
     offset: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -31,8 +32,18 @@ class PDTargets:
     def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""
         base = q_ref_next if self.mode == "additive" else self.offset
-        target = action if self.scale == 1.0 else action * self.scale
+        scale = self.scale.to(action) if isinstance(self.scale, Tensor) else self.scale
+        plain = not isinstance(scale, Tensor) and scale == 1.0
+        target = action if plain else action * scale
         drive.ctrl.add_(target if base is None else target + base.to(target.device))
+
+
+def range_scale(ranges: Tensor) -> Tensor:
+    """Rad per unit of absolute action, `(n)` of joint ranges `(n, 2)` rad: min(1.2 max |limit|, pi).
+
+    PHC's code has it so, with a policy whose actions are not bounded; its knees have 5.
+    """
+    return (1.2 * ranges.abs().amax(-1)).clamp_max(torch.pi)
 
 
 def stable_pd_torque(

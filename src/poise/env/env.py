@@ -15,7 +15,9 @@ from poise.env.frame import DoneTerm, Frame, ObsTerm, Pose, RewardTerm, placed
 from poise.env.means import Means
 from poise.env.record import TensorFunction, record
 from poise.env.reference import FIELDS, Reference
-from poise.env.terms.evaluate import Seen, Terms, sim_pose
+from poise.env.starts import Starts
+from poise.env.style import ClipWindows, clip_past
+from poise.env.terms.evaluate import Seen, Terms, seen_by, sim_pose
 from poise.errors import PoiseError
 from poise.sim import Backend, NanGuard
 
@@ -45,8 +47,10 @@ class TaskConfig:
     of residual force, None for plain DeepMimic. help: how its limits change while episodes are
     counted, which is with auto_reset alone; None leaves them. horizon: control steps until an episode
     times out. finish: what a clip done to its end is worth, in rewards of its last step; a discount g
-    makes g / (1 - g) of a character that goes on as it ended. auto_reset: start a new episode where
-    one ended (off while evaluating).
+    makes g / (1 - g) of a character that goes on as it ended. first: share of the episodes that begin
+    on their clip's frame 0, as evaluations do. style: what a motion prior sees of a frame, terms that
+    look at `frame.sim` alone, see `ImitationEnv.features`. auto_reset: start a new episode where one
+    ended (off while evaluating).
     """
 
     obs: tuple[ObsTerm, ...]
@@ -57,15 +61,18 @@ class TaskConfig:
     help: HelpSchedule | None = None
     horizon: int = 300
     finish: float = 0.0
+    first: float = 0.0
+    style: tuple[ObsTerm, ...] = ()
     auto_reset: bool = True
 
 
 class ImitationEnv:
-    """N characters that imitate a reference; implements the learner's `VecEnv` protocol.
+    """N characters that imitate a reference; the learner's `VecEnv`, and `FeatureSource` with a style.
 
     An action is `hinges` joint actions followed by the residual's. At step t the character stands at
     reference frame t, acts toward frame t + 1, and is rewarded there.
 
+    weights: `(C,)` odds with which clips are drawn, see `Starts`.
     fused: terms are recorded once and replayed as a whole, see `Terms`; off, one by one.
     """
 
@@ -81,7 +88,7 @@ class ImitationEnv:
         fused: bool = True,
     ):
         self.num_envs, self.device = backend.num_envs, backend.device
-        length = reference.length.cpu()
+        self._starts = Starts(reference.length, weights, seed, task.first)
         self.reference = reference = reference.to(self.device)
         self.backend, self.task, self.substeps = backend, task, substeps
         self.hinges = len(reference.humanoid.hinges)
@@ -93,11 +100,6 @@ class ImitationEnv:
         self._limit_n = task.residual.limit_n if task.residual else 0.0
         self.num_actions = self.hinges + self._extra
         self._guard = guard
-        # Starts are drawn on the CPU, so that a seed means the same ones on every device.
-        self._rng = torch.Generator().manual_seed(seed)
-        self._length = length
-        seconds = (length - 1).double()
-        self._weights = seconds if weights is None else weights.double().cpu()
         n, here = self.num_envs, self.device
         self.clip = torch.zeros(n, dtype=torch.long, device=here)
         # Views of one tensor, since every step adds one to both.
@@ -117,10 +119,14 @@ class ImitationEnv:
         self._places = torch.tensor([b + 1 for b in self._helped], device=here)
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
+        terms = (*task.obs, *task.rewards, *task.dones)
+        self._torqued = any(getattr(term.fn, "uses_torque", False) for term in terms)
+        self._torques = self._bind_torques()
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
-        self._terms = Terms(*terms, self._frame_of, self._ends, here, fused)
+        self._terms = Terms(*terms, placed(task.style, here), self._frame_of, self._ends, here, fused)
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
+        self._style = seen_by(self._terms.style, self._frame())
         self._obs = torch.empty(n, self.num_obs, device=here)
 
     # --- episodes -----------------------------------------------------------------------------
@@ -132,7 +138,16 @@ class ImitationEnv:
 
     def reseed(self, seed: int) -> None:
         """Makes the draws of all later starts repeatable; worlds stay where they are."""
-        self._rng.manual_seed(seed)
+        self._starts.rng.manual_seed(seed)
+
+    @property
+    def weights(self) -> Tensor:
+        """`(C,)` odds with which new episodes draw their clips, see `Starts.weights`."""
+        return self._starts.weights
+
+    @weights.setter
+    def weights(self, odds: Tensor) -> None:
+        self._starts.weights = odds
 
     def reset_to(self, clip: Tensor, frame: Tensor) -> Tensor:
         """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
@@ -148,12 +163,7 @@ class ImitationEnv:
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
     def _restart(self, ids: Tensor) -> None:
-        pick = torch.multinomial(self._weights, len(ids), replacement=True, generator=self._rng)
-        # Uniform over the frames from which at least one step can be made.
-        span = (self._length[pick] - 1).double()
-        u = torch.rand(len(ids), dtype=torch.float64, generator=self._rng)
-        frame = torch.minimum((u * span).long(), self._length[pick] - 2)
-        pick, frame = pick.to(self.device), frame.to(self.device)
+        pick, frame = (x.to(self.device) for x in self._starts.draw(len(ids)))
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
@@ -184,7 +194,7 @@ class ImitationEnv:
         self._counts += 1
         ref = self._goal
         self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame)
-        final, scores, ends = self._terms.judge(self._seen(ref, self._goal))
+        final, scores, ends, self._style = self._terms.judge(self._seen(ref, self._goal))
         reward, self.imitation, *values = scores.unbind(0)
         self.terms = {t.name: v for t, v in zip(self.task.rewards, values, strict=True)}
         failed, terminated, truncated = ends.unbind(0)
@@ -276,7 +286,7 @@ class ImitationEnv:
         """What the terms are worked out from, of all worlds or of the worlds `ids`."""
         s = self.backend.state
         fields = s.qpos, s.qvel, s.xpos, s.xquat, s.cvel, s.subtree_com
-        seen = Seen(*fields, ref, ahead, self.action, self.age)
+        seen = Seen(*fields, *self._torques, ref, ahead, self.action, self.age)
         if ids is None:
             return seen
         # The reference is that of the worlds `ids` already.
@@ -285,6 +295,8 @@ class ImitationEnv:
     def _frame_of(self, seen: Seen) -> Frame:
         residual, reference = self.task.residual, self.reference
         place, extra = reference.place(seen.ref), seen.action[:, self.hinges :]
+        # The hinges' part of the generalized forces, after the root's six.
+        torque = (seen.actuator + seen.damper)[:, 6:].float() if self._torqued else None
         return Frame(
             sim_pose(seen, reference.local, self._roots),
             reference.unpacked(seen.ref),
@@ -293,6 +305,8 @@ class ImitationEnv:
             extra,
             residual.regularizer(extra) if residual else torch.ones_like(place.phase),
             place.low,
+            seen.age,
+            torque,
         )
 
     def _frame(self) -> Frame:
@@ -301,8 +315,35 @@ class ImitationEnv:
         return self._frame_of(self._seen(*packed))
 
     def _observe(self) -> Tensor:
-        frame = self._frame()
-        return torch.cat([term.fn(frame, **term.params) for term in self._terms.obs], -1)
+        return seen_by(self._terms.obs, self._frame())
+
+    def _bind_torques(self) -> tuple[Tensor, Tensor]:
+        """Views of what servos and damping exert, where a term asks for it; else of nothing."""
+        if not self._torqued:
+            nothing = torch.zeros(self.num_envs, 0, device=self.device)
+            return nothing, nothing
+        self.backend.state.bind(("qfrc_actuator", "qfrc_damper"))
+        return self.backend.state["qfrc_actuator"], self.backend.state["qfrc_damper"]
+
+    # --- motion prior -------------------------------------------------------------------------
+
+    @property
+    def num_features(self) -> int:
+        """F, the width of what a motion prior sees of a frame; 0 without `TaskConfig.style`."""
+        return self._style.shape[1]
+
+    def features(self) -> Tensor:
+        """`(N, F)` of the states that the last step reached, before any restart."""
+        return self._style
+
+    def past(self, rows: Tensor, count: int) -> Tensor | None:
+        """`(n, count, F)` of the clips up to the starts of the new episodes in `rows (n,)`; NaN where a
+        clip begins later, None if all do."""
+        return clip_past(self.reference, self._terms.style, self.clip[rows], self.frame[rows], count)
+
+    def demos(self, frames: int) -> ClipWindows:
+        """Draws windows of so many frames of the clips, by the odds with which episodes draw clips."""
+        return ClipWindows(self.reference, self._terms.style, frames, lambda: self.weights)
 
     # --- persistence --------------------------------------------------------------------------
 
@@ -317,7 +358,8 @@ class ImitationEnv:
             "age": self.age.clone(),
             "action": self.action.clone(),
             "help": self.help.state(),
-            "rng": self._rng.get_state(),
+            "weights": self.weights,
+            "rng": self._starts.rng.get_state(),
         }
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -331,7 +373,9 @@ class ImitationEnv:
             getattr(self, name).copy_(state[name])
         self.help.load_state(state["help"])
         self._aim()
-        self._rng.set_state(state["rng"])
+        if "weights" in state:  # States of former versions are without; their odds never changed.
+            self.weights = state["weights"]
+        self._starts.rng.set_state(state["rng"])
 
     def close(self) -> None:
         """Frees the worlds."""

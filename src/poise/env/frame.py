@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from poise.errors import PoiseError
+
 
 @dataclass(frozen=True, eq=False)
 class Pose:
@@ -57,6 +59,8 @@ class Frame:
     step later, where it is known. phase `(N,)` in [0, 1]: place in the clip.
     residual `(N, k)`: unscaled residual action of the last step. reg `(N,)`: its regularizer.
     min_height `(N,)` m: lowest root height of the reference clip.
+    age `(N,)`: control steps since the episode began. torque `(N, n)` N m: what servos and damping
+    exert on each hinge at the end of the step, where a term asks for it (`uses_torque`).
     """
 
     sim: Pose
@@ -66,9 +70,18 @@ class Frame:
     residual: Tensor
     reg: Tensor
     min_height: Tensor
+    age: Tensor | None = None
+    torque: Tensor | None = None
 
 
 TermFunction = Callable[..., Tensor]
+AnyTerm = TypeVar("AnyTerm", bound=TermFunction)
+
+
+def uses_torque(fn: AnyTerm) -> AnyTerm:
+    """Marks a term that looks at `Frame.torque`, which is fetched for tasks with such a term alone."""
+    fn.__dict__["uses_torque"] = True
+    return fn
 
 
 @dataclass(frozen=True)
@@ -82,9 +95,12 @@ class ObsTerm:
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """`fn(frame, **params)` gives `(N,)` in [0, 1]; the reward is the weighted sum.
+    """`fn(frame, **params)` gives `(N,)`; the reward is the weighted sum.
 
-    imitation: whether the term counts for the imitation reward that is reported (regularizers do not).
+    weight: above 0 for a reward, whose values lie in [0, 1]; below 0 for a cost, whose values are at
+    least 0 and have a unit of their own, such as W.
+    imitation: whether the term counts for the imitation reward that is reported (regularizers and costs
+    do not).
     """
 
     name: str
@@ -92,6 +108,13 @@ class RewardTerm:
     weight: float
     params: Mapping[str, Any] = field(default_factory=dict)
     imitation: bool = True
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 and self.imitation:
+            raise PoiseError(
+                f"the term '{self.name}' is a cost and counts as imitation",
+                hint="Give it imitation=False",
+            )
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,10 @@ class Reference:
         pose = _carried(self.unpacked(packed), carry[0].float(), carry[1].float())
         return torch.cat((_pack(pose), packed[:, -self._place.shape[1] :]), 1)
 
+    def packed(self, rows: Tensor) -> Tensor:
+        """Packed poses of `rows (N)` as they stand in their clips."""
+        return self._packed.index_select(0, rows)
+
     def follow(self, rows: Tensor, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """The row after each of `rows (N)`, and its packed pose; it is frame `frame + 1` of `clip`."""
         rows = self._after.index_select(0, rows)

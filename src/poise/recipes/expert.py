@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -150,7 +150,7 @@ def _trainer(
     warm: bool,
 ) -> Trainer:
     ppo = finetuning(imitation.ppo()) if warm else None
-    how = {"start": "expert"} if warm else {}
+    how: dict[str, Any] = {"start": "expert"} if warm else {}
     with together(comm):
         return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)
 

@@ -9,9 +9,11 @@ from typing import Any, cast
 
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
+from poise.errors import PoiseError
 from poise.kin import FitReport
-from poise.learn import PPOConfig, Trainer, VecEnv, WarmStart
+from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
+from poise.learn.protocols import Style
 from poise.motion import ClipLibrary
 from poise.recipes.room import FEW, check_room, free_bytes, learner_bytes
 from poise.sim import NanGuard, make_backend
@@ -91,22 +93,34 @@ class Imitation:
         warm_start: WarmStart | None = None,
         ppo: PPOConfig | None = None,
         device: str = "cpu",
+        style: Style | AmpConfig | None = None,
+        env: ImitationEnv | None = None,
         **metadata: Any,
     ) -> Trainer:
         """A PPO trainer on a fresh environment; `ppo` in place of this task's own settings.
 
         threads: of the physics; 0 takes this process's share of the machine's cores. comm: the
-        processes that train together; they share the config's environments out evenly.
+        processes that train together; they share the config's environments out evenly. style: a motion
+        prior's settings, for which the task must have `TaskConfig.style`; or a style of your own, with
+        the `env` that it watches. env: in place of a fresh environment.
         """
+        if env is None and style is not None and not isinstance(style, AmpConfig):
+            raise PoiseError(
+                "a style of your own watches an environment of its own",
+                hint="Give that environment as env=, or give AmpConfig settings",
+            )
         rank = comm.rank
         if dumps is not None and rank:
             dumps = dumps / f"rank{rank}"
         if not threads and comm.local_size > 1:
             threads = max(1, len(os.sched_getaffinity(0)) // comm.local_size)
-        own = share_of(self.config.num_envs, comm)
-        self.check_room(own, device)
-        seed = rank_seed(self.config.seed, rank)
-        env = self.env(own, seed, threads=threads, dumps=dumps, device=device)
+        if env is None:
+            own = share_of(self.config.num_envs, comm)
+            self.check_room(own, device)
+            seed = rank_seed(self.config.seed, rank)
+            env = self.env(own, seed, threads=threads, dumps=dumps, device=device)
+        if isinstance(style, AmpConfig):
+            style = Amp(env, env.demos(style.frames), style, self.config.seed, comm)
         # A GPU is fed by one thread.
         cores = 1 if env.device.type == "cuda" else threads or len(os.sched_getaffinity(0))
         return Trainer(
@@ -119,4 +133,5 @@ class Imitation:
             warm_start=warm_start,
             update_threads=cores,
             comm=comm,
+            style=style,
         )

@@ -20,6 +20,7 @@ MANY = 256
 class Seen(NamedTuple):
     """What the terms of N worlds are worked out from: MuJoCo's own arrays (float64) and the rest.
 
+    actuator, damper: what servos and joint damping exert, `(N, 0)` where no term asks for torques.
     ref, ahead: packed reference poses now and one control step later, see `Reference`. action
     `(N, A)`: the last one. age `(N)`: control steps since the episode began.
     """
@@ -30,6 +31,8 @@ class Seen(NamedTuple):
     xquat: Tensor
     cvel: Tensor
     subtree_com: Tensor
+    actuator: Tensor
+    damper: Tensor
     ref: Tensor
     ahead: Tensor
     action: Tensor
@@ -61,13 +64,21 @@ def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Po
     return pose
 
 
+def seen_by(terms: tuple[ObsTerm, ...], frame: Frame) -> Tensor:
+    """The observations `(N, O)` of some terms side by side; O is 0 without any."""
+    parts = [term.fn(frame, **term.params) for term in terms]
+    return torch.cat(parts, -1) if parts else frame.phase.unsqueeze(-1)[:, :0]
+
+
 class Evaluation(NamedTuple):
     """obs `(N, O)`. scores `(2 + K, N)`: the reward, the part of it that is imitation, and the value of
-    each of K reward terms. ends `(3, N)` bool: failed, terminated, truncated."""
+    each of K reward terms. ends `(3, N)` bool: failed, terminated, truncated. style `(N, F)`: what a
+    motion prior sees."""
 
     obs: Tensor
     scores: Tensor
     ends: Tensor
+    style: Tensor
 
 
 class Terms:
@@ -75,6 +86,7 @@ class Terms:
 
     Args:
         frame: what the terms see, made of `Seen`.
+        style: what a motion prior sees, none for none.
         ends: which episodes are terminated and which are truncated, by what was seen and what failed.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
@@ -84,12 +96,13 @@ class Terms:
         obs: tuple[ObsTerm, ...],
         rewards: tuple[RewardTerm, ...],
         dones: tuple[DoneTerm, ...],
+        style: tuple[ObsTerm, ...],
         frame: Callable[[Seen], Frame],
         ends: Callable[[Seen, Tensor], tuple[Tensor, Tensor]],
         device: torch.device,
         fused: bool = True,
     ):
-        self.obs, self.rewards, self.dones = obs, rewards, dones
+        self.obs, self.rewards, self.dones, self.style = obs, rewards, dones, style
         self.frame, self.ends = frame, ends
         self.fused = fused
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
@@ -114,8 +127,8 @@ class Terms:
             self._run("judge", self._judge, first)
         other = self._helper().submit(self._run, "judge", self._judge, second)
         ours, theirs = self._run("judge", self._judge, first), other.result()
-        obs, scores, ends = zip(ours, theirs, strict=True)
-        return Evaluation(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1))
+        obs, scores, ends, style = zip(ours, theirs, strict=True)
+        return Evaluation(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1), torch.cat(style))
 
     def _helper(self) -> ThreadPoolExecutor:
         if self._pool is None:
@@ -124,8 +137,7 @@ class Terms:
         return self._pool
 
     def _observe(self, *seen: Tensor) -> tuple[Tensor, ...]:
-        frame = self.frame(Seen(*seen))
-        return (torch.cat([term.fn(frame, **term.params) for term in self.obs], -1),)
+        return (seen_by(self.obs, self.frame(Seen(*seen))),)
 
     def _judge(self, *seen: Tensor) -> tuple[Tensor, ...]:
         all_seen = Seen(*seen)
@@ -135,9 +147,9 @@ class Terms:
         failed = torch.zeros_like(frame.phase, dtype=torch.bool)
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
-        obs = torch.cat([term.fn(frame, **term.params) for term in self.obs], -1)
         scores = torch.cat((self._weights @ values, values))
-        return obs, scores, torch.stack((failed, *self.ends(all_seen, failed)))
+        ends = torch.stack((failed, *self.ends(all_seen, failed)))
+        return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
 
     def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
         if not self.fused:

@@ -1,0 +1,102 @@
+"""What a motion prior learns from: frames of the clips, seen as it sees the characters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from poise.env.frame import Frame, ObsTerm
+from poise.env.reference import Reference
+from poise.env.terms.evaluate import seen_by
+from poise.errors import PoiseError
+
+
+def clip_features(reference: Reference, terms: tuple[ObsTerm, ...], rows: Tensor) -> Tensor:
+    """`(n, F)`: what `terms`, which look at `frame.sim` alone, see of the reference's `rows (n,)`.
+
+    Frames of later cycles are seen as the clip has them, so the terms must not know of the world's x, y
+    and heading.
+    """
+    packed = reference.packed(rows)
+    pose, place = reference.unpacked(packed), reference.place(packed)
+    nothing = place.phase.new_zeros(len(rows), 0)
+    frame = Frame(pose, pose, None, place.phase, nothing, torch.ones_like(place.phase), place.low)
+    return seen_by(terms, frame)
+
+
+def clip_past(
+    reference: Reference, terms: tuple[ObsTerm, ...], clip: Tensor, frame: Tensor, count: int
+) -> Tensor | None:
+    """`(n, count, F)` of the `count` frames that end with `frame (n,)` of `clip (n,)`.
+
+    NaN where the clip begins later than that; None if it does so for all.
+    """
+    frames = frame.unsqueeze(1) + torch.arange(1 - count, 1, device=frame.device)
+    known = (frames[:, 0] >= 0) | reference.cyclic[clip]
+    if not bool(known.any()):
+        return None
+    # Clips that go on have frames before their first one, too; rows of the others are left unused.
+    frames = torch.where(reference.cyclic[clip].unsqueeze(1), frames, frames.clamp_min(0))
+    rows = reference.rows(clip.repeat_interleave(count), frames.flatten())
+    seen = clip_features(reference, terms, rows).unflatten(0, (len(clip), count))
+    seen[~known] = torch.nan
+    return seen
+
+
+class ClipWindows:
+    """Draws windows of the clips for a motion prior; implements the learner's `DemoSampler`.
+
+    Args:
+        reference: the clips.
+        terms: what is seen of a frame.
+        frames: W, consecutive frames of a window.
+        weights: gives the odds `(C,)` with which clips are drawn now, such as an environment's. Clips
+            with fewer frames are left out, unless they go on in cycles; if none remains, all clips that
+            have enough are drawn by their length.
+
+    Raises:
+        PoiseError: no terms, or no clip with enough frames.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        terms: tuple[ObsTerm, ...],
+        frames: int,
+        weights: Callable[[], Tensor],
+    ):
+        if not terms:
+            raise PoiseError(
+                "a motion prior needs to know what it sees of a frame",
+                hint="Set TaskConfig.style, for instance to phc_obs.style_terms(humanoid)",
+            )
+        self.reference, self.terms, self.frames, self.weights = reference, terms, frames, weights
+        length, cyclic = reference.length.cpu(), reference.cyclic.cpu()
+        # From how many frames of each clip a window can begin.
+        self._room = torch.where(cyclic, length - 1, (length - frames + 1).clamp_min(0))
+        if not bool(self._room.any()):
+            raise PoiseError(
+                f"no clip has the {frames} frames of a window, the longest has {int(length.max())}",
+                hint="Give longer clips, or fewer AmpConfig.frames",
+            )
+
+    def __call__(self, count: int, generator: torch.Generator) -> Tensor:
+        """`(count, W F)` float32, oldest frame first."""
+        odds = torch.where(self._room > 0, self.weights(), 0.0)
+        if not float(odds.sum()) > 0:
+            odds = self._room.double()
+        clip = torch.multinomial(odds, count, replacement=True, generator=generator)
+        room = self._room[clip]
+        u = torch.rand(count, dtype=torch.float64, generator=generator)
+        first = torch.minimum((u * room).long(), room - 1)
+        return self.at(clip, first)
+
+    def at(self, clip: Tensor, first: Tensor) -> Tensor:
+        """The windows that begin with frame `first (n,)` of `clip (n,)`, `(n, W F)`."""
+        device = self.reference.length.device
+        frames = first.unsqueeze(1) + torch.arange(self.frames)
+        clips = clip.repeat_interleave(self.frames)
+        rows = self.reference.rows(clips.to(device), frames.flatten().to(device))
+        return clip_features(self.reference, self.terms, rows).view(len(clip), -1)

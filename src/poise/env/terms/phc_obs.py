@@ -1,0 +1,116 @@
+"""Observations of Perpetual Humanoid Control (Luo et al. 2023, Sec. 3.1): next reference frame only.
+
+| PHC                                    | here              | numbers for B bodies, n hinges       |
+|----------------------------------------|-------------------|--------------------------------------|
+| s^p, proprioception                    | `self_state`      | 1 + 3 (B - 1) + 12 B (358 of 24)     |
+| s^g-rot, goal with rotations           | `rotation_goal`   | 24 B (576)                           |
+| s^g-kp, goal of keypoints              | `keypoint_goal`   | 9 B (216)                            |
+| beta, limb lengths (and masses)        | `shape`           | 2 B - 1                              |
+| what the discriminator sees of a frame | `motion_features` | 13 + 3 K + 6 J + n (196)             |
+
+J are hinged bodies, K the tips: feet and hands.
+All are seen from the character's root: offsets from it, in its heading frame.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.env.frame import Frame, ObsTerm, Pose
+from poise.spatial import into_heading, quat_between, quat_conj, quat_mul, quat_to_sixd
+
+
+def self_state(frame: Frame) -> Tensor:
+    """Root height m, body places m, velocities m/s, angular velocities rad/s, rotations 6D.
+
+    `(N, 1 + 3 (B - 1) + 3 B + 3 B + 6 B)`; the root's place is left out, since it is the origin.
+    """
+    sim = frame.sim
+    places = sim.pos[:, 1:] - sim.pos[:, :1]
+    vectors = into_heading(sim.heading, torch.cat((places, sim.linvel, sim.angvel), 1))
+    turns = quat_to_sixd(_from_heading(sim, sim.quat))
+    return torch.cat((sim.pos[:, 0, 2:], vectors.flatten(1), turns.flatten(1)), -1)
+
+
+def rotation_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
+    """s^g-rot = (th^ - th, p^ - p, v^ - v, w^ - w, th^, p^) of every body `(N, 24 K)`.
+
+    ^ is the reference one step later. In order: p^ - p m (3 K), v^ - v m/s, w^ - w rad/s, p^ m from the
+    root, the rotation th^ th^-1 6D (6 K) and th^ 6D, all in the heading frame (the paper writes w^ of
+    the present frame, its code takes the next one, as here).
+
+    bodies: `(K,)` rows, all by default.
+    """
+    sim, goal = frame.sim, _ahead(frame)
+    pos, linvel, angvel, quat = (
+        _rows(getattr(sim, name), bodies) for name in ("pos", "linvel", "angvel", "quat")
+    )
+    target, aim = _rows(goal.pos, bodies), _rows(goal.quat, bodies)
+    moves = _rows(goal.linvel, bodies) - linvel, _rows(goal.angvel, bodies) - angvel
+    places = torch.cat((target - pos, *moves, target - sim.pos[:, :1]), 1)
+    then, now = _from_heading(sim, aim), _from_heading(sim, quat)
+    # h^-1 (th^ th^-1) h = (h^-1 th^) (h^-1 th)^-1
+    turns = torch.cat((quat_mul(then, quat_conj(now)), then), 1)
+    return torch.cat((into_heading(sim.heading, places).flatten(1), quat_to_sixd(turns).flatten(1)), -1)
+
+
+def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
+    """s^g-kp = (p^ - p, v^ - v, p^) of every body `(N, 9 K)`, m, m/s, m from the root; no rotations.
+
+    ^ is the reference one step later, in the character's heading frame. bodies: as `rotation_goal`.
+    """
+    sim, goal = frame.sim, _ahead(frame)
+    target, moves = _rows(goal.pos, bodies), _rows(goal.linvel, bodies) - _rows(sim.linvel, bodies)
+    places = torch.cat((target - _rows(sim.pos, bodies), moves, target - sim.pos[:, :1]), 1)
+    return into_heading(sim.heading, places).flatten(1)
+
+
+def shape(frame: Frame, sizes: Tensor) -> Tensor:
+    """Sizes of the body `(N, S)`, the same in all worlds; see `shape_of`."""
+    return sizes.expand(frame.phase.shape[0], -1)
+
+
+def shape_of(humanoid: Humanoid) -> Tensor:
+    """Limb lengths, m, of all bodies but the root, then masses of all in tenths of kg: `(2 B - 1,)`."""
+    rows = humanoid.table.rows
+    lengths = torch.tensor([r.pos for r in rows if r.parent >= 0]).norm(dim=-1)
+    return torch.cat((lengths, torch.tensor([0.1 * r.mass for r in rows]))).float()
+
+
+def motion_features(frame: Frame, tips: Tensor) -> Tensor:
+    """What a motion prior sees of a frame (AMP, as in PHC's code), of `frame.sim` alone.
+
+    Root height m (1), rotation without heading 6D (6), velocity m/s and angular velocity rad/s in the
+    heading frame (3 + 3), places of the bodies `tips (K,)` from the root in the heading frame m (3 K),
+    turns of the hinged bodies 6D (6 J), hinge speeds rad/s (n).
+    """
+    sim = frame.sim
+    ends = sim.pos.index_select(1, tips) - sim.pos[:, :1]
+    vectors = torch.cat((sim.linvel[:, :1], sim.angvel[:, :1], ends), 1)
+    moves = into_heading(sim.heading, vectors).flatten(1)
+    tilt = quat_to_sixd(quat_between(sim.heading, sim.quat[:, 0]))
+    turns = quat_to_sixd(sim.local).flatten(1)
+    return torch.cat((sim.pos[:, 0, 2:], tilt, moves, turns, sim.qvel[:, 6:]), -1)
+
+
+def style_terms(humanoid: Humanoid) -> tuple[ObsTerm, ...]:
+    """PHC's features for `TaskConfig.style`; the key bodies are feet and hands."""
+    tips = torch.tensor((*humanoid.feet, *humanoid.rows_of("hand")))
+    return (ObsTerm("motion_features", motion_features, {"tips": tips}),)
+
+
+def _rows(values: Tensor, bodies: Tensor | None) -> Tensor:
+    return values if bodies is None else values.index_select(1, bodies)
+
+
+def _from_heading(sim: Pose, quat: Tensor) -> Tensor:
+    """Rotations `(N, K, 4)` seen from the character's heading."""
+    return quat_between(sim.heading.unsqueeze(1), quat)
+
+
+def _ahead(frame: Frame) -> Pose:
+    if frame.ahead is None:
+        raise ValueError("a goal needs the next reference frame")
+    return frame.ahead

@@ -1,0 +1,93 @@
+"""Rewards of Perpetual Humanoid Control (Luo et al. 2023): imitation, Eq. 2, and the energy penalty.
+
+    r = 0.5 e^(-100 |p^ - p|) + 0.3 e^(-10 |q^ - q|) + 0.1 e^(-0.1 |v^ - v|) + 0.1 e^(-0.1 |w^ - w|)
+
+over the places, rotations, velocities and angular velocities of all bodies. Paper and code differ in
+what |.| is, which `form` decides:
+
+| form  | |.|                                                                                  |
+|-------|--------------------------------------------------------------------------------------|
+| paper | a norm: the length of each body's error (angle for rotations), mean over the bodies   |
+| code  | the mean over bodies and axes of the squared error; squared angle, mean over bodies   |
+
+The paper states one norm and not over what; by the mean it does not grow with the number of bodies. At
+3 cm the place is worth e^-3 = 0.05 with "paper", and e^(-100 0.0003) = 0.97 with "code".
+The reference is that of the frame reached. Weights are from the code; the paper names none.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from poise.env.frame import Frame, RewardTerm, uses_torque
+from poise.spatial import quat_distance
+
+Form = Literal["paper", "code"]
+
+
+def body_positions(frame: Frame, alpha: float = 100.0, form: Form = "code") -> Tensor:
+    """First term of Eq. 2: places of all bodies, m, world. `(N,)` in (0, 1]."""
+    return _vectors(frame.sim.pos - frame.ref.pos, alpha, form)
+
+
+def body_rotations(frame: Frame, alpha: float = 10.0, form: Form = "code") -> Tensor:
+    """Second term of Eq. 2: rotations of all bodies, rad, world. `(N,)` in (0, 1]."""
+    angle = quat_distance(frame.sim.quat, frame.ref.quat)
+    return torch.exp(-alpha * (angle if form == "paper" else angle.square()).mean(-1))
+
+
+def body_velocities(frame: Frame, alpha: float = 0.1, form: Form = "code") -> Tensor:
+    """Third term of Eq. 2: velocities of all bodies, m/s, world. `(N,)` in (0, 1]."""
+    return _vectors(frame.sim.linvel - frame.ref.linvel, alpha, form)
+
+
+def body_angular_velocities(frame: Frame, alpha: float = 0.1, form: Form = "code") -> Tensor:
+    """Last term of Eq. 2: angular velocities of all bodies, rad/s, world. `(N,)` in (0, 1]."""
+    return _vectors(frame.sim.angvel - frame.ref.angvel, alpha, form)
+
+
+@uses_torque
+def energy(frame: Frame, form: Form = "code", exempt: int = 3) -> Tensor:
+    """A cost: sum over the hinges of |torque * speed|, W ("code"), or of its square ("paper"). `(N,)`.
+
+    exempt: control steps at the begin of an episode that cost nothing, 3 in the code, since a start on
+    the reference begins with a jerk.
+    """
+    if frame.torque is None or frame.age is None:
+        raise ValueError("the energy needs the hinges' torques and the age of the episodes")
+    power = (frame.torque * frame.sim.qvel[:, 6:]).abs()
+    total = (power.square() if form == "paper" else power).sum(-1)
+    return torch.where(frame.age > exempt, total, 0.0)
+
+
+def imitation_terms(form: Form = "code") -> tuple[RewardTerm, ...]:
+    """Eq. 2 as terms of a task."""
+    given = {"form": form}
+    return (
+        RewardTerm("body_positions", body_positions, 0.5, given),
+        RewardTerm("body_rotations", body_rotations, 0.3, given),
+        RewardTerm("body_velocities", body_velocities, 0.1, given),
+        RewardTerm("body_angular_velocities", body_angular_velocities, 0.1, given),
+    )
+
+
+def energy_term(
+    task_weight: float = 0.5, form: Form = "code", weight: float = 0.0005, exempt: int = 3
+) -> RewardTerm:
+    """The energy penalty of Eq. 1, r = w_task r_task + w_style r_style - 0.0005 energy.
+
+    task_weight: w_task, with which a motion prior multiplies the whole task reward and by which the
+    weight is divided here, since the penalty is not halved (1 without a prior). weight: 0.0005 for
+    primitives; the code's composer has 0.00005, and Eq. 4 a tenth, 0.00005, for recovery.
+    """
+    given = {"form": form, "exempt": exempt}
+    return RewardTerm("energy", energy, -weight / task_weight, given, imitation=False)
+
+
+def _vectors(error: Tensor, alpha: float, form: Form) -> Tensor:
+    """e^(-alpha |error|) of errors `(N, B, 3)`."""
+    size = error.norm(dim=-1).mean(-1) if form == "paper" else error.square().mean((-1, -2))
+    return torch.exp(-alpha * size)
