@@ -63,9 +63,7 @@ def run(
     t, result = training, None
     with contextlib.suppress(KeyboardInterrupt), showing(until) as show:
         # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
-        result = train(
-            imitation, out, until, show, t.threads, device=t.device, beginning=beginning()
-        )
+        result = train(imitation, out, until, show, t.threads, device=t.device, beginning=beginning())
     if result is None or result.interrupted:
         where = "" if result is None or result.last is None else f" in {result.last.stage.name}"
         tell(f"Stopped{where}; the training so far is saved. Go on with:")

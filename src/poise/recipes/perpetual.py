@@ -4,6 +4,9 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023; the training without fail-state rec
 
 | paper                                             | here                                        |
 |---------------------------------------------------|---------------------------------------------|
+| Sec. 3.1 s^p, s^g-rot, s^g-kp, beta               | `env.terms.phc_obs`                         |
+| Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.terms.phc_reward`, `learn.Amp`         |
+| Sec. 3.1 relaxed early termination                | `env.terms.done`, `all_but_feet`            |
 | Sec. 3.2 progressive primitives, hard negatives   | `recipes.perpetual_stages`                  |
 | Alg. 1, line 3: until success no longer improves  | `learn.converge`, `learn.mining`            |
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
@@ -18,21 +21,20 @@ primitive that learned it. At the end of every stage there is no help.
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
-from poise.body import BodyConfig
-from poise.control import SuccessHelp
-from poise.env import Reference, TaskConfig
+import torch
+
+from poise.body import BodyConfig, Humanoid
+from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
+from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
+from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.errors import PoiseError
 from poise.kin import fit_humanoid
 from poise.kin.own_body import on_own_body
-from poise.learn import CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
+from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
 from poise.motion import Clip, ClipLibrary
-from poise.recipes import residual_force
 from poise.recipes.imitation import Imitation
 from poise.sim import SimConfig
 
@@ -41,6 +43,12 @@ from poise.sim import SimConfig
 class Perpetual:
     """Settings of one run.
 
+    goal: what is told of the next frame, "rotations" and places or "keypoints", which are places alone.
+    shape: limb lengths and masses are observed, too. action: "absolute" as in the paper, or "additive"
+    to the reference's angles. faithful: where the paper and its code disagree about the reward.
+    energy: weight of the energy penalty, 0 for none. style: the motion prior, None for none.
+    termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
+    "code". first: share of the episodes that begin on frame 0, as evaluations do.
     single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
     `ppo.policy_hidden` and a composer of `composer_hidden`.
     max_primitives: no more than so many; fewer where nothing fails any more.
@@ -48,14 +56,22 @@ class Perpetual:
     hidden layers of the earlier ones. combine, weights: see `nets.Composer`.
     composer_clone: the composer first imitates for each clip the primitive that learned it.
     expert: the first primitive begins as a clone of a scripted expert, by `clone`.
-    help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it has
-    ended at the share `help_share` of the stage's time, or before by success.
+    help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
+    has ended at the share `help_share` of the stage's time, or before by success.
     residual_std: deviation of the noise on the residual action, in units of the limits.
     shares: where in the whole training the first and the last primitive end at the latest.
     evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of the
     control steps. mining, convergence: what fails is trained more; when a stage has learned what it can.
     """
 
+    goal: Literal["rotations", "keypoints"] = "rotations"
+    shape: bool = False
+    action: Literal["absolute", "additive"] = "absolute"
+    faithful: Literal["paper", "code"] = "code"
+    energy: float = 0.00005
+    style: AmpConfig | None = field(default_factory=AmpConfig)
+    termination: Literal["relaxed", "all", "code"] = "relaxed"
+    first: float = 0.1
     single: bool = False
     max_primitives: int = 3
     start: Literal["copy", "random"] = "copy"
@@ -80,7 +96,7 @@ class Perpetual:
     body: BodyConfig = field(default_factory=BodyConfig)
     sim: SimConfig = field(default_factory=SimConfig)
     ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(std=0.055, policy_lr=3e-4, policy_hidden=(512, 256))
+        default_factory=lambda: PPOConfig(std=0.02, policy_lr=3e-4, policy_hidden=(512, 256))
     )
 
     def __post_init__(self) -> None:
@@ -105,19 +121,49 @@ class Perpetual:
         return 0.0
 
 
-def task(config: Perpetual, humanoid: Any) -> TaskConfig:
+def task(config: Perpetual, humanoid: Humanoid) -> TaskConfig:
     """Imitation as terms."""
-    plain = residual_force.ResidualForce(
-        method="rfc-implicit" if config.help_start else "deepmimic",
-        help_limit=0.0,
-        help_start=config.help_start,
-        residual_std=config.residual_std,
+    own = (ObsTerm("self_state", phc_obs.self_state),)
+    if config.shape:
+        own += (ObsTerm("shape", phc_obs.shape, {"sizes": phc_obs.shape_of(humanoid)}),)
+    goal = phc_obs.rotation_goal if config.goal == "rotations" else phc_obs.keypoint_goal
+    rewards = phc_reward.imitation_terms(config.faithful)
+    if config.energy:
+        halved = config.style.task_weight if config.style else 1.0
+        rewards += (phc_reward.energy_term(halved, config.faithful, config.energy),)
+    if config.help_start:
+        rewards += (RewardTerm("residual", reward.residual, 0.1, imitation=False),)
+    limit, gamma = config.help_start, config.ppo.gamma
+    return TaskConfig(
+        obs=(*own, ObsTerm(goal.__name__, goal)),
+        rewards=rewards,
+        dones=(_failure(config, humanoid),),
+        pd=_targets(config, humanoid),
+        residual=ImplicitResidual(limit, limit) if limit else None,
+        help=SuccessHelp() if limit else None,
         horizon=config.horizon,
-        ppo=config.ppo,
+        # As many of the last rewards as a character that goes on would earn: g + g^2 + ...
+        finish=gamma / max(1.0 - gamma, 1.0 / config.horizon),
+        first=config.first,
+        style=phc_obs.style_terms(humanoid) if config.style else (),
     )
-    return replace(
-        residual_force.task(plain, humanoid), help=SuccessHelp() if config.help_start else None
-    )
+
+
+def _failure(config: Perpetual, humanoid: Humanoid) -> DoneTerm:
+    """When an episode of training has failed."""
+    if config.termination == "all":
+        return DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5})
+    free = {"bodies": done.all_but_feet(humanoid)}
+    if config.termination == "code":
+        return DoneTerm("any_body_too_far", done.any_body_too_far, {**free, "limit": 0.25, "grace": 1})
+    return DoneTerm("bodies_too_far", done.bodies_too_far, {**free, "limit": 0.5})
+
+
+def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:
+    if config.action == "additive":
+        return PDTargets("additive")
+    ranges = torch.tensor(humanoid.model.jnt_range[1:]).float()
+    return PDTargets("absolute", range_scale(ranges))
 
 
 def build(library: ClipLibrary | Clip, config: Perpetual | None = None) -> Imitation:
@@ -129,38 +175,6 @@ def build(library: ClipLibrary | Clip, config: Perpetual | None = None) -> Imita
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
-
-
-def to_json(config: Perpetual) -> dict[str, Any]:
-    """The settings as JSON data."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
-
-
-def from_json(data: Mapping[str, Any]) -> Perpetual:
-    """Settings from JSON data.
-
-    Raises:
-        PoiseError: they are of another version.
-    """
-    try:
-        return _filled(Perpetual(), data)
-    except (TypeError, KeyError, AttributeError) as problem:
-        raise PoiseError(
-            f"the run was made by another version of Poise ({problem})", hint="Train it again"
-        ) from None
-
-
-def _filled(default: Any, data: Mapping[str, Any]) -> Any:
-    """A dataclass of the default's type; its own dataclasses are filled likewise, lists are tuples."""
-    values = {
-        k: _filled(getattr(default, k), v) if dataclasses.is_dataclass(getattr(default, k)) else _tuples(v)
-        for k, v in data.items()
-    }
-    return type(default)(**values)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
 
 
 #: Expected figures: see `benchmarks/perpetual.md`.

@@ -145,14 +145,15 @@ def _env(imitation: Imitation, worlds: int, scale: float, threads: int, device: 
     """Worlds without a guard: one that goes bad is a failure and no reason to stop."""
     config = imitation.config
     backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
-    task = replace(imitation.task, auto_reset=False)
+    # Only what the policy sees is worked out.
+    task = replace(imitation.task, rewards=(), dones=(), style=(), auto_reset=False)
     env = ImitationEnv(imitation.reference, backend, task, config.sim.substeps, int(config.seed))
     env.help.set(scale)
     return env
 
 
 class History:
-    """Every evaluation of every clip as a CSV file; a resumed run leaves the file of an uninterrupted one.
+    """Every evaluation of every clip as a CSV file, after a resumed run as after an uninterrupted one.
 
     last: iterations after this one are dropped from an existing file.
     """
@@ -169,7 +170,9 @@ class History:
         columns = (r.clip, r.succeeded, r.frames, r.tracked, r.mpjpe_mm, r.global_mm)
         with self.path.open("a", newline="", encoding="utf-8") as file:
             write = csv.writer(file)
-            for clip, won, frames, tracked, local, far in zip(*(c.tolist() for c in columns), strict=True):
+            for clip, won, frames, tracked, local, far in zip(
+                *(c.tolist() for c in columns), strict=True
+            ):
                 write.writerow(
                     (iteration, stage, f"{help_n:.4g}", self.names[clip], int(won), frames, tracked,
                      f"{local:.4f}", f"{far:.4f}")

@@ -97,7 +97,9 @@ def begin_composer(
     policy = compose(before.policy, combine, weights, hidden, std, generator=rng)
     if not config.composer_clone:
         return replace(before, policy=policy)
-    env = unhelped(imitation).env(min(config.num_envs, 512), threads=threads, dumps=dumps, help_scale=0.0)
+    env = unhelped(imitation).env(
+        min(config.num_envs, 512), threads=threads, dumps=dumps, help_scale=0.0
+    )
     # The critic goes on from the primitives.
     settings = replace(config.clone, critic_steps=0)
     try:
@@ -116,7 +118,7 @@ def begin_composer(
 
 
 class Owners:
-    """Acts for each world as the primitive that learned the clip it is in: a teacher for the composer."""
+    """Acts for each world as the primitive that learned its clip: a teacher for the composer."""
 
     def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor):
         assert isinstance(policy.policy, Composer)
@@ -144,7 +146,7 @@ def make_trainer(
     own = unhelped(imitation) if stage.kind == "composer" else imitation
     own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
     ppo = finetuning(own.ppo()) if warm else own.ppo()
-    return own.trainer(threads, dumps, warm_start=start, ppo=ppo, device=device)
+    return own.trainer(threads, dumps, warm_start=start, ppo=ppo, device=device, style=config.style)
 
 
 def unhelped(imitation: Imitation) -> Imitation:
@@ -154,9 +156,7 @@ def unhelped(imitation: Imitation) -> Imitation:
 
 def critic_of(trainer: Trainer) -> State:
     """The critic of a trainer, for a `WarmStart`."""
-    return {
-        k: v for k, v in trainer.ppo.state().items() if k.startswith(("critic/", "return_norm/"))
-    }
+    return {k: v for k, v in trainer.ppo.state().items() if k.startswith(("critic/", "return_norm/"))}
 
 
 def _sized(config: Perpetual, stage: Stage) -> PPOConfig:

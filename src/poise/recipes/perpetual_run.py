@@ -11,8 +11,9 @@ run/
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
 from poise.recipes.inbetween_data import motion_files, of_one_skeleton, read_all
-from poise.recipes.perpetual import RECIPE, Perpetual, build, from_json, to_json
+from poise.recipes.perpetual import RECIPE, Perpetual, build
 from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
 from poise.recipes.perpetual_stages import Course, Progress
 from poise.recipes.session import FINAL, RUN_FILE
@@ -180,7 +181,7 @@ def finish(course: Course) -> ClipResults:
     results = evaluate_clips(imitation, policy, None, 0.0, course.threads, course.device)
     course.history.add(course.iteration, FINAL_STAGE, 0.0, results)
     policy.save(course.folder / FINAL, t.character, facts | cost)
-    names, owner = imitation.library.names, course.owner.tolist()
+    names, owner = imitation.library.names, course.ledger.owner.tolist()
     rows = [
         {
             "clip": names[c], "succeeded": bool(results.succeeded[k]), "frames": int(results.frames[k]),
@@ -196,3 +197,35 @@ def finish(course: Course) -> ClipResults:
     }  # fmt: skip
     write_atomic(course.folder / RESULT, json.dumps(said, indent=2, allow_nan=False).encode())
     return results
+
+
+def to_json(config: Perpetual) -> dict[str, Any]:
+    """The settings as JSON data."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_json(data: Mapping[str, Any]) -> Perpetual:
+    """Settings from JSON data.
+
+    Raises:
+        PoiseError: they are of another version.
+    """
+    try:
+        return _filled(Perpetual(), data)
+    except (TypeError, KeyError, AttributeError) as problem:
+        raise PoiseError(
+            f"the run was made by another version of Poise ({problem})", hint="Train it again"
+        ) from None
+
+
+def _filled(default: Any, data: Mapping[str, Any]) -> Any:
+    """A dataclass of the default's type; its own dataclasses are filled likewise, lists are tuples."""
+    values = {
+        k: _filled(getattr(default, k), v) if isinstance(v, Mapping) else _tuples(v)
+        for k, v in data.items()
+    }
+    return type(default)(**values)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

@@ -19,9 +19,8 @@ import torch
 from poise.env import ImitationEnv
 from poise.learn import (
     LATEST,
-    Convergence,
+    Amp,
     Decision,
-    HardNegatives,
     IterationStats,
     Log,
     PolicyBundle,
@@ -31,11 +30,12 @@ from poise.learn import (
     load_checkpoint,
 )
 from poise.learn.checkpoint import remove_partial
-from poise.learn.state import State, prefixed, take, under
+from poise.learn.state import prefixed, under
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual_eval import ClipResults, History, evaluate_clips
+from poise.recipes.perpetual_ledger import Ledger
 from poise.recipes.perpetual_next import (
     Stage,
     begin_composer,
@@ -44,9 +44,6 @@ from poise.recipes.perpetual_next import (
     critic_of,
     make_trainer,
 )
-
-#: Help that is less by this share of its limit is a gain of a stage.
-LESS_HELP = 0.01
 
 
 @dataclass(frozen=True)
@@ -99,15 +96,8 @@ class Course:
         self.config: Perpetual = imitation.config
         self.threads, self.device, self.save_s = threads, device, save_s
         self.dumps, self.tell = folder / "dumps", tell or Beginning()
-        length = imitation.reference.length.cpu()
-        self.mining = HardNegatives(len(length), self.config.mining, (length - 1).double())
-        self.convergence = Convergence(self.config.convergence)
-        # The primitive that learned each clip.
-        self.owner = torch.zeros(len(length), dtype=torch.long)
-        self.finished = False
-        # Clips that succeeded in the last evaluation, and how many the stage has.
-        self._seen: tuple[int | None, int] = (None, len(length))
-        self._reset(0, (0, 0.0))
+        self.ledger = Ledger(self.config, imitation.reference.length)
+        self.finished, self.before, self.begun = False, 0, (0, 0.0)
         if (folder / LATEST).exists():
             self._load()
             remove_partial(folder)
@@ -168,14 +158,14 @@ class Course:
         """Iterations between evaluations of this stage's clips."""
         if self.config.evaluate_every:
             return self.config.evaluate_every
-        frames = int(self.imitation.reference.length.cpu()[self.mining.member].sum())
+        frames = int(self.imitation.reference.length.cpu()[self.ledger.mining.member].sum())
         return max(25, round(10 * frames / self.trainer.rollout.samples))
 
     def policy(self) -> PolicyBundle:
         """The stage's policy that did best, or the present one before any was evaluated."""
         policy = self.trainer.policy()
-        if self.best:
-            policy.load_state(self.best)
+        if self.ledger.best:
+            policy.load_state(self.ledger.best)
         return policy
 
     # --- training -----------------------------------------------------------------------------
@@ -188,20 +178,20 @@ class Course:
         self._limit_help()
         iteration, share, help_n = self.iteration, self.share, self.help * self.config.help_start
         row = stats.row() | {"iteration": iteration, "stage": stage.number}
-        if share >= min(1.0, self.until_share) or self.trainer.iteration % self.every == 0:
+        seen = self.ledger.seen
+        if share >= self.until_share or self.trainer.iteration % self.every == 0:
             results, decision = self._judge(share)
+            seen = self.ledger.seen
             row |= {
                 "eval/clips": len(results.clip),
                 "eval/succeeded": int(results.succeeded.sum()),
                 "eval/mpjpe_global_mm": results.error_mm,
             }
+            following = None if decision == "go on" else self._advance(decision)
         self.log.write(row)
-        shown = self._seen
-        if results is not None and decision != "go on":
-            following = self._advance(decision)
         if results is not None or time.monotonic() - self._saved_at >= self.save_s:
             self.save()
-        return Progress(stage, iteration, stats, share, *shown, help_n, results, following)
+        return Progress(stage, iteration, stats, share, *seen, help_n, results, following)
 
     def _limit_help(self) -> None:
         """No more help than the stage's time allows, so that it ends in any case."""
@@ -217,17 +207,12 @@ class Course:
 
     def _judge(self, share: float) -> tuple[ClipResults, Decision]:
         """Evaluates the stage's clips and decides; a stage ends by what is done without help."""
-        scale, least = self.help, self.least
+        scale, over = self.help, share >= self.until_share
         results = self._evaluate(scale)
-        self.least = min(least, scale)
-        improved = scale < least - LESS_HELP
-        decision = self.convergence.add(int(results.succeeded.sum()), len(results.clip), improved)
-        over = share >= self.until_share
-        if decision == "solved" and scale > 0 and not over:
-            decision = "go on"
+        decision = self.ledger.decide(scale)
         if over and decision == "go on":
             decision = "next"
-        if decision != "go on" and scale > 0:
+        if decision == "next" and scale > 0:
             results = self._evaluate(0.0)
             decision = "solved" if bool(results.succeeded.all()) else "next"
         ends = decision == "solved" and (self.lasts or self.stage.number == 1)
@@ -235,78 +220,54 @@ class Course:
         return results, decision if ends or not (self.lasts or share >= 1) else "go on"
 
     def _evaluate(self, scale: float) -> ClipResults:
-        member = self.mining.member
-        results = evaluate_clips(
-            self.imitation, self.trainer.policy(), member.nonzero().squeeze(-1), scale, self.threads,
-            self.device,
-        )  # fmt: skip
-        won = results.spread(results.succeeded, len(member))
-        self.mining.record(won, member)
-        self._set_weights()
-        self._seen = (int(won.sum()), len(results.clip))
+        policy = self.trainer.policy()
+        where = (self.threads, self.device)
+        results = evaluate_clips(self.imitation, policy, self.ledger.clips, scale, *where)
+        self.ledger.record(results, policy, scale)
+        self.env.weights = self.ledger.mining.weights()
         self.history.add(self.iteration, self.stage.name, scale * self.config.help_start, results)
-        # Less help counts before more clips, more clips before a smaller error.
-        key = (-scale, results.rate, -results.error_mm)
-        if not self.best or key > self.best_key:
-            self.best, self.best_key = self.trainer.policy().state(), key
-            self.best_failed = member & ~won
         return results
 
     # --- stages -------------------------------------------------------------------------------
 
     def _advance(self, decision: Decision) -> Stage | None:
         """Ends the stage; the next one, or None where there is none."""
-        stage, mining, config = self.stage, self.mining, self.config
+        stage, ledger, t = self.stage, self.ledger, self.trainer
         if self.lasts:
             self.finished = True
             return None
-        member = mining.member.clone()
-        hard = torch.zeros_like(member) if decision == "solved" else (mining.hard | self.best_failed)
-        self.owner[member] = stage.number - 1
-        policy = self.policy()
+        member, policy = ledger.mining.member.clone(), self.policy()
+        hard = torch.zeros_like(member) if decision == "solved" else ledger.hard
+        ledger.owner[member] = stage.number - 1
         about = {"stage": stage.name, "clips": int(member.sum()), "hard": int(hard.sum())}
-        policy.save(
-            self.folder / f"primitive-{stage.number}.safetensors", self.trainer.character, about
-        )
+        policy.save(self.folder / f"primitive-{stage.number}.safetensors", t.character, about)
         if not bool(hard.any()) and stage.number == 1:
             self.finished = True
             return None
-        t = self.trainer
         before = WarmStart(policy, critic_of(t), t.samples, t.seconds)
-        scale, done = self.help, self.iteration
-        if bool(hard.any()) and stage.number < config.max_primitives:
-            following = Stage("primitive", stage.number + 1)
-            start = begin_primitive(before, config, following.number)
-            mining.next_stage(hard)
+        if bool(hard.any()) and stage.number < self.config.max_primitives:
+            following, scale = Stage("primitive", stage.number + 1), self.help
+            start = begin_primitive(before, self.config, following.number)
         else:
-            following, scale = Stage("composer", stage.number + 1), 0.0
-            start = begin_composer(
-                before, self.imitation, self.owner, self.threads, self.dumps, self.tell
-            )
-            mining.next_stage(torch.ones_like(member))
+            following, scale, hard = Stage("composer", stage.number + 1), 0.0, torch.ones_like(member)
+            where = (self.threads, self.dumps, self.tell)
+            start = begin_composer(before, self.imitation, ledger.owner, *where)
+        self.before, self.begun = self.iteration, (start.samples, start.seconds)
         self.env.close()
-        self.convergence.reset()
-        self._reset(done, (start.samples, start.seconds))
+        ledger.begin(hard)
         self._enter(following, start, True, scale)
-        self._seen = (None, int(mining.member.sum()))
+        if isinstance(self.trainer.style, Amp) and isinstance(t.style, Amp):
+            # The discriminator goes on, as in the paper.
+            self.trainer.style.load_learned(t.style.state())
         return following
 
-    def _reset(self, before: int, begun: tuple[int, float]) -> None:
-        """What is counted per stage. before: iterations of earlier ones. begun: samples, seconds then."""
-        self.before, self.begun, self.least = before, begun, 1.0
-        self.best: State = {}
-        self.best_key: tuple[float, ...] = ()
-        self.best_failed = torch.zeros(len(self.owner), dtype=torch.bool)
-
     def _enter(self, stage: Stage, start: WarmStart | None, warm: bool, scale: float) -> None:
+        """Makes the stage's trainer, whose worlds have the share `scale` of the help."""
         self.stage, self.warm = stage, warm
         where = (self.threads, self.dumps, self.device)
         self.trainer: Trainer = make_trainer(self.imitation, stage, start, warm, *where)
         self.env.help.set(scale)
-        self._set_weights()
-
-    def _set_weights(self) -> None:
-        self.env._weights = self.mining.weights()
+        self.env.weights = self.ledger.mining.weights()
 
     # --- persistence --------------------------------------------------------------------------
 
@@ -315,30 +276,22 @@ class Course:
         self.log.flush()
         self.trainer.metadata["course"] = {
             "stage": asdict(self.stage), "warm": self.warm, "before": self.before,
-            "begun": list(self.begun), "least": self.least, "best_key": list(self.best_key),
-            "seen": list(self._seen), "finished": self.finished,
+            "begun": list(self.begun), "finished": self.finished, "ledger": self.ledger.facts(),
         }  # fmt: skip
-        extra = prefixed("mining", self.mining.state()) | prefixed("stages", self.convergence.state())
-        extra |= {"stages/owner": self.owner, "stages/best_failed": self.best_failed}
-        self.trainer.save(self.folder / LATEST, extra | prefixed("best", self.best))
+        self.trainer.save(self.folder / LATEST, prefixed("ledger", self.ledger.state()))
         self._saved_at = time.monotonic()
 
     def _load(self) -> None:
-        tensors, meta = load_checkpoint(self.folder / LATEST)
+        path = self.folder / LATEST
+        tensors, meta = load_checkpoint(path)
         said: dict[str, Any] = meta["metadata"]["course"]
-        self.mining.load_state(under("mining", tensors))
-        self.convergence.load_state(under("stages", tensors))
+        self.ledger.load(under("ledger", tensors), said["ledger"])
         samples, seconds = said["begun"]
-        self._reset(said["before"], (samples, seconds))
-        self.owner, self.best_failed = (take(tensors, f"stages/{k}") for k in ("owner", "best_failed"))
-        self.least, self.best_key = said["least"], tuple(said["best_key"])
-        self.best, self.finished = under("best", tensors), said["finished"]
-        succeeded, clips = said["seen"]
-        self._seen = (succeeded, clips)
-        stage, policy = Stage(**said["stage"]), meta["policy"]
-        shaped = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], policy)
-        self._enter(stage, WarmStart(shaped), said["warm"], 1.0)
-        self.trainer.load(self.folder / LATEST)
+        self.before, self.begun, self.finished = said["before"], (samples, seconds), said["finished"]
+        # A policy of the same sizes, into which the trainer loads what was saved.
+        shaped = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
+        self._enter(Stage(**said["stage"]), WarmStart(shaped), said["warm"], 1.0)
+        self.trainer.load(path)
 
     def close(self) -> None:
         """Frees the worlds and closes the log."""
