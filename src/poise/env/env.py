@@ -16,7 +16,7 @@ from poise.env.means import Means
 from poise.env.record import TensorFunction, record
 from poise.env.reference import FIELDS, Reference
 from poise.env.starts import Starts
-from poise.env.style import ClipWindows, clip_past
+from poise.env.style import ClipFeatures, ClipWindows
 from poise.env.terms.evaluate import Seen, Terms, seen_by, sim_pose
 from poise.errors import PoiseError
 from poise.sim import Backend, NanGuard
@@ -127,6 +127,7 @@ class ImitationEnv:
         self.reset_to(self.clip, self.frame)
         self.num_obs = self._observe().shape[1]
         self._style = seen_by(self._terms.style, self._frame())
+        self._clip_features = ClipFeatures(reference, self._terms.style)
         self._obs = torch.empty(n, self.num_obs, device=here)
 
     # --- episodes -----------------------------------------------------------------------------
@@ -339,11 +340,11 @@ class ImitationEnv:
     def past(self, rows: Tensor, count: int) -> Tensor | None:
         """`(n, count, F)` of the clips up to the starts of the new episodes in `rows (n,)`; NaN where a
         clip begins later, None if all do."""
-        return clip_past(self.reference, self._terms.style, self.clip[rows], self.frame[rows], count)
+        return self._clip_features.past(self.clip[rows], self.frame[rows], count)
 
     def demos(self, frames: int) -> ClipWindows:
         """Draws windows of so many frames of the clips, by the odds with which episodes draw clips."""
-        return ClipWindows(self.reference, self._terms.style, frames, lambda: self.weights)
+        return ClipWindows(self._clip_features, frames, lambda: self.weights)
 
     # --- persistence --------------------------------------------------------------------------
 

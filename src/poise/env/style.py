@@ -12,45 +12,67 @@ from poise.env.reference import Reference
 from poise.env.terms.evaluate import seen_by
 from poise.errors import PoiseError
 
+#: Features of all frames are kept up to this size; of larger libraries they are worked out when drawn.
+MOST_BYTES = 256 * 2**20
+#: Frames that are worked out at once.
+AT_ONCE = 4096
 
-def clip_features(reference: Reference, terms: tuple[ObsTerm, ...], rows: Tensor) -> Tensor:
-    """`(n, F)`: what `terms`, which look at `frame.sim` alone, see of the reference's `rows (n,)`.
+
+class ClipFeatures:
+    """What `terms`, which look at `frame.sim` alone, see of the frames of the clips.
 
     Frames of later cycles are seen as the clip has them, so the terms must not know of the world's x, y
     and heading.
+
+    Args:
+        reference: the clips. terms: what is seen of a frame, side by side.
+        most_bytes: up to this size the features of all frames are kept.
     """
-    packed = reference.packed(rows)
-    pose, place = reference.unpacked(packed), reference.place(packed)
-    nothing = place.phase.new_zeros(len(rows), 0)
-    frame = Frame(pose, pose, None, place.phase, nothing, torch.ones_like(place.phase), place.low)
-    return seen_by(terms, frame)
 
+    def __init__(self, reference: Reference, terms: tuple[ObsTerm, ...], most_bytes: int = MOST_BYTES):
+        self.reference, self.terms, self.most_bytes = reference, terms, most_bytes
+        self._all: Tensor | None = None
 
-def clip_past(
-    reference: Reference, terms: tuple[ObsTerm, ...], clip: Tensor, frame: Tensor, count: int
-) -> Tensor | None:
-    """`(n, count, F)` of the `count` frames that end with `frame (n,)` of `clip (n,)`.
+    def __call__(self, rows: Tensor) -> Tensor:
+        """`(n, F)` float32 of the reference's `rows (n,)`."""
+        if self._all is None and self._fits():
+            every = torch.arange(self.reference.frames, device=rows.device)
+            self._all = torch.cat([self._of(part) for part in every.split(AT_ONCE)])
+        return self._of(rows) if self._all is None else self._all.index_select(0, rows)
 
-    NaN where the clip begins later than that; None if it does so for all.
-    """
-    frames = frame.unsqueeze(1) + torch.arange(1 - count, 1, device=frame.device)
-    known = (frames[:, 0] >= 0) | reference.cyclic[clip]
-    if not bool(known.any()):
-        return None
-    # Clips that go on have frames before their first one, too; rows of the others are left unused.
-    frames = torch.where(reference.cyclic[clip].unsqueeze(1), frames, frames.clamp_min(0))
-    rows = reference.rows(clip.repeat_interleave(count), frames.flatten())
-    seen = clip_features(reference, terms, rows).unflatten(0, (len(clip), count))
-    seen[~known] = torch.nan
-    return seen
+    def _fits(self) -> bool:
+        one = self._of(self.reference.start[:1])
+        return one.nbytes * self.reference.frames <= self.most_bytes
+
+    def _of(self, rows: Tensor) -> Tensor:
+        packed = self.reference.packed(rows)
+        pose, place = self.reference.unpacked(packed), self.reference.place(packed)
+        nothing, one = packed[:, :0], torch.ones_like(place.phase)
+        return seen_by(self.terms, Frame(pose, pose, None, place.phase, nothing, one, place.low))
+
+    def past(self, clip: Tensor, frame: Tensor, count: int) -> Tensor | None:
+        """`(n, count, F)` of the `count` frames that end with `frame (n,)` of `clip (n,)`.
+
+        NaN where the clip begins later than that; None if it does so for all.
+        """
+        reference, goes_on = self.reference, self.reference.cyclic[clip]
+        frames = frame.unsqueeze(1) + torch.arange(1 - count, 1, device=frame.device)
+        known = (frames[:, 0] >= 0) | goes_on
+        if not bool(known.any()):
+            return None
+        # Clips that go on have frames before their first one, too; those of the others are not used.
+        frames = torch.where(goes_on.unsqueeze(1), frames, frames.clamp_min(0))
+        rows = reference.rows(clip.repeat_interleave(count), frames.flatten())
+        seen = self(rows).unflatten(0, (len(clip), count))
+        seen[~known] = torch.nan
+        return seen
 
 
 class ClipWindows:
     """Draws windows of the clips for a motion prior; implements the learner's `DemoSampler`.
 
     Args:
-        reference: the clips.
-        terms: what is seen of a frame.
+        features: what is seen of the clips' frames.
         frames: W, consecutive frames of a window.
         weights: gives the odds `(C,)` with which clips are drawn now, such as an environment's. Clips
             with fewer frames are left out, unless they go on in cycles; if none remains, all clips that
@@ -60,19 +82,14 @@ class ClipWindows:
         PoiseError: no terms, or no clip with enough frames.
     """
 
-    def __init__(
-        self,
-        reference: Reference,
-        terms: tuple[ObsTerm, ...],
-        frames: int,
-        weights: Callable[[], Tensor],
-    ):
-        if not terms:
+    def __init__(self, features: ClipFeatures, frames: int, weights: Callable[[], Tensor]):
+        if not features.terms:
             raise PoiseError(
                 "a motion prior needs to know what it sees of a frame",
                 hint="Set TaskConfig.style, for instance to phc_obs.style_terms(humanoid)",
             )
-        self.reference, self.terms, self.frames, self.weights = reference, terms, frames, weights
+        self.features, self.frames, self.weights = features, frames, weights
+        self.reference = reference = features.reference
         length, cyclic = reference.length.cpu(), reference.cyclic.cpu()
         # From how many frames of each clip a window can begin.
         self._room = torch.where(cyclic, length - 1, (length - frames + 1).clamp_min(0))
@@ -99,4 +116,4 @@ class ClipWindows:
         frames = first.unsqueeze(1) + torch.arange(self.frames)
         clips = clip.repeat_interleave(self.frames)
         rows = self.reference.rows(clips.to(device), frames.flatten().to(device))
-        return clip_features(self.reference, self.terms, rows).view(len(clip), -1)
+        return self.features(rows).view(len(clip), -1)
