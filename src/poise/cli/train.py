@@ -73,7 +73,7 @@ def _perpetual(o: Options, argv: Sequence[str]) -> int:
 
     _only_a_folder(o)
     again = command_line("train", argv)
-    return train(o.network.library, o.primitives, o.out, o.training, o.body, again)
+    return train(o.network, o.primitives, o.out, o.training, o.body, again)
 
 
 def _only_a_folder(o: Options) -> None:

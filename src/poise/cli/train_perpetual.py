@@ -20,6 +20,7 @@ from poise.cli.console import err, notes, say, table, tell
 from poise.cli.options import Body, Training
 from poise.cli.output import claimed
 from poise.cli.progress import EVERY_S, clock
+from poise.cli.train_inbetween import Network
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -44,10 +45,10 @@ class Primitives:
 
 
 def run(
-    library: Path | None, primitives: Primitives, out: Path, training: Training, body: Body, again: str
+    network: Network, primitives: Primitives, out: Path, training: Training, body: Body, again: str
 ) -> int:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
-    if library is None:
+    if network.library is None:
         hint = "Write poise train perpetual --library DIR -o RUNDIR"
         raise PoiseError("the recipe perpetual needs --library", hint=hint)
     training.check()
@@ -56,9 +57,10 @@ def run(
     from poise.recipes.perpetual_run import train
     from poise.recipes.session import RUN_FILE
 
-    if (out / RUN_FILE).exists() and not training.resume:
+    held = (out / RUN_FILE).exists()
+    if held and not training.resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
-    imitation = begin(library, out, config, training.device)
+    imitation = begin(network, out, config, training, held)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result = training, None
     with contextlib.suppress(KeyboardInterrupt), showing(until) as show:
@@ -95,19 +97,26 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
     return config if training.envs is None else replace(config, num_envs=training.envs)
 
 
-def begin(library: Path, out: Path, config: Perpetual, device: str) -> Imitation:
-    """Reads the folder, tries the run folder, builds the task; nothing stays if that fails."""
-    from poise.recipes.perpetual_run import begin as begin_run
-    from poise.recipes.perpetual_run import clips_of
+def begin(network: Network, out: Path, config: Perpetual, training: Training, held: bool) -> Imitation:
+    """Reads the folder, tries the run folder, builds the task; nothing stays if that fails.
 
-    with progress.working("reading the library"):
-        clips, said = clips_of(library, config, tell)
-    say(f"{len(clips)} clips, {clips.seconds / 60:.1f} minutes")
+    held: the run folder holds a run already, which then is all that is read.
+    """
+    from poise.recipes import perpetual_run
+
+    assert network.library is not None
+    hold_out, never = ((p,) if p else () for p in (network.hold_out, network.never))
+    source = ", without ".join((str(network.library.resolve()), *hold_out, *never))
+    if held:
+        with progress.working("opening the run"):
+            return perpetual_run.resume(out, config, source, training.device)
+    if training.resume:
+        tell(f"There was no run in {out}; a new one starts.")
+    clips, said = perpetual_run.clips_of(network.library, config.body, hold_out, never, tell)
+    say(f"{len(clips)} clips, {clock(clips.seconds)}")
     notes(said)
     with claimed(out), progress.working("making the body"):
-        imitation = begin_run(out, clips, config, device)
-    notes(imitation.report.sentences())
-    return imitation
+        return perpetual_run.begin(out, clips, config, source, training.device)
 
 
 def report(imitation: Imitation, result: PerpetualResult, out: Path) -> None:

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from poise import __version__
+from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.learn import Until, load_checkpoint, save_checkpoint
 from poise.learn.checkpoint import write_atomic
@@ -27,8 +28,8 @@ from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
-from poise.recipes.inbetween_data import motion_files, of_one_skeleton, read_all
 from poise.recipes.perpetual import RECIPE, Perpetual, build
+from poise.recipes.perpetual_data import LibraryConfig, library_of, split
 from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
 from poise.recipes.perpetual_stages import Course, Progress
 from poise.recipes.session import FINAL, RUN_FILE
@@ -53,69 +54,94 @@ class PerpetualResult:
 
 
 def clips_of(
-    folder: Path, config: Perpetual, tell: Callable[[str], None] = lambda _: None
+    folder: Path,
+    body: BodyConfig,
+    hold_out: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
+    tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[ClipLibrary, tuple[str, ...]]:
-    """The clips of a folder on one skeleton, and sentences on what was left out or changed.
+    """The clips of a folder on one skeleton, see `library_of`, and sentences on what became of them.
 
-    Raises:
-        PoiseError: no clip can be used.
+    hold_out: clips and performers that are not learned from, see `split`. leave_out: regular expressions
+    of clips that are not even read.
     """
-    clips, notes = read_all(motion_files(folder), tell)
-    clips, notes = of_one_skeleton(clips, notes)
-    # Files of different folders may have one name.
-    seen: dict[str, int] = {}
-    named = []
-    for clip in clips:
-        seen[clip.name] = count = seen.get(clip.name, 0) + 1
-        named.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))
-    return ClipLibrary.of(named), notes
+    config = LibraryConfig(leave_out=tuple(leave_out))
+    library, report = library_of(folder, config=config, body=body, tell=tell)
+    notes = tuple(report.sentences())
+    if not hold_out:
+        return library, notes
+    parts = split(library, hold_out)
+    return parts.train, (*notes, f"{len(parts.test)} clips are held out.")
 
 
 def begin(
-    folder: Path, library: ClipLibrary, config: Perpetual, device: str = "cpu", least: int = 2
+    folder: Path, library: ClipLibrary, config: Perpetual, source: str = "", device: str = "cpu"
 ) -> Imitation:
     """Builds the task and writes the run file; a folder that holds another run is refused.
 
+    source: where the clips are from, by which `resume` knows them.
+
     Raises:
-        PoiseError: fewer clips than `least`, another run in the folder, or not enough memory.
+        PoiseError: a single clip, another run in the folder, or not enough memory.
     """
-    if len(library) < least:
+    if len(library) < 2:
         raise PoiseError(
-            f"a library needs at least {least} clips, got {len(library)}",
+            f"a library needs at least 2 clips, and there is only '{library.names[0]}'",
             hint="Use poise imitate for a single clip",
         )
     path, said = folder / RUN_FILE, to_json(config)
     tensors, notes = pack_clips(library.clips)
     notes = json.loads(json.dumps(notes))
     if path.exists():
-        _check_same(folder, said, notes)
+        meta = _checked(folder, said, source)
+        if meta["clips"] != notes:
+            raise PoiseError(
+                f"the folder holds a run of other clips ({len(meta['clips'])}, here {len(notes)})",
+                folder,
+                "Give the library it was begun with, or choose another folder",
+            )
     imitation = build(library, config)
     imitation.check_room(config.num_envs, device)
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         meta = {"kind": "run", "recipe": RECIPE["name"], "config": said, "clips": notes}
-        save_checkpoint(path, tensors, {**meta, "character": imitation.humanoid.identity})
+        character = imitation.humanoid.identity
+        save_checkpoint(path, tensors, {**meta, "source": source, "character": character})
     return imitation
 
 
-def _check_same(folder: Path, config: dict[str, Any], clips: list[dict[str, Any]]) -> None:
+def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu") -> Imitation:
+    """The task of the run in a folder, from that folder alone, if it has these settings.
+
+    Raises:
+        PoiseError: other settings, another source of clips, or another recipe.
+    """
+    _checked(folder, to_json(config), source)
+    imitation = reopen(folder)
+    imitation.check_room(config.num_envs, device)
+    return imitation
+
+
+def _checked(folder: Path, config: dict[str, Any], source: str) -> dict[str, Any]:
+    """What the run file says, unless it is that of another run."""
     _, meta = load_checkpoint(folder / RUN_FILE)
     if meta.get("recipe") != RECIPE["name"]:
         raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
     found = meta["config"]
-    if found != config:
-        names = sorted(k for k in config if found.get(k) != config[k])
+    names = sorted(k for k in {*config, *found} if config.get(k) != found.get(k))
+    if names:
         raise PoiseError(
             f"the folder holds a run with other settings ({', '.join(names)})",
             folder,
             "Resume it as it is or choose another folder",
         )
-    if meta["clips"] != clips:
+    if meta["source"] != source:
         raise PoiseError(
-            f"the folder holds a run of other clips ({len(meta['clips'])}, here are {len(clips)})",
+            f"the folder holds a run on the library {meta['source'] or 'of a program'}",
             folder,
-            "Give the library it was begun with, or choose another folder",
+            "Give that library, or choose another folder",
         )
+    return meta
 
 
 def reopen(folder: Path) -> Imitation:

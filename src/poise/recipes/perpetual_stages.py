@@ -28,6 +28,7 @@ from poise.learn import (
     Until,
     WarmStart,
     load_checkpoint,
+    load_policy,
 )
 from poise.learn.checkpoint import remove_partial
 from poise.learn.state import prefixed, under
@@ -288,9 +289,9 @@ class Course:
         self.ledger.load(under("ledger", tensors), said["ledger"])
         samples, seconds = said["begun"]
         self.before, self.begun, self.finished = said["before"], (samples, seconds), said["finished"]
-        # A policy of the same sizes, into which the trainer loads what was saved.
-        shaped = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
-        self._enter(Stage(**said["stage"]), WarmStart(shaped), said["warm"], 1.0)
+        # A trainer takes the sizes and the action noise from the policy it starts with.
+        start = WarmStart(load_policy(path))
+        self._enter(Stage(**said["stage"]), start, said["warm"], 1.0)
         self.trainer.load(path)
 
     def close(self) -> None:
