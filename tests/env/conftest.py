@@ -6,8 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+import torch
 
-from poise.env import ImitationEnv
+from poise.control import PDTargets, range_scale
+from poise.env import DoneTerm, ImitationEnv, ObsTerm
+from poise.env.terms import done, phc_obs, phc_reward
 from poise.motion import Clip
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
@@ -27,6 +30,27 @@ def make_task() -> Callable[..., Imitation]:
 
             known[key] = build(ClipLibrary(clips or (swing(),)), config)
         return known[key]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_phc(make_task: Callable[..., Imitation]) -> Callable[..., Imitation]:
+    """`make_phc(*clips)`: rotation goal, Eq. 2, energy, relaxed ends, absolute actions and a style."""
+
+    def make(*clips: Clip) -> Imitation:
+        built = make_task(*clips, method="deepmimic")
+        humanoid = built.humanoid
+        apart = {"bodies": done.all_but_feet(humanoid), "grace": 1}
+        task = replace(
+            built.task,
+            obs=(ObsTerm("self", phc_obs.self_state), ObsTerm("goal", phc_obs.rotation_goal)),
+            rewards=(*phc_reward.imitation_terms(), phc_reward.energy_term()),
+            dones=(DoneTerm("any_body_too_far", done.any_body_too_far, apart),),
+            pd=PDTargets("absolute", range_scale(torch.tensor(humanoid.model.jnt_range[1:]))),
+            style=phc_obs.style_terms(humanoid),
+        )
+        return replace(built, task=task)
 
     return make
 

@@ -106,9 +106,9 @@ def naive(name: str, sim: Pose, goal: Pose, bodies: list[int], world: int) -> np
         parts += [h @ (to["linvel"][b] - at["linvel"][b]) for b in bodies]
         parts += [h @ (to["angvel"][b] - at["angvel"][b]) for b in bodies]
         parts += [h @ (to["pos"][b] - root) for b in bodies]
+        parts += [sixd(turn * then[b]) for b in bodies]
         # What turns the present into the target, a world turn seen from the heading.
         parts += [sixd(turn * (then[b] * now[b].inv()) * turn.inv()) for b in bodies]
-        parts += [sixd(turn * then[b]) for b in bodies]
     elif name == "keypoint_goal":
         parts = [h @ (to["pos"][b] - at["pos"][b]) for b in bodies]
         parts += [h @ (to["linvel"][b] - at["linvel"][b]) for b in bodies]
@@ -154,7 +154,7 @@ def test_at_the_goal_the_differences_are_nothing():
     sim = a_pose(4)
     goal = phc_obs.rotation_goal(a_frame(sim, sim))
     assert not goal[:, : 9 * B].any()
-    turned = goal[:, 12 * B : 18 * B].unflatten(1, (B, 6))
+    turned = goal[:, 18 * B :].unflatten(1, (B, 6))
     identity = torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(N, B, 6)
     torch.testing.assert_close(turned, identity, atol=1e-6, rtol=0)
     assert not phc_obs.keypoint_goal(a_frame(sim, sim))[:, : 6 * B].any()

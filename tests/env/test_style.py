@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from poise.control import PDTargets, range_scale
-from poise.env import DoneTerm, ImitationEnv, ObsTerm
+from poise.control import range_scale
+from poise.env import ImitationEnv
 from poise.env.style import ClipFeatures, ClipWindows
-from poise.env.terms import done, phc_obs, phc_reward
+from poise.env.terms import phc_reward
 from poise.env.terms.evaluate import MANY, seen_by
 from poise.errors import PoiseError
 from poise.recipes.imitation import Imitation
@@ -21,20 +21,8 @@ CLIPS = (swing(0.6), swing(0.5, speed=1.2, bend=0.5, cyclic=True, name="walk"), 
 
 
 @pytest.fixture
-def task(make_task) -> Imitation:
-    built = make_task(*CLIPS, method="deepmimic")
-    humanoid = built.humanoid
-    apart = {"bodies": done.all_but_feet(humanoid), "grace": 1}
-    ranges = torch.tensor(humanoid.model.jnt_range[1:])
-    given = replace(
-        built.task,
-        obs=(ObsTerm("self", phc_obs.self_state), ObsTerm("goal", phc_obs.rotation_goal)),
-        rewards=(*phc_reward.imitation_terms(), phc_reward.energy_term()),
-        dones=(DoneTerm("any_body_too_far", done.any_body_too_far, apart),),
-        pd=PDTargets("absolute", range_scale(ranges)),
-        style=phc_obs.style_terms(humanoid),
-    )
-    return replace(built, task=given)
+def task(make_phc) -> Imitation:
+    return make_phc(*CLIPS)
 
 
 def act(env: ImitationEnv, seed: int) -> torch.Tensor:

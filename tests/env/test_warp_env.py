@@ -36,9 +36,10 @@ def on_warp(task, auto_reset: bool = True) -> ImitationEnv:
 
 
 @needs_warp
-def test_steps_are_those_of_the_cpu(make_task):
+@pytest.mark.parametrize("phc", [False, True], ids=["rfc", "phc"])
+def test_steps_are_those_of_the_cpu(make_task, make_phc, phc):
     """Observations, rewards and ends of a few control steps, with residual forces and restarts."""
-    task = make_task(swing(0.4))
+    task = (make_phc if phc else make_task)(swing(0.4))
     warp, cpu = on_warp(task), task.env(N, threads=1)
     assert warp.device == torch.device(WARP_DEVICE) and cpu.device == torch.device("cpu")
     close(warp.reset(), cpu.reset())
@@ -54,7 +55,9 @@ def test_steps_are_those_of_the_cpu(make_task):
         assert torch.equal(ours.terminated.cpu(), theirs.terminated)
         assert torch.equal(ours.truncated.cpu(), theirs.truncated)
         restarted |= bool((ours.terminated | ours.truncated).any())
-        assert ours.log["help/force_n"] == pytest.approx(theirs.log["help/force_n"], rel=1e-3)
+        for name in ("reward/energy",) if phc else ("help/force_n",):
+            assert ours.log[name] == pytest.approx(theirs.log[name], rel=1e-3)
+        close(warp.features(), cpu.features())
     assert restarted and torch.equal(warp.frame.cpu(), cpu.frame)
     goes_on_elsewhere(warp, cpu)
     trains(warp)
@@ -96,6 +99,17 @@ def evaluates(task) -> None:
     assert recordings[0].qpos.dtype == np.float64
 
 
+class FakeState(SimpleNamespace):
+    """Fields under MuJoCo's names, further ones of which are asked for."""
+
+    def bind(self, names: tuple[str, ...]) -> None:
+        for name in names:
+            setattr(self, name, torch.zeros_like(self.qvel))
+
+    def __getitem__(self, name: str) -> Tensor:
+        return getattr(self, name)
+
+
 class FakeBackend:
     """Worlds that stand still, on a device that is not the CPU."""
 
@@ -105,7 +119,7 @@ class FakeBackend:
 
         b = model.nbody
         self.model, self.num_envs, self.device = model, N, ELSEWHERE
-        self.state = SimpleNamespace(
+        self.state = FakeState(
             qpos=zeros(model.nq), qvel=zeros(model.nv), xpos=zeros(b, 3), xquat=zeros(b, 4),
             xipos=zeros(b, 3), subtree_com=zeros(b, 3), cvel=zeros(b, 6),
         )  # fmt: skip
@@ -136,4 +150,18 @@ def test_no_step_mixes_devices(make_task, settings):
         env.pose()
         ids = torch.arange(2, device=ELSEWHERE)
         env._terms.observe(env._seen(env._goal[ids], env._goal[ids], ids))
+        env.reset()
+
+
+def test_phcs_terms_mix_no_devices_either(make_phc):
+    task = make_phc(swing())
+    quiet = replace(task.task, auto_reset=False)
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        env = ImitationEnv(task.reference, FakeBackend(task.humanoid.model), quiet, 2)
+        out = env.step(torch.zeros(N, env.num_actions, device=ELSEWHERE))
+        rows = torch.arange(5, device=ELSEWHERE)
+        seen = env._clip_features._of(rows)
+        for value in (out.obs, out.reward, out.terminated, env.features(), seen, env.terms["energy"]):
+            assert value.device == env.device
+        assert seen.shape == (5, env.num_features)
         env.reset()

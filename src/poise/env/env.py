@@ -119,8 +119,8 @@ class ImitationEnv:
         self._places = torch.tensor([b + 1 for b in self._helped], device=here)
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        terms = (*task.obs, *task.rewards, *task.dones)
-        self._torqued = any(getattr(term.fn, "uses_torque", False) for term in terms)
+        asking = (*task.obs, *task.rewards, *task.dones)
+        self._torqued = any(getattr(term.fn, "uses_torque", False) for term in asking)
         self._torques = self._bind_torques()
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         self._terms = Terms(*terms, placed(task.style, here), self._frame_of, self._ends, here, fused)

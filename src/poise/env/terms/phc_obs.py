@@ -29,16 +29,15 @@ def self_state(frame: Frame) -> Tensor:
     """
     sim = frame.sim
     places = sim.pos[:, 1:] - sim.pos[:, :1]
-    vectors = into_heading(sim.heading, torch.cat((places, sim.linvel, sim.angvel), 1))
-    turns = quat_to_sixd(_from_heading(sim, sim.quat))
-    return torch.cat((sim.pos[:, 0, 2:], vectors.flatten(1), turns.flatten(1)), -1)
+    vectors = torch.cat((places, sim.linvel, sim.angvel, _columns(sim.quat)), 1)
+    return torch.cat((sim.pos[:, 0, 2:], into_heading(sim.heading, vectors).flatten(1)), -1)
 
 
 def rotation_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
     """s^g-rot = (th^ - th, p^ - p, v^ - v, w^ - w, th^, p^) of every body `(N, 24 K)`.
 
     ^ is the reference one step later. In order: p^ - p m (3 K), v^ - v m/s, w^ - w rad/s, p^ m from the
-    root, the rotation th^ th^-1 6D (6 K) and th^ 6D, all in the heading frame (the paper writes w^ of
+    root, th^ 6D (6 K) and the rotation th^ th^-1 6D, all in the heading frame (the paper writes w^ of
     the present frame, its code takes the next one, as here).
 
     bodies: `(K,)` rows, all by default.
@@ -49,11 +48,12 @@ def rotation_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
     )
     target, aim = _rows(goal.pos, bodies), _rows(goal.quat, bodies)
     moves = _rows(goal.linvel, bodies) - linvel, _rows(goal.angvel, bodies) - angvel
-    places = torch.cat((target - pos, *moves, target - sim.pos[:, :1]), 1)
-    then, now = _from_heading(sim, aim), _from_heading(sim, quat)
-    # h^-1 (th^ th^-1) h = (h^-1 th^) (h^-1 th)^-1
-    turns = torch.cat((quat_mul(then, quat_conj(now)), then), 1)
-    return torch.cat((into_heading(sim.heading, places).flatten(1), quat_to_sixd(turns).flatten(1)), -1)
+    apart = quat_mul(aim, quat_conj(quat))
+    vectors = target - pos, *moves, target - sim.pos[:, :1], _columns(aim)
+    # A rotation seen from elsewhere, h^-1 (w, v) h = (w, h^-1 v), turns about its turned axis.
+    axis = into_heading(sim.heading, apart[..., 1:])
+    turn = quat_to_sixd(torch.cat((apart[..., :1], axis), -1))
+    return torch.cat((into_heading(sim.heading, torch.cat(vectors, 1)).flatten(1), turn.flatten(1)), -1)
 
 
 def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
@@ -105,9 +105,9 @@ def _rows(values: Tensor, bodies: Tensor | None) -> Tensor:
     return values if bodies is None else values.index_select(1, bodies)
 
 
-def _from_heading(sim: Pose, quat: Tensor) -> Tensor:
-    """Rotations `(N, K, 4)` seen from the character's heading."""
-    return quat_between(sim.heading.unsqueeze(1), quat)
+def _columns(quat: Tensor) -> Tensor:
+    """The 6D of rotations `(N, K, 4)` as vectors, `(N, 2 K, 3)`."""
+    return quat_to_sixd(quat).unflatten(-1, (2, 3)).flatten(1, 2)
 
 
 def _ahead(frame: Frame) -> Pose:

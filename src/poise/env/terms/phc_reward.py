@@ -53,6 +53,8 @@ def body_angular_velocities(frame: Frame, alpha: float = 0.1, form: Form = "code
 def energy(frame: Frame, form: Form = "code", exempt: int = 3) -> Tensor:
     """A cost: sum over the hinges of |torque * speed|, W ("code"), or of its square ("paper"). `(N,)`.
 
+    The torque is that of the servos in the step's last physics step, less the damping at its end.
+
     exempt: control steps at the begin of an episode that cost nothing, 3 in the code, since a start on
     the reference begins with a jerk.
     """
@@ -82,6 +84,11 @@ def energy_term(
     task_weight: w_task, with which a motion prior multiplies the whole task reward and by which the
     weight is divided here, since the penalty is not halved (1 without a prior). weight: 0.0005 for
     primitives; the code's composer has 0.00005, and Eq. 4 a tenth, 0.00005, for recovery.
+
+    A body of 64 kg whose expert walks on the reference spends 530 W, and 1,700 W under a noise of 0.055
+    rad on its targets: at 0.0005 it loses 0.26 and 0.84 of the reward of at most about 1. Where nothing
+    is left above 0, falling early pays; then take the composer's weight, or less noise. The paper's
+    squares are 49,000 W^2 there, so that its formula with its weight leaves nothing at all.
     """
     given = {"form": form, "exempt": exempt}
     return RewardTerm("energy", energy, -weight / task_weight, given, imitation=False)
