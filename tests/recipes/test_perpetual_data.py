@@ -72,7 +72,8 @@ def test_what_becomes_of_each_file(folder: Path) -> None:
     cut = report.of("cmu-07-07_02")
     assert cut.kept_s[0] == pytest.approx(2.6, abs=0.05) and cut.kept_s[1] == pytest.approx(4.0)
     assert cut.frames == library.clips[3].frames
-    assert "up to 0.6" in cut.sentence() and cut.sentence().startswith("cmu-07-07_02: cut to 2.6 to 4.0")
+    assert cut.sentence().startswith("cmu-07-07_02: cut to 2.6 to 4.0 s of 4.0 s, since for 1.5 s")
+    assert "up to 0.59 m above" in cut.sentence()
     text = "\n".join(report.sentences())
     assert "4 of 7 clips" in text and "its name says 'swimming'" in text and "fewer than 10" in text
     assert report.subjects == ("cmu 02", "cmu 07")

@@ -1,23 +1,34 @@
 """Evaluation: padded rollouts in, a score card with stable keys out."""
 
 from poise.eval.episodes import Recording, run_episodes, shapes_of, start_frames
+from poise.eval.field_card import FieldTable, markdown, read_field_table, write_field_table
+from poise.eval.field_paper import PHC_RECOVERY, PHC_ROWS, paper_rows
+from poise.eval.field_table import field_table
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.scorecard import Help, ScoreCard, read_score, score_rollouts, write_score
 from poise.eval.verdicts import THRESHOLDS, Row, Threshold, table
 
 __all__ = [
+    "PHC_RECOVERY",
+    "PHC_ROWS",
     "THRESHOLDS",
+    "FieldTable",
     "Help",
     "Recording",
     "RolloutSet",
     "Row",
     "ScoreCard",
     "Threshold",
+    "field_table",
+    "markdown",
+    "paper_rows",
+    "read_field_table",
     "read_score",
     "run_episodes",
     "score_rollouts",
     "shapes_of",
     "start_frames",
     "table",
+    "write_field_table",
     "write_score",
 ]
