@@ -11,7 +11,7 @@ import pytest
 import torch
 from toy_library import Script, Scripted, library, tiny
 
-from poise.learn import LATEST, Until, load_policy
+from poise.learn import LATEST, IterationStats, Trainer, Until, load_policy
 from poise.learn.progressive import primitive
 from poise.nets import Composer
 from poise.recipes import perpetual_run, perpetual_stages
@@ -20,6 +20,7 @@ from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual_run import PerpetualResult, begin, train
 from poise.recipes.perpetual_stages import Course, Progress, share_of
 from poise.recipes.session import FINAL
+from poise.sim import UnstableError
 
 
 def script(kind: str, columns: int, scale: float, clip: int) -> bool:
@@ -154,3 +155,40 @@ def test_the_library_goes_into_the_checkpoint_of_no_stage(tmp_path: Path, script
     files = {p.name for p in tmp_path.iterdir()}
     wanted = {"run.safetensors", LATEST, FINAL, "log.csv", "success.csv", "result.json"}
     assert files == wanted
+
+
+def test_a_simulation_that_goes_bad_does_not_end_the_training(
+    tmp_path: Path, scripted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scripted(script)
+    plain, calls = Trainer.iterate, [0]
+    monkeypatch.setattr(UnstableError, "__init__", lambda self, failures: None)
+    monkeypatch.setattr(UnstableError, "__str__", lambda self: "the knee")
+
+    def shaky(self: Trainer) -> IterationStats:
+        calls[0] += 1
+        if calls[0] == 2:
+            plain(self)
+            raise UnstableError([])
+        return plain(self)
+
+    monkeypatch.setattr(Trainer, "iterate", shaky)
+    _, shown, _ = watched(tmp_path, tiny(max_primitives=1, expert=False), 4)
+    assert [p.iteration for p in shown] == [1, 2, 3, 4]
+    assert [p.trouble for p in shown] == ["", "the knee", "", ""]
+    with (tmp_path / "log.csv").open(newline="") as file:
+        assert [r["iteration"] for r in csv.DictReader(file)] == ["1", "2", "3", "4"]
+
+
+def test_a_simulation_that_always_goes_bad_ends_it(
+    tmp_path: Path, scripted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scripted(script)
+    monkeypatch.setattr(UnstableError, "__init__", lambda self, failures: None)
+
+    def bad(self: Trainer) -> IterationStats:
+        raise UnstableError([])
+
+    monkeypatch.setattr(Trainer, "iterate", bad)
+    with pytest.raises(UnstableError):
+        watched(tmp_path, tiny(max_primitives=1, expert=False), 4)

@@ -162,7 +162,11 @@ def times(p: Progress) -> str:
 
 
 def events(p: Progress) -> None:
-    """A line for each evaluation, and one where another stage begins."""
+    """A line for each evaluation, where another stage begins, and for what went wrong."""
+    if p.trouble:
+        tell(
+            f"Gone on from the last checkpoint with other draws, since a simulation failed: {p.trouble}"
+        )
     if p.results is not None:
         won, total = int(p.results.succeeded.sum()), len(p.results.clip)
         tell(

@@ -45,8 +45,10 @@ class Perpetual:
 
     goal: what is told of the next frame, "rotations" and places or "keypoints", which are places alone.
     shape: limb lengths and masses are observed, too. action: "absolute" as in the paper, or "additive"
-    to the reference's angles. faithful: where the paper and its code disagree about the reward.
-    energy: weight of the energy penalty, 0 for none. style: the motion prior, None for none.
+    to the reference's angles. faithful: where the paper and its code disagree about Eq. 2.
+    energy: weight of the energy penalty in the code's form, 0 for none; by default that of the code's
+    composer, since with ten times as much falling early would pay, see `phc_reward.energy_term`.
+    style: the motion prior, None for none.
     termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
     "code". first: share of the episodes that begin on frame 0, as evaluations do.
     single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
@@ -96,7 +98,13 @@ class Perpetual:
     body: BodyConfig = field(default_factory=BodyConfig)
     sim: SimConfig = field(default_factory=SimConfig)
     ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(std=0.02, policy_lr=3e-4, policy_hidden=(512, 256))
+        default_factory=lambda: PPOConfig(
+            std=0.02,
+            policy_lr=2e-5,
+            kl_target=0.05,
+            lr_range=(5e-6, 3e-4),
+            policy_hidden=(512, 256),
+        )
     )
 
     def __post_init__(self) -> None:
@@ -130,7 +138,7 @@ def task(config: Perpetual, humanoid: Humanoid) -> TaskConfig:
     rewards = phc_reward.imitation_terms(config.faithful)
     if config.energy:
         halved = config.style.task_weight if config.style else 1.0
-        rewards += (phc_reward.energy_term(halved, config.faithful, config.energy),)
+        rewards += (phc_reward.energy_term(halved, weight=config.energy),)
     if config.help_start:
         rewards += (RewardTerm("residual", reward.residual, 0.1, imitation=False),)
     limit, gamma = config.help_start, config.ppo.gamma

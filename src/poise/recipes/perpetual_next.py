@@ -100,8 +100,8 @@ def begin_composer(
     env = unhelped(imitation).env(
         min(config.num_envs, 512), threads=threads, dumps=dumps, help_scale=0.0
     )
-    # The critic goes on from the primitives.
-    settings = replace(config.clone, critic_steps=0)
+    # Choosing among primitives is learned sooner than acting; the critic goes on from them.
+    settings = replace(config.clone, rounds=min(1, config.clone.rounds), critic_steps=0)
     try:
         taught, _ = clone(
             cast(VecEnv, env), Owners(env, policy, owner), settings, imitation.ppo(), config.seed,

@@ -31,7 +31,7 @@ from poise.learn import (
     load_policy,
 )
 from poise.learn.checkpoint import remove_partial
-from poise.learn.state import prefixed, under
+from poise.learn.state import make_generator, prefixed, under
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
@@ -45,6 +45,10 @@ from poise.recipes.perpetual_next import (
     critic_of,
     make_trainer,
 )
+from poise.sim import UnstableError
+
+#: Simulations that may go bad between two evaluations.
+MOST_TROUBLES = 5
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class Progress:
     stage: the one that was trained, of whose `clips` the last evaluation saw `succeeded`, or None before
     the first. iteration: over all stages. share: of the whole training, 0 to 1. help_n: N, what is left.
     results: an evaluation that was made after this iteration. following: the stage that begins now.
+    trouble: what went wrong before this iteration, which then was made again from the last checkpoint.
     """
 
     stage: Stage
@@ -65,6 +70,7 @@ class Progress:
     help_n: float
     results: ClipResults | None
     following: Stage | None
+    trouble: str = ""
 
 
 def share_of(until: Until, iterations: int, samples: int, seconds: float) -> float:
@@ -96,9 +102,12 @@ class Course:
         self.imitation, self.folder, self.until = imitation, folder, until
         self.config: Perpetual = imitation.config
         self.threads, self.device, self.save_s = threads, device, save_s
+        self.tensorboard = tensorboard
         self.dumps, self.tell = folder / "dumps", tell or Beginning()
         self.ledger = Ledger(self.config, imitation.reference.length)
         self.finished, self.before, self.begun = False, 0, (0, 0.0)
+        # How often a simulation went bad in all, and since the last evaluation.
+        self.troubles = (0, 0)
         if (folder / LATEST).exists():
             self._load()
             remove_partial(folder)
@@ -106,6 +115,8 @@ class Course:
             stage, start = begin_first(imitation, threads, self.dumps, self.tell)
             warm = start is not None and start.critic is not None
             self._enter(stage, start, warm, 1.0)
+            # What the clone has cost is no time with help.
+            self.begun = self.trainer.samples, self.trainer.seconds
         self.history = History(folder, imitation.library.names, self.iteration)
         self.log = Log(folder, self.iteration, tensorboard)
         self._saved_at = time.monotonic()
@@ -175,13 +186,14 @@ class Course:
         """One iteration, with the evaluation, the next stage and the checkpoint that are due."""
         stage, results, following = self.stage, None, None
         self._limit_help()
-        stats = self.trainer.iterate()
+        stats, trouble = self._learn()
         self._limit_help()
         iteration, share, help_n = self.iteration, self.share, self.help * self.config.help_start
         row = stats.row() | {"iteration": iteration, "stage": stage.number}
         seen = self.ledger.seen
         if share >= self.until_share or self.trainer.iteration % self.every == 0:
             results, decision = self._judge(share)
+            self.troubles = (self.troubles[0], 0)
             seen = self.ledger.seen
             row |= {
                 "eval/clips": len(results.clip),
@@ -192,7 +204,34 @@ class Course:
         self.log.write(row)
         if results is not None or time.monotonic() - self._saved_at >= self.save_s:
             self.save()
-        return Progress(stage, iteration, stats, share, *seen, help_n, results, following)
+        return Progress(stage, iteration, stats, share, *seen, help_n, results, following, trouble)
+
+    def _learn(self) -> tuple[IterationStats, str]:
+        """One iteration, and what went wrong before it.
+
+        Where a simulation goes bad, as one world in millions of steps may do, training goes on from the
+        last checkpoint with other draws, since the same ones would end there again.
+
+        Raises:
+            UnstableError: it happens again and again.
+        """
+        trouble = ""
+        while True:
+            try:
+                return self.trainer.iterate(), trouble
+            except UnstableError as problem:
+                total, lately = self.troubles
+                if lately >= MOST_TROUBLES:
+                    raise
+                trouble, self.troubles = str(problem), (total + 1, lately + 1)
+                self.trainer.load(self.folder / LATEST)
+                self.log.close()
+                self.log = Log(self.folder, self.iteration, self.tensorboard)
+                other, noise = f"after trouble {total + 1}", self.trainer.ppo.noise
+                draws = make_generator(self.config.seed, other, noise.device)
+                noise.set_state(draws.get_state())
+                self.env.reseed(int(draws.initial_seed()))
+                self.save()
 
     def _limit_help(self) -> None:
         """No more help than the stage's time allows, so that it ends in any case."""
@@ -277,7 +316,8 @@ class Course:
         self.log.flush()
         self.trainer.metadata["course"] = {
             "stage": asdict(self.stage), "warm": self.warm, "before": self.before,
-            "begun": list(self.begun), "finished": self.finished, "ledger": self.ledger.facts(),
+            "begun": list(self.begun), "troubles": list(self.troubles),
+            "finished": self.finished, "ledger": self.ledger.facts(),
         }  # fmt: skip
         self.trainer.save(self.folder / LATEST, prefixed("ledger", self.ledger.state()))
         self._saved_at = time.monotonic()
@@ -289,6 +329,8 @@ class Course:
         self.ledger.load(under("ledger", tensors), said["ledger"])
         samples, seconds = said["begun"]
         self.before, self.begun, self.finished = said["before"], (samples, seconds), said["finished"]
+        total, lately = said["troubles"]
+        self.troubles = (total, lately)
         # A trainer takes the sizes and the action noise from the policy it starts with.
         start = WarmStart(load_policy(path))
         self._enter(Stage(**said["stage"]), start, said["warm"], 1.0)
