@@ -15,8 +15,9 @@ from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary
 from poise.recipes import perpetual_next, perpetual_stages
 from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_progress import Progress
 from poise.recipes.perpetual_run import begin, from_json, resume, to_json, train
-from poise.recipes.perpetual_stages import Course, Progress
+from poise.recipes.perpetual_stages import Course
 from poise.recipes.session import FINAL
 
 ITERATIONS = 12

@@ -17,8 +17,9 @@ from poise.nets import Composer
 from poise.recipes import perpetual_run, perpetual_stages
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_progress import Progress, share_of
 from poise.recipes.perpetual_run import PerpetualResult, begin, train
-from poise.recipes.perpetual_stages import Course, Progress, share_of
+from poise.recipes.perpetual_stages import Course
 from poise.recipes.session import FINAL
 from poise.sim import UnstableError
 

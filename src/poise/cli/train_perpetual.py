@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from poise.learn import Until
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
+    from poise.recipes.perpetual_progress import Progress
     from poise.recipes.perpetual_run import PerpetualResult
-    from poise.recipes.perpetual_stages import Progress
 
 #: Clips that are named in the end.
 NAMED = 10

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -27,25 +27,8 @@ from poise.nets import Composer
 from poise.recipes.expert import Beginning, clone_expert, finetuning
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_progress import Stage
 from poise.sim import UnstableError
-
-Kind = Literal["primitive", "single", "composer"]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One training after another: primitives 1 to K and the composer, or the single network.
-
-    number: counts all stages of a run from 1.
-    """
-
-    kind: Kind
-    number: int = 1
-
-    @property
-    def name(self) -> str:
-        """As it is shown and noted: "primitive 2"."""
-        return f"primitive {self.number}" if self.kind == "primitive" else self.kind
 
 
 def begin_first(

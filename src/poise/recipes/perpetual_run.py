@@ -31,7 +31,8 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import RECIPE, Perpetual, build
 from poise.recipes.perpetual_data import LibraryConfig, library_of, split
 from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
-from poise.recipes.perpetual_stages import Course, Progress
+from poise.recipes.perpetual_progress import Progress
+from poise.recipes.perpetual_stages import Course
 from poise.recipes.session import FINAL, RUN_FILE
 
 RESULT = "result.json"

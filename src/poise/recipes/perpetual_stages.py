@@ -10,7 +10,7 @@ as if nothing had happened.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,47 +38,17 @@ from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual_eval import ClipResults, History, evaluate_clips
 from poise.recipes.perpetual_ledger import Ledger
 from poise.recipes.perpetual_next import (
-    Stage,
     begin_composer,
     begin_first,
     begin_primitive,
     critic_of,
     make_trainer,
 )
+from poise.recipes.perpetual_progress import Progress, Stage, share_of
 from poise.sim import UnstableError
 
 #: Simulations that may go bad between two evaluations.
 MOST_TROUBLES = 5
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What one iteration came to.
-
-    stage: the one that was trained, of whose `clips` the last evaluation saw `succeeded`, or None before
-    the first. iteration: over all stages. share: of the whole training, 0 to 1. help_n: N, what is left.
-    results: an evaluation that was made after this iteration. following: the stage that begins now.
-    trouble: what went wrong before this iteration, which then was made again from the last checkpoint.
-    """
-
-    stage: Stage
-    iteration: int
-    stats: IterationStats
-    share: float
-    succeeded: int | None
-    clips: int
-    help_n: float
-    results: ClipResults | None
-    following: Stage | None
-    trouble: str = ""
-
-
-def share_of(until: Until, iterations: int, samples: int, seconds: float) -> float:
-    """How much of the nearest limit is used up, 0 to 1."""
-    used = (
-        (seconds / 60, until.minutes), (iterations, until.iterations), (samples, until.samples)
-    )  # fmt: skip
-    return min(1.0, max(a / b if b else 1.0 for a, b in used if b is not None))
 
 
 class Course:
