@@ -107,3 +107,11 @@ def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> Non
         (("--hold-out", "nobody"), "fits no clip"),
     ):
         refused(*command(folder, tmp_path / "out", *more), words=(words,))
+
+
+def test_it_trains_in_one_process(
+    folder: Path, tmp_path: Path, refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("TORCHELASTIC_RUN_ID", "x"), ("WORLD_SIZE", "2"), ("RANK", "0")):
+        monkeypatch.setenv(name, value)
+    refused(*command(folder, tmp_path / "out"), words=("in one process", "without torchrun"))

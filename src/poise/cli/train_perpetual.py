@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from tyro.conf import arg
 
 from poise.cli import progress
 from poise.cli.beginning import beginning
-from poise.cli.console import err, notes, say, table, tell
+from poise.cli.console import err, launched, notes, say, table, tell
 from poise.cli.options import Body, Training
 from poise.cli.output import claimed
 from poise.cli.progress import EVERY_S, clock
@@ -51,6 +52,9 @@ def run(
     if network.library is None:
         hint = "Write poise train perpetual --library DIR -o RUNDIR"
         raise PoiseError("the recipe perpetual needs --library", hint=hint)
+    if launched() and int(os.environ["WORLD_SIZE"]) > 1:
+        hint = "Start it without torchrun; --threads and --device take all of one machine"
+        raise PoiseError("the recipe perpetual trains in one process", hint=hint)
     training.check()
     config = settings(primitives, training, body)
     from poise.learn import Until
