@@ -112,6 +112,7 @@ def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> Non
 def test_it_trains_in_one_process(
     folder: Path, tmp_path: Path, refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in (("TORCHELASTIC_RUN_ID", "x"), ("WORLD_SIZE", "2"), ("RANK", "0")):
+    sizes = {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "RANK": "0"}
+    for name, value in ({"TORCHELASTIC_RUN_ID": "x"} | sizes).items():
         monkeypatch.setenv(name, value)
     refused(*command(folder, tmp_path / "out"), words=("in one process", "without torchrun"))
