@@ -4,10 +4,12 @@
     python benchmarks/rsl_rl_twin.py CLIP [--samples 2000000] [--envs 512] [--seeds 1] [--out FILE]
 
 Writes FILE.json (both learning curves, samples/s, settings, versions) and FILE.svg (the curves over
-samples). Each learner runs alone, one after the other, in turns of `--seeds` seeds; the worlds, their
-seeds, the rewards, horizon, minibatches, epochs, networks, noise and discount are the same. What
-rsl_rl does in another way stays its own: one learning rate for both networks, clipped value loss,
-no scaled returns. `--rsl-lr adaptive` lets it choose the rate by its KL rule.
+samples). What is compared is the deterministic policy from 64 start frames to the clip's end, since
+rsl_rl learns how much noise it explores with and the reward of training depends on that. Each learner
+runs alone, one after the other, in turns of `--seeds` seeds; the worlds, their seeds, the rewards,
+horizon, minibatches, epochs, networks, first noise and discount are the same. What rsl_rl does in
+another way stays its own: one learning rate for both networks, clipped value loss, no scaled returns,
+learned noise. `--rsl-lr adaptive` lets it choose the rate by its KL rule.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import io
 import json
 import platform
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -26,6 +29,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
 
 from poise.env.rsl_rl import GROUP, RslRlVecEnv
 from poise.learn import Trainer, VecEnv
@@ -33,20 +37,42 @@ from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
+from poise.recipes.session import evaluate
 from poise.view.svg import line_plot
 
-Curve = list[tuple[int, float, float]]  # Samples, seconds, imitation reward of the last step.
+#: Samples, seconds of training; of the deterministic policy Succ, reward per step, joint error in mm;
+#: and the reward of the last training step, noise included.
+Curve = list[tuple[int, float, float, float, float, float]]
 
 
-def ours(task: Imitation, seed: int, samples: int) -> Curve:
+class _Acting:
+    """Rsl_rl's network as a policy that can be evaluated."""
+
+    def __init__(self, network: Callable[[TensorDict], torch.Tensor]):
+        self.network = network
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.network(TensorDict({GROUP: obs}, [len(obs)]))
+
+
+def _scored(task: Imitation, policy: Any) -> tuple[float, float, float]:
+    card = evaluate(task, policy, {}, most=64).card
+    return card.succ, card.reward["total"], card.mpjpe_mm
+
+
+def ours(task: Imitation, seed: int, samples: int, every: int) -> Curve:
     """Our PPO; the clock counts collection and update, as rsl_rl's does."""
     env = task.env(seed=seed)
     trainer = Trainer(cast(VecEnv, env), task.ppo(), seed, task.humanoid.identity)
     trainer.state()  # The warm-up of the statistics is not counted.
     curve: Curve = []
+    due = every
     while trainer.samples < samples:
         stats = trainer.iterate()
-        curve.append((stats.samples, stats.seconds, stats.terms["imitation"]))
+        if stats.samples >= due or stats.samples >= samples:
+            score = _scored(task, trainer.policy())
+            curve.append((stats.samples, stats.seconds, *score, stats.terms["imitation"]))
+            due += every
     env.close()
     return curve
 
@@ -63,7 +89,7 @@ class _Watched(RslRlVecEnv):
         return out
 
 
-def theirs(task: Imitation, seed: int, samples: int, rate: str) -> Curve:
+def theirs(task: Imitation, seed: int, samples: int, every: int, rate: str) -> Curve:
     """Rsl_rl's PPO through the adapter, with the settings of `task` where it has them."""
     torch.manual_seed(seed)
     ppo, env = task.ppo(), _Watched(task.env(seed=seed))
@@ -107,22 +133,29 @@ def theirs(task: Imitation, seed: int, samples: int, rate: str) -> Curve:
             last.weight.mul_(0.1)
             last.bias.mul_(0.1)
         curve: Curve = []
-        seconds = 0.0
-        while len(curve) * batch < samples:
+        seconds, made, due = 0.0, 0, every
+        while made < samples:
             env.total, env.steps = 0.0, 0
             begun = time.perf_counter()
             runner.learn(1)
             seconds += time.perf_counter() - begun
-            curve.append(((len(curve) + 1) * batch, seconds, env.total / env.steps))
+            made += batch
+            if made >= due or made >= samples:
+                score = _scored(task, _Acting(runner.get_inference_policy()))
+                curve.append((made, seconds, *score, env.total / env.steps))
+                runner.alg.train_mode()
+                due += every
     env.close()
     return curve
 
 
 def summary(curves: list[Curve]) -> dict[str, Any]:
-    """Median rate and last reward over the seeds, and every curve."""
+    """Medians over the seeds of the rate and of the last figures, and every curve."""
     return {
         "samples_per_s": float(np.median([c[-1][0] / c[-1][1] for c in curves])),
-        "reward_last": float(np.median([np.mean([x[2] for x in c[-5:]]) for c in curves])),
+        "succ": float(np.median([c[-1][2] for c in curves])),
+        "reward": float(np.median([c[-1][3] for c in curves])),
+        "mpjpe_mm": float(np.median([c[-1][4] for c in curves])),
         "curves": curves,
     }
 
@@ -131,6 +164,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("clip", type=Path)
     parser.add_argument("--samples", type=int, default=2_000_000)
+    parser.add_argument("--every", type=int, default=200_000, help="samples between evaluations")
     parser.add_argument("--envs", type=int, default=512)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--rsl-lr", choices=("fixed", "adaptive"), default="fixed")
@@ -143,19 +177,23 @@ def main() -> None:
     task = build(ClipLibrary.of(read_clip(args.clip)), config)
     curves: dict[str, list[Curve]] = {"poise": [], "rsl_rl": []}
     for seed in range(args.seeds):
-        curves["poise"].append(ours(task, seed, args.samples))
-        curves["rsl_rl"].append(theirs(task, seed, args.samples, args.rsl_lr))
+        curves["poise"].append(ours(task, seed, args.samples, args.every))
+        curves["rsl_rl"].append(theirs(task, seed, args.samples, args.every, args.rsl_lr))
     result: dict[str, Any] = {name: summary(c) for name, c in curves.items()}
     versions = {name: metadata.version(name) for name in ("torch", "mujoco", "rsl-rl-lib")}
     result |= {"clip": args.clip.stem, "samples": args.samples, "envs": args.envs, "rsl_lr": args.rsl_lr}
     result |= {"versions": versions, "machine": platform.machine(), "torch_threads": args.threads}
     args.out.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
     # The first seed's curves; all are in the JSON.
-    lines = [(name, [x[0] for x in c[0]], [x[2] for x in c[0]]) for name, c in curves.items()]
-    line_plot(lines, f"{args.clip.stem}, equal samples", "samples", "imitation reward", svg)
+    lines = [(name, [x[0] for x in c[0]], [x[3] for x in c[0]]) for name, c in curves.items()]
+    title = f"{args.clip.stem}, equal samples, deterministic policies"
+    line_plot(lines, title, "samples", "reward per step", svg)
     for name in curves:
-        rate, reward = result[name]["samples_per_s"], result[name]["reward_last"]
-        print(f"{name:<7} {rate:>10,.0f} samples/s   imitation reward at the end {reward:.3f}")
+        r = result[name]
+        print(
+            f"{name:<7} {r['samples_per_s']:>10,.0f} samples/s   at the end: succ {r['succ']:.3f}, "
+            f"reward {r['reward']:.3f}, {r['mpjpe_mm']:.1f} mm"
+        )
 
 
 if __name__ == "__main__":

@@ -9,11 +9,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from poise.env import Recovery
+from poise.control import PDTargets
+from poise.env import Recovery, TaskConfig
 from poise.env.falls import Drop
 from poise.errors import PoiseError
 from poise.eval import recovery_card, trial_task, write_recovery
-from poise.eval.recovery import KINDS, PHC_RECOVERY, back_after
+from poise.eval.field_paper import PHC_RECOVERY
+from poise.eval.recovery import KINDS, back_after
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from toy_human import swing
@@ -126,16 +128,8 @@ def test_what_cannot_be_tried_is_told(built):
         recovery_card(lambda n: plain.env(n, 0, False, threads=1), Still(1), 2)
 
 
-def test_the_papers_table_is_as_printed():
-    assert PHC_RECOVERY["PHC"]["far"] == (0.837, 0.995)
-    assert trial_task(replace_task()).recovery == replace(
-        Recovery.phc(), distance=(3.0, 3.0), drop=Drop(count=1000)
-    )
-
-
-def replace_task():
-    """A task that knows nothing of recovery."""
-    from poise.control import PDTargets
-    from poise.env import TaskConfig
-
-    return TaskConfig((), (), (), PDTargets())
+def test_a_task_without_recovery_is_tried_as_the_papers():
+    plain = TaskConfig((), (), (), PDTargets())
+    asked = trial_task(plain).recovery
+    assert asked == replace(Recovery.phc(), distance=(3.0, 3.0), drop=Drop(count=1000))
+    assert {r.start for r in PHC_RECOVERY} == set(KINDS)

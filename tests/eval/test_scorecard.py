@@ -17,7 +17,7 @@ KEYS = [
     "succ", "succ_rule", "mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame2",
     "foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk", "reward", "help", "seconds",
     "samples", "seed", "version", "clip", "method", "episodes", "frames", "mpjpe_succ_mm",
-    "reference", "per_clip", "weighting", "variants",
+    "reference", "per_clip", "weighting", "variants", "delivered",
 ]  # fmt: skip
 HELP_KEYS = [
     "limit_n", "limit_nm", "force_mean_n", "force_p95_n", "torque_mean_nm", "torque_p95_nm",

@@ -140,6 +140,12 @@ def test_inserted_rest_frame_is_dropped(tmp_path: Path) -> None:
     clip = read_clip(put(tmp_path, "a.bvh", bvh_text([rest, *moving])))
     assert clip.frames == 30
     assert clip.skeleton.source.notes[0].startswith("Frame 0 is a rest pose that was put before")
+    # A converter that smooths over the jump leaves frames that are no motion either.
+    eased = [" ".join(["0 90 0", "5 5 3", *[f"{angle}"] * 12]) for angle in (10, 30, 42, 48, 50)]
+    still = [" ".join(["0 90 0", "5 5 3", *[f"{50 + 0.1 * t:.2f}"] * 12]) for t in range(1, 30)]
+    clip = read_clip(put(tmp_path, "c.bvh", bvh_text([rest, *eased, *still])))
+    assert clip.frames == 30
+    assert clip.skeleton.source.mended == (("rest frame", "", 0, 4, 5.0),)
     # A motion that merely starts from rest keeps its first frame.
     slow = [" ".join([f"0 90 {t}", f"{t} 0 0", *["0"] * 12]) for t in range(30)]
     assert read_clip(put(tmp_path, "b.bvh", bvh_text(slow))).frames == 30

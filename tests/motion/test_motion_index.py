@@ -24,11 +24,12 @@ def expected_unit(path: str) -> float:
 def check(clip: Clip, row: dict[str, str]) -> None:
     path = row["path"]
     facts = describe(clip)
-    dropped = any(w.startswith("Frame 0 is a rest pose") for w in facts["warnings"])
+    # Both conversions put a rest pose first; acRNN's eases out of it for three to five frames more.
+    dropped = sum(int(m[4]) for m in clip.skeleton.source.mended if m[0] == "rest frame")
     assert facts["joints"] == int(row["joints"]), path
     assert facts["frames"] == int(row["frames"]) - dropped, path
     assert abs(facts["fps"] - float(row["fps"])) < 2e-3, path
-    assert dropped == ("acrnn" in path or "fairmotion" in path), path
+    assert (dropped in (4, 5, 6)) if "acrnn" in path else dropped == ("fairmotion/" in path), path
     assert np.isclose(facts["unit_m"], expected_unit(path)), path
     z_up = "cmu_bvh/ad/" in path and "14_14" not in path and "jumping" not in path
     assert facts["up_axis"] == ("Z" if z_up else "Y"), path
@@ -75,7 +76,7 @@ def test_arrays_of_the_index(data_dir: Path) -> None:
 
 
 def test_known_teleports(data_dir: Path) -> None:
-    for name, frames in (("04", ("346", "347", "350")), ("10", ("317", "356", "361"))):
+    for name, frames in (("04", ("341", "342", "345")), ("10", ("313", "352", "357"))):
         clip = read_clip(data_dir / f"cmu_bvh/acrnn_salsa/{name}.bvh")
         note = next(n for n in clip.skeleton.source.notes if n.startswith("The root jumps"))
         assert all(f in note for f in frames)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from poise.eval import Recording
-from poise.motion import Clip, ClipLibrary
+from poise.motion import Clip, ClipLibrary, read_clip
 from poise.recipes import ResidualForce, build
-from poise.recipes.deliver import simulated_clip
+from poise.recipes.deliver import deliver, simulated_clip
 from poise.recipes.session import Evaluation, evaluate
 from toy_human import swing
 
@@ -73,3 +76,23 @@ def test_a_real_evaluation_is_delivered_whole():
     assert (out.frames, out.fps, out.skeleton) == (source.frames, source.fps, source.skeleton)
     # It begins on the first frame and then falls where physics takes it.
     assert np.ptp((out.positions() - source.positions())[0], axis=0).max() < 1e-3
+
+
+def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -> None:
+    source = swing(0.5, 60.0, name="source")
+    imitation = build(source, ResidualForce(num_envs=2))
+    extra = imitation.task.residual.dims if imitation.task.residual else 0
+    policy = Nothing(len(imitation.humanoid.hinges) + extra)
+    evaluation = evaluate(imitation, policy, {})  # type: ignore[arg-type]
+    raw = simulated_clip(imitation, evaluation)
+    done = deliver(imitation, evaluation, tmp_path / "raw", {}, tmp_path / "raw.npz", hold=False)
+    assert done.card.delivered == () and done.notes == ()
+    assert np.abs(read_clip(tmp_path / "raw.npz").positions() - raw.positions()).max() < 1e-9
+    done = deliver(imitation, evaluation, tmp_path / "held", {})
+    (figures,) = json.loads((tmp_path / "held/score.json").read_text())["delivered"]
+    assert figures["delivered"]["penetration_mm"] <= figures["simulated"]["penetration_mm"] + 0.1
+    assert set(figures) == {
+        "clip", "held_mean_mm", "held_max_mm", "source", "simulated", "delivered"
+    }  # fmt: skip
+    # The score is that of the simulation, however the file was mended.
+    assert done.card.foot_slide_mm_per_s == evaluation.card.foot_slide_mm_per_s

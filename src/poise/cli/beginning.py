@@ -34,7 +34,9 @@ def beginning(first: First | None = None) -> Beginning:
     return Beginning(expert, cloned_round, first, failed)
 
 
-def first_delivery(imitation: Imitation, out: Path, motion: Path | None = None) -> First:
+def first_delivery(
+    imitation: Imitation, out: Path, motion: Path | None = None, hold: bool = True
+) -> First:
     """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
 
     def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
@@ -44,7 +46,7 @@ def first_delivery(imitation: Imitation, out: Path, motion: Path | None = None) 
 
         meta = {"seconds": start.seconds, "samples": start.samples}
         evaluation = evaluate(imitation, policy, meta, most=FIRST_STARTS)
-        paths = deliver(imitation, evaluation, out, {}, motion)
+        paths = deliver(imitation, evaluation, out, {}, motion, hold).paths
         tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
 
     return deliver_first

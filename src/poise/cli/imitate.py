@@ -28,6 +28,8 @@ class Options:
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
+    hold_feet: bool = True
+    """Hold standing feet to the spot in the written motion; score.json shows the simulation itself."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
@@ -43,7 +45,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
 
     with joined() as comm:
         imitation = job.start(comm)
-        result = job.train(imitation, comm, first_delivery(imitation, out, motion))
+        result = job.train(imitation, comm, first_delivery(imitation, out, motion, o.hold_feet))
     if result.interrupted:
         return job.stopped("Stopped; the training so far is saved.")
     if comm.rank:
@@ -55,11 +57,14 @@ def run(options: Options, argv: Sequence[str]) -> int:
         with working("simulating every start frame"):
             trained, device = trained_policy(job.run, imitation), o.training.device
             evaluation = evaluate(imitation, *trained, device=device)
-            paths = deliver(imitation, evaluation, out, learning_curve(job.run), motion)
+            curve = learning_curve(job.run)
+            done = deliver(imitation, evaluation, out, curve, motion, o.hold_feet)
     except KeyboardInterrupt:
         return job.stopped("Stopped in the evaluation; the training is saved.")
-    print_card(evaluation.card)
-    for path in (*paths.values(), job.run):
+    print_card(done.card)
+    for note in done.notes:
+        say(note)
+    for path in (*done.paths.values(), job.run):
         say(str(path))
     return 0
 

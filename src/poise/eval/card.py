@@ -64,6 +64,7 @@ class ScoreCard:
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
     variants: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    delivered: tuple[Mapping[str, Any], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values with the keys in field order; what is not finite becomes None."""

@@ -21,19 +21,11 @@ from poise.env import ImitationEnv, Recovery, TaskConfig
 from poise.env.recovery import FALLEN, FAR
 from poise.errors import PoiseError
 from poise.eval.episodes import Acts
+from poise.eval.field_paper import PHC_RECOVERY
 
 #: The fail-states by name.
 KINDS: Mapping[str, int] = {"fallen": FALLEN, "far": FAR, "fallen and far": FALLEN | FAR}
 
-#: Table 4 of the paper: shares that are back within 5 and within 10 s.
-PHC_RECOVERY: Mapping[str, Mapping[str, tuple[float, float]]] = {
-    "PHC": {"fallen": (0.950, 0.988), "far": (0.837, 0.995), "fallen and far": (0.934, 0.988)},
-    "PHC keypoints": {
-        "fallen": (0.925, 0.946),
-        "far": (0.951, 0.960),
-        "fallen and far": (0.794, 0.932),
-    },
-}
 #: The times of that table, s.
 SECONDS = (5.0, 10.0)
 
@@ -85,9 +77,10 @@ class RecoveryCard:
         head = ["method", "trials", *(f"{kind} {time}" for kind in kinds for time in times)]
         own = [self.method, str(max(r.trials for r in self.rows))]
         lines = [head, ["---"] * len(head), [*own, *(_share(x) for r in self.rows for x in r.within)]]
-        for name, told in PHC_RECOVERY.items():
-            found = [dict(zip(SECONDS, told.get(k, ()), strict=False)) for k in kinds]
-            cells = [_share(f.get(s, math.nan)) for f in found for s in self.seconds]
+        told = {(r.method, r.start): (r.succ_5s, r.succ_10s) for r in PHC_RECOVERY}
+        for name in dict.fromkeys(r.method for r in PHC_RECOVERY):
+            found = [dict(zip(SECONDS, told[name, kind], strict=True)) for kind in kinds]
+            cells = [_share(f.get(s, math.nan) / 100) for f in found for s in self.seconds]
             lines.append([f"{name} (table 4)", "1000", *cells])
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         low, high = self.distance

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.eval.card import NAN, Help, ScoreCard, Weighting, read_score, write_score
+from poise.eval.judged import Sums, judge
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.verdicts import table
 from poise.metrics import (
@@ -28,7 +29,6 @@ from poise.metrics import (
     mpjpe_global,
     mpjpe_root,
     span_mask,
-    success,
     success_rule,
     velocity_error,
 )
@@ -47,51 +47,29 @@ TRACKING = ("mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame
 PLAUSIBILITY = ("foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk")
 
 
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """Sum and count of one figure per episode, so that either weighting is a division away."""
-
-    total: Tensor
-    count: Tensor
-
-    @staticmethod
-    def of(values: Tensor, mask: Tensor) -> _Sums:
-        """From `(E, ...)` values under a mask of the same shape."""
-        kept = torch.where(mask, values, torch.zeros_like(values)).double()
-        return _Sums(kept.flatten(1).sum(1), mask.flatten(1).sum(1))
-
-    def mean(self, rows: Tensor, weighting: Weighting) -> float:
-        """Over the episodes `rows (E,)` bool; NaN when they hold no sample."""
-        rows = rows & (self.count > 0)
-        if not bool(rows.any()):
-            return NAN
-        total, count = self.total[rows], self.count[rows]
-        return float(total.sum() / count.sum() if weighting == "frame" else (total / count).mean())
-
-
 def _plausibility(
     pos: Tensor, quat: Tensor, mask: Tensor, fps: float, shapes: Shapes | None, feet: tuple[int, ...]
-) -> dict[str, _Sums]:
+) -> dict[str, Sums]:
     """The plausibility figures of one side (simulation or reference); the same code serves both."""
-    out = {"jerk": _Sums.of(jerk(pos, fps), span_mask(mask, 3))}
+    out = {"jerk": Sums.of(jerk(pos, fps), span_mask(mask, 3))}
     if shapes is None:
         return out
     lowest = lowest_points(pos, quat, shapes)
-    out["penetration_mm"] = _Sums.of((-lowest).clamp_min(0) * 1000.0, mask)
+    out["penetration_mm"] = Sums.of((-lowest).clamp_min(0) * 1000.0, mask)
     height = centre_of_mass(pos, quat, shapes)[..., 2]
-    out["float_mm"] = _Sums.of(*float_gaps(lowest, height, fps, mask=mask))
+    out["float_mm"] = Sums.of(*float_gaps(lowest, height, fps, mask=mask))
     if feet:
         points = foot_points(pos, quat, shapes, feet)
-        out["foot_slide_mm_per_s"] = _Sums.of(*foot_contacts(points, fps, mask=mask))
+        out["foot_slide_mm_per_s"] = Sums.of(*foot_contacts(points, fps, mask=mask))
     return out
 
 
-def _tracking(r: RolloutSet, mask: Tensor) -> dict[str, _Sums]:
+def _tracking(r: RolloutSet, mask: Tensor) -> dict[str, Sums]:
     return {
-        "mpjpe_mm": _Sums.of(mpjpe_root(r.pos, r.ref_pos, r.root), mask),
-        "mpjpe_global_mm": _Sums.of(mpjpe_global(r.pos, r.ref_pos), mask),
-        "vel_mm_per_frame": _Sums.of(velocity_error(r.pos, r.ref_pos, r.fps), span_mask(mask, 1)),
-        "acc_mm_per_frame2": _Sums.of(acceleration_error(r.pos, r.ref_pos, r.fps), span_mask(mask, 2)),
+        "mpjpe_mm": Sums.of(mpjpe_root(r.pos, r.ref_pos, r.root), mask),
+        "mpjpe_global_mm": Sums.of(mpjpe_global(r.pos, r.ref_pos), mask),
+        "vel_mm_per_frame": Sums.of(velocity_error(r.pos, r.ref_pos, r.fps), span_mask(mask, 1)),
+        "acc_mm_per_frame2": Sums.of(acceleration_error(r.pos, r.ref_pos, r.fps), span_mask(mask, 2)),
     }
 
 
@@ -102,14 +80,14 @@ def _help(r: RolloutSet, audit: HelpAudit) -> Help:
 
 def _per_clip(
     r: RolloutSet,
-    sums: Mapping[str, _Sums],
+    sums: Mapping[str, Sums],
     mask: Tensor,
     won: Tensor,
     failed_at: Tensor,
     weighting: Weighting,
 ) -> tuple[Mapping[str, Any], ...]:
     """One entry per clip, in order of the clip's index; forces are pooled over the clip's frames."""
-    force = _Sums.of(r.force.norm(dim=-1).sum(-1), mask)
+    force = Sums.of(r.force.norm(dim=-1).sum(-1), mask)
     entries = []
     for index in sorted(set(r.clip.tolist())):
         rows = r.clip == index
@@ -155,26 +133,7 @@ def score_rollouts(
     if weighting not in ("frame", "episode"):
         raise PoiseError(f"the weighting must be 'frame' or 'episode', got '{weighting}'")
     chosen = success_rule(rule)
-    valid = r.valid
-    frame = torch.arange(r.pos.shape[1], device=r.pos.device)
-    outcome = success(
-        r.pos,
-        r.ref_pos,
-        torch.where(valid, frame + 1, 0).amax(1),
-        chosen,
-        bodies=r.rule_bodies,
-        root=r.root,
-        ref_min_height=r.ref_min_height,
-    )
-    won = outcome.success & r.reached_end.bool() & valid.any(1)
-    last = torch.where(outcome.first_fail >= 0, outcome.first_fail, r.pos.shape[1])
-    # A state that blew up is a failure, not a number to average.
-    finite = r.pos.isfinite().flatten(2).all(2) & r.quat.isfinite().flatten(2).all(2)
-    mask = valid & finite & (frame <= last.unsqueeze(-1))
-    # An episode that was stopped without breaking the rule failed at its last valid frame.
-    failed_at = torch.where(
-        won, -1, torch.where(outcome.first_fail >= 0, outcome.first_fail, valid.sum(1) - 1)
-    )
+    won, mask, failed_at = judge(r, chosen)
     sums = _tracking(r, mask) | _plausibility(r.pos, r.quat, mask, r.fps, r.shapes, r.feet)
     of_reference = _plausibility(r.ref_pos, r.ref_quat, mask, r.fps, r.shapes, r.feet)
     everyone = torch.ones_like(won)
@@ -196,7 +155,7 @@ def score_rollouts(
         succ_rule=chosen.name,
         **figures,
         reward={"total": NAN}
-        | {n: _Sums.of(v, mask).mean(everyone, weighting) for n, v in r.reward.items()},
+        | {n: Sums.of(v, mask).mean(everyone, weighting) for n, v in r.reward.items()},
         help=_help(r, audit),
         seconds=float(seconds),
         samples=int(samples),

@@ -11,6 +11,7 @@ from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground, lowest_height
 from poise.kin.guesses import Guess, find_guesses, grounded
 from poise.kin.hinges import chain_angles, chain_quat
+from poise.kin.hold import Held, hold_feet
 from poise.kin.ik import analytic_ik, clip_ik
 from poise.kin.ik_body import IkBody, ik_body
 from poise.kin.ik_config import CORRECTIONS, IkConfig
@@ -34,6 +35,7 @@ __all__ = [
     "FitReport",
     "GroundFit",
     "Guess",
+    "Held",
     "IkBody",
     "IkConfig",
     "Kinematics",
@@ -64,6 +66,7 @@ __all__ = [
     "fit_humanoid",
     "grounded",
     "heal",
+    "hold_feet",
     "ik_body",
     "limb_of",
     "lowest_height",

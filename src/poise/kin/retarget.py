@@ -73,11 +73,9 @@ def retarget(
     """
     began = time.perf_counter()
     config = config or RetargetConfig()
-    target, shown = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
-    joints = map_joints(clip.skeleton, target, mapping)
+    target = onto if isinstance(onto, Skeleton) else onto.skeleton
     world = World.of(clip)
-    here = common_pose(joints.source, clip, world) if example is None else _pose(joints.source, example)
-    there = here if _same(clip.skeleton, target) else _other_pose(joints, clip, shown)
+    joints, here, there = passage(clip, onto, mapping, example, world)
     scale = Scale.between(world, clip.fps, joints, here, there, config.scale)
     rot, root = transfer(world, joints, here, there, scale)
     feet = feet_of(joints, here, there)
@@ -94,6 +92,22 @@ def retarget(
     return made, measure(
         (world, World.of(made)), clip.fps, joints, (here, there), feet, contacts, scale, seconds
     )
+
+
+def passage(
+    clip: Clip,
+    onto: Skeleton | Clip,
+    mapping: Mapping[str, str] | None = None,
+    example: Clip | None = None,
+    world: World | None = None,
+) -> tuple[JointMap, CommonPose, CommonPose]:
+    """Which joint moves which, and how source and target stand in their common pose; see `retarget`."""
+    target, shown = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
+    joints = map_joints(clip.skeleton, target, mapping)
+    world = World.of(clip) if world is None else world
+    here = common_pose(joints.source, clip, world) if example is None else _pose(joints.source, example)
+    there = here if _same(clip.skeleton, target) else _other_pose(joints, clip, shown)
+    return joints, here, there
 
 
 def _same(a: Skeleton, b: Skeleton) -> bool:

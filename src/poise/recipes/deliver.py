@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from poise import __version__
-from poise.eval import write_score
-from poise.kin import lowest_height, qpos_to_clip
+from poise.eval import ScoreCard, clip_figures, write_score
+from poise.kin import Held, hold_feet, lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
@@ -44,32 +46,93 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
     return out.replaced(root_pos=out.root_pos[tail], rot=out.rot[tail])
 
 
+@dataclass(frozen=True, eq=False)
+class Delivery:
+    """paths: of what was written, by name. card: the score card as it was written. notes: what was done
+    to the motions beyond simulating them, in sentences."""
+
+    paths: dict[str, Path]
+    card: ScoreCard
+    notes: tuple[str, ...]
+
+
 def deliver(
     imitation: Imitation,
     evaluation: Evaluation,
     out: Path,
     curve: dict[str, np.ndarray],
     motion: Path | None = None,
-) -> dict[str, Path]:
-    """Writes the motion, `score.json` and `report.html` into `out`; returns their paths.
+    hold: bool = True,
+) -> Delivery:
+    """Writes the motion, `score.json` and `report.html` into `out`.
 
     The motion is `simulated.bvh`, or has the suffix of its source's format, see `home_suffix`. A library
     gets one `simulated_<clip>` file per clip; the report shows the first clip.
 
-    motion: the file for a single clip's motion, in the format of its suffix, in place of that in `out`.
+    Args:
+        motion: the file for a single clip's motion, in the format of its suffix, in place of that in
+            `out`.
+        hold: standing feet are held to the spot (`kin.hold_feet`): contacts of a simulation are soft,
+            so soles creep, rock and sink by millimetres. Score and report show the simulation itself;
+            what holding did stands in them as well.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
+    figures, notes = [], []
     for k, recording in enumerate(evaluation.recordings):
         single = len(evaluation.recordings) == 1
         name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
         clip = simulated_clip(imitation, evaluation, k)
+        if hold:
+            clip, found = _held(imitation, evaluation, recording.clip, clip)
+            figures.append(found)
+            notes += _sentences(found)
         paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"
         write_clip(clip, paths[name])
-    paths["score"] = write_score(evaluation.card, out / "score.json")
+    card = replace(evaluation.card, delivered=tuple(figures))
+    paths["score"] = write_score(card, out / "score.json")
     paths["report"] = out / "report.html"
-    write_report(make_report(imitation, evaluation, curve), paths["report"])
-    return paths
+    report = make_report(imitation, replace(evaluation, card=card), curve)
+    write_report(replace(report, notes=(*report.notes, *notes)), paths["report"])
+    return Delivery(paths, card, tuple(notes))
+
+
+def _held(
+    imitation: Imitation, evaluation: Evaluation, index: int, clip: Clip
+) -> tuple[Clip, dict[str, Any]]:
+    """The clip with its feet held, and figures of the source, the simulation and of what is delivered.
+
+    The source is judged on the floor that its soles tell; its penetration, on that of the file.
+    """
+    table, r = imitation.humanoid.table, evaluation.rollouts
+    joints = tuple(row.joint for row in table.rows)
+    held, moved = hold_feet(clip, table)
+    source = imitation.library.clips[index]
+    found: dict[str, Any] = {"clip": source.name, **_moved(moved)}
+    if r.shapes is not None and r.feet:
+        ground = -imitation.report.ground[index].lift_m
+        of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
+        found |= {name: clip_figures(c, joints, r.shapes, r.feet, floor) for name, c, floor in of}
+    return held, found
+
+
+def _moved(held: Held) -> dict[str, float]:
+    return {"held_mean_mm": held.mean_mm, "held_max_mm": held.max_mm}
+
+
+def _sentences(found: dict[str, Any]) -> list[str]:
+    if "delivered" not in found or not found["held_max_mm"] > 0.05:
+        return []
+
+    def three(key: str, digits: int) -> str:
+        before, between, after = (found[k][key] for k in ("source", "simulated", "delivered"))
+        return f"{after:.{digits}f} (simulated {between:.{digits}f}, the clip {before:.{digits}f})"
+
+    return [
+        f"{found['clip']}: standing feet are held in place in the written motion: they slide at "
+        f"{three('foot_slide_mm_per_s', 0)} mm/s and sink by {three('penetration_mm', 1)} mm; ankles "
+        f"moved by {found['held_mean_mm']:.0f} mm on average, {found['held_max_mm']:.0f} at most."
+    ]
 
 
 def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, np.ndarray]) -> Report:

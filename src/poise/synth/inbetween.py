@@ -109,7 +109,6 @@ def _filled(
     root: Tensor, rot: Tensor, gaps: list[Gap], keys: tuple[int, ...], own: Clip,
     model: InbetweenModel, filling: Filling, noise: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    offsets = torch.tensor(np.array(own.skeleton.offsets))
     blend = max(1, round(filling.blend_s * own.fps))
     for gap in gaps:
         a, b = gap
@@ -126,9 +125,8 @@ def _filled(
             # A keyframe next to a standing foot is where that foot stands.
             stands[a - low], stands[b - low] = stands[a + 1 - low], stands[b - 1 - low]
             rot[low:high] = lock_feet(
-                model.layout.parents, model.layout.feet, offsets, root[low:high], rot[low:high],
-                stands, free, blend,
-            )  # fmt: skip
+                own.skeleton, model.layout.feet, root[low:high], rot[low:high], stands, free, own.fps
+            )
         met = meet(root[low:high], rot[low:high], a + 1 - low, high - b, blend)
         root[a + 1 : b], rot[a + 1 : b] = met[0][a + 1 - low : b - low], met[1][a + 1 - low : b - low]
     return root, rot

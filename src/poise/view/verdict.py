@@ -116,8 +116,12 @@ def foot_slide(score: dict[str, Any]) -> Grade:
     slide = number(score.get("foot_slide_mm_per_s"))
     before = number(_part(score, "reference").get("foot_slide_mm_per_s"))
     text = "not measured" if slide is None else f"{slide:.0f} mm/s"
-    detail = "" if before is None else f"the clip itself: {before:.0f} mm/s"
     key = "foot_slide_mm_per_s"
+    told = [] if before is None else [f"the clip itself: {before:.0f} mm/s"]
+    written = [number(_part(d, "delivered").get(key)) for d in score.get("delivered") or ()]
+    if written and written[0] is not None:
+        told.append(f"the written motion, feet held: {written[0]:.0f} mm/s")
+    detail = "; ".join(told)
     return Grade("Foot slide", text, _level(slide, key), _rule(key, "mm/s"), detail, False)
 
 

@@ -139,33 +139,37 @@ def _axis(along: np.ndarray, why: str) -> tuple[str, str] | None:
     return ("Y" if y > z else "Z"), why
 
 
-def inserted_rest_frame(rot: np.ndarray) -> str | None:
-    """A sentence if frame 0 is a rest pose put before the motion (as some conversions do).
+def inserted_rest_frames(rot: np.ndarray) -> tuple[int, str]:
+    """How many frames of a rest pose were put before the motion, and a sentence about them; 0 if none.
 
-    It is when its root is unturned and its joints are near their rest rotations, and from it to
-    frame 1 the root (or the mean joint) turns far more than from frame to frame afterwards.
+    Frame 0 is one when its root is unturned and its joints are near their rest rotations, and from it to
+    frame 1 the root (or the mean joint) turns far more than from frame to frame afterwards. Some
+    converters smooth over that jump: frames in which the joints go on easing out of it, by ever smaller
+    steps that are all far greater than usual, are no motion either.
     """
     if len(rot) < 4:
-        return None
+        return 0, ""
     q = torch.tensor(rot[:40], dtype=torch.float64)
     steps = quat_angle(quat_mul(quat_conj(q[:-1]), q[1:])).numpy()
     from_rest = quat_angle(q[0]).numpy()
     if from_rest[0] > np.radians(0.5) or from_rest.mean() > _REST_ANGLE:
-        return None
+        return 0, ""
     root, joints = steps[:, 0], steps[:, 1:].mean(-1) if steps.shape[1] > 1 else steps[:, 0]
     root_jumps = root[0] > 6.0 * np.median(root[1:12]) + np.radians(5.0)
     joints_jump = joints[0] > 6.0 * np.median(joints[1:12]) + np.radians(2.0)
     if not (root_jumps or joints_jump):
-        return None
-    note = "Frame 0 is a rest pose that was put before the motion; it was dropped"
-    easing = (
-        int(np.cumprod(joints[1:20] > 3.0 * np.median(joints[20:]) + np.radians(0.2)).sum())
-        if (len(joints) > 24)
-        else 0
+        return 0, ""
+    easing = 0
+    if len(joints) > 24:
+        large = joints[1:20] > 2.0 * np.median(joints[20:]) + np.radians(0.2)
+        falling = np.concatenate(([True], joints[2:20] < joints[1:19]))
+        easing = int(np.cumprod(large & falling).sum())
+    if not easing:
+        return 1, "Frame 0 is a rest pose that was put before the motion; it was dropped"
+    return 1 + easing, (
+        f"Frame 0 is a rest pose that was put before the motion, and up to frame {easing} the joints "
+        f"ease out of it; these {1 + easing} frames were dropped"
     )
-    if easing:
-        note += f" (the joints still ease out of it in the first {easing} frames that are left)"
-    return note
 
 
 def root_jumps(root_pos: np.ndarray, fps: float) -> list[tuple[int, float]]:

@@ -15,7 +15,7 @@ from poise.motion.io.guess import (
     Guess,
     guess_unit,
     guess_up,
-    inserted_rest_frame,
+    inserted_rest_frames,
     stated_unit,
     teleports,
 )
@@ -107,8 +107,9 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
     _check(raw)
     notes = list(raw.notes)
     whole = len(raw.rot)
-    raw = _drop_rest_frame(raw, notes)
-    mended = [*raw.mended, *((("rest frame", "", 0, 0, 1.0),) if len(raw.rot) < whole else ())]
+    raw = _drop_rest_frames(raw, notes)
+    dropped = whole - len(raw.rot)
+    mended = [*raw.mended, *((("rest frame", "", 0, dropped - 1, float(dropped)),) if dropped else ())]
     rot = unwrap_quats(normalize(torch.tensor(raw.rot, dtype=torch.float64))).numpy()
     up, unit = _up_and_unit(raw, rot, options)
     notes += [guess.note for guess in (up, unit) if guess.note]
@@ -178,12 +179,14 @@ def _check(raw: RawMotion) -> None:
         raise PoiseError("no bone of the skeleton has any length (all offsets are zero)", raw.path)
 
 
-def _drop_rest_frame(raw: RawMotion, notes: list[str]) -> RawMotion:
-    note = None if raw.whole or raw.format == "deepmimic" else inserted_rest_frame(raw.rot)
-    if note is None:
+def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
+    if raw.whole or raw.format == "deepmimic":
+        return raw
+    count, note = inserted_rest_frames(raw.rot)
+    if not count:
         return raw
     notes.append(note)
-    return replace(raw, root_pos=raw.root_pos[1:], rot=raw.rot[1:])
+    return replace(raw, root_pos=raw.root_pos[count:], rot=raw.rot[count:])
 
 
 def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: Options) -> tuple[Guess, Guess]:

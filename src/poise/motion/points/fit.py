@@ -64,7 +64,7 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     if not _span(tracks) > 1e-6:
         raise PoiseError("all keypoints lie in one place", points.source.path or points.name)
     rest = measure(tracks, spine, notes)
-    tracks = hold_lengths(tracks, _bones(rest))
+    tracks = hold_lengths(tracks, bones_of(rest))
     root_pos, rot = Solver(rest, tracks, points.fps).run()
     names = tuple(rest.parents)
     skeleton = Skeleton(
@@ -104,7 +104,7 @@ def _span(tracks: dict[str, Tensor]) -> float:
     return float((every - every[:1]).norm(dim=-1).max())
 
 
-def _bones(rest: Rest) -> list[tuple[str, str, float]]:
+def bones_of(rest: Rest) -> list[tuple[str, str, float]]:
     """The bones that keypoints show: the hips' distance, thighs, shins, upper arms, forearms."""
     hips = np.linalg.norm(rest.offsets["LeftUpLeg"] - rest.offsets["RightUpLeg"])
     bones = [("left_hip", "right_hip", float(hips))]

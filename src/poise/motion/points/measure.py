@@ -51,12 +51,25 @@ class Rest:
         self.parents[name], self.offsets[name], self.points[name] = parent, np.asarray(offset), place
 
 
-def trunk_tracks(tracks: dict[str, Tensor], notes: list[str]) -> tuple[dict[str, Tensor], list[str]]:
+def spine_shares(tracks: dict[str, Tensor]) -> dict[str, float]:
+    """How far up each of the spine's places lies on the way from the pelvis to the neck, by median."""
+    line = tracks["neck"] - tracks["pelvis"]
+    return {
+        place: float((((track - tracks["pelvis"]) * line).sum(-1) / line.square().sum(-1)).median())
+        for place, track in tracks.items()
+        if place.startswith("spine")
+    }
+
+
+def trunk_tracks(
+    tracks: dict[str, Tensor], notes: list[str], share: dict[str, float] | None = None
+) -> tuple[dict[str, Tensor], list[str]]:
     """The tracks with pelvis, spine, neck and head joint, interpolated where they were not measured, and
     the spine's places from below.
 
     Interpolated: the pelvis between the hips, the neck above the shoulders, the spine on the line
-    between them, the head joint on the way to the top of the head.
+    between them, the head joint on the way to the top of the head. share: see `spine_shares`, where it
+    is known from other frames of the same body.
     """
     out = {p: t for p, t in tracks.items() if not p.startswith("spine")}
     made: list[str] = []
@@ -67,12 +80,8 @@ def trunk_tracks(tracks: dict[str, Tensor], notes: list[str]) -> tuple[dict[str,
     if "neck" not in out:
         out["neck"] = shoulders + _NECK_SHARE * (shoulders - hips)
         made.append("neck")
-    line = out["neck"] - out["pelvis"]
-    share = {
-        place: float((((track - out["pelvis"]) * line).sum(-1) / line.square().sum(-1)).median())
-        for place, track in tracks.items()
-        if place.startswith("spine")
-    }
+    if share is None:
+        share = spine_shares({**tracks, **out})
     spine: list[str] = []
     for place in sorted(share, key=lambda p: share[p]):
         if 0.03 < share[place] < 0.93 and (not spine or share[place] - share[spine[-1]] > 0.03):

@@ -1,0 +1,40 @@
+"""Errors of pose estimators, made on purpose: kinds, their composition, ladders of strength."""
+
+from poise.motion.noise.apply import (
+    TRIANGULATED,
+    VIDEO,
+    Level,
+    hold_missing,
+    perturb_clip,
+    perturb_points,
+    perturb_positions,
+    robustness_levels,
+    scaled,
+)
+from poise.motion.noise.kinds import Noise, Points, Pose, side_pairs
+from poise.motion.noise.missing import Dropouts, FrameLoss, Latency, SwapSides
+from poise.motion.noise.offsets import Drift, Jitter, Outliers, WrongDepth
+
+__all__ = [
+    "TRIANGULATED",
+    "VIDEO",
+    "Drift",
+    "Dropouts",
+    "FrameLoss",
+    "Jitter",
+    "Latency",
+    "Level",
+    "Noise",
+    "Outliers",
+    "Points",
+    "Pose",
+    "SwapSides",
+    "WrongDepth",
+    "hold_missing",
+    "perturb_clip",
+    "perturb_points",
+    "perturb_positions",
+    "robustness_levels",
+    "scaled",
+    "side_pairs",
+]

@@ -1,0 +1,121 @@
+"""Which files a library consists of, how its clips are called, and the key of their content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from poise.errors import PoiseError
+from poise.motion.io.formats import READERS
+from poise.motion.io.text import read_head
+
+#: Files that hold part of a motion beside them: its skeleton, its numbers.
+COMPANIONS = (".asf", ".bin")
+#: Suffixes that other files than motions have too, so that their content must tell.
+_COMMON = (".txt", ".json", ".csv", ".npz")
+_CMU_TAKE = re.compile(r"-(\d{1,3})_\d{1,3}(?!\d)")
+_SUBJECT = re.compile(r"subject[ _-]?(\d+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class MotionFile:
+    """One file of a library.
+
+    path: where it lies. name: its folders from the library's own on and its stem, joined by "-" (a "-"
+    in the stem becomes "_"), and unique. subject: who moved, see `subject_of`.
+    """
+
+    path: Path
+    name: str
+    subject: str
+
+
+def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFile]:
+    """Every motion file of folders and files, in order of its name.
+
+    Formats that are read only when they are asked for (pickles, robots) count only where the file
+    itself is given.
+
+    Raises:
+        PoiseError: there is no such file or folder, or no motion in any of them.
+    """
+    given = [sources] if isinstance(sources, str | Path) else list(sources)
+    found: dict[Path, tuple[str, ...]] = {}
+    for source in map(Path, given):
+        if not source.exists():
+            raise PoiseError("there is no such file or folder", source, "Give a folder of motion files")
+        root = source.absolute()
+        files = [root] if root.is_file() else sorted(f for f in root.rglob("*") if is_motion(f))
+        base = root.parents[min(2, len(root.parents) - 1)] if root.is_file() else root.parent
+        for file in files:
+            *folders, stem = file.relative_to(base).with_suffix("").parts
+            found.setdefault(file, (*folders, stem.replace("-", "_")))
+    if not found:
+        where = ", ".join(map(str, given)) or None
+        raise PoiseError("holds no motion file", where, "Give a folder with BVH, AMC or DeepMimic files")
+    out, seen = [], {}
+    for path, parts in sorted(found.items(), key=lambda item: (item[1], str(item[0]))):
+        name = "-".join(parts)
+        seen[name] = seen.get(name, 0) + 1
+        unique = name if seen[name] == 1 else f"{name}-{seen[name]}"
+        out.append(MotionFile(path, unique, subject_of(unique)))
+    return out
+
+
+def is_motion(path: Path) -> bool:
+    """Whether a file found in a folder is a motion; what many files could be is told by its content."""
+    suffix = path.suffix.lower()
+    readers = [r for r in READERS if suffix in r.suffixes and r.name != "ASF" and not r.asks]
+    if not readers or not path.is_file():
+        return False
+    if suffix not in _COMMON:
+        return True
+    head = read_head(path).removeprefix(b"\xef\xbb\xbf").lstrip()
+    return any(r.looks_like(head) for r in readers)
+
+
+def subject_of(name: str) -> str:
+    """Who moves in the clip of this name.
+
+    "cmu 02" for a take such as `02_01` below a folder whose name has "cmu" in it, "subject 1" where the
+    name says so, else the folders before the last "-".
+    """
+    take = _CMU_TAKE.search(name)
+    if take and "cmu" in name[: take.start()].lower():
+        return f"cmu {int(take[1]):02d}"
+    folders, _, stem = name.rpartition("-")
+    said = _SUBJECT.search(stem)
+    return f"{folders} subject {said[1]}".strip() if said else folders or stem
+
+
+def matches(patterns: Sequence[str], name: str, subject: str = "") -> bool:
+    """Whether a pattern is found in a clip's name, or is its whole subject; case does not matter."""
+    return any(
+        re.search(p, name, re.IGNORECASE) or re.fullmatch(p, subject, re.IGNORECASE) for p in patterns
+    )
+
+
+def check_patterns(patterns: Sequence[str]) -> None:
+    """Raises a PoiseError for what is no regular expression."""
+    for pattern in patterns:
+        try:
+            re.compile(pattern)
+        except re.error as problem:
+            raise PoiseError(f"'{pattern}' is no regular expression: {problem}") from None
+
+
+def content_key(files: Sequence[MotionFile], settings: Any) -> str:
+    """A hash of the content of all files, of what lies beside them, of their names and of `settings`."""
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
+    beside = {f for folder in {m.path.parent for m in files} for f in folder.iterdir()}
+    companions = sorted(f for f in beside if f.suffix.lower() in COMPANIONS and f.is_file())
+    for name, path in [*((m.name, m.path) for m in files), *((f.name, f) for f in companions)]:
+        data = path.read_bytes()
+        digest.update(f"{name} {len(data)} ".encode() + data)
+    return digest.hexdigest()
