@@ -15,6 +15,7 @@ from poise.env.falls import Drop, fall_states, lies, standing_height
 from poise.env.recovery import CONTINUED, FALLEN, FAR, TRACKED, toward
 from poise.env.terms import done, phc_obs, phc_recovery
 from poise.errors import PoiseError
+from poise.learn import AmpConfig, PPOConfig
 from poise.sim import CpuBackend
 from toy_human import swing
 
@@ -414,3 +415,20 @@ def test_the_motion_prior_is_not_told_that_the_clip_led_to_a_fall(built):
     assert past.isnan().flatten(1).any(1).tolist() == [False, True, False]
     assert math.isfinite(float(past[[0, 2]].sum()))
     env.close()
+
+
+def test_a_trainer_with_a_motion_prior_goes_on_where_it_stopped(built):
+    ppo = PPOConfig(horizon=6, epochs=1, minibatch=24, policy_hidden=(8,), value_hidden=(8,), std=0.05)
+    prior = AmpConfig(hidden=(8,), frames=3, steps=1, minibatch=16, kept=32)
+    task = replace(built, task=replace(built.task, horizon=9))
+    first, second = (task.trainer(threads=1, ppo=ppo, style=prior) for _ in range(2))
+    first.iterate()
+    second.load_state(first.state())
+    first.iterate()
+    second.iterate()
+    ours, theirs = first.state(), second.state()
+    # The counters hold the time on the clock.
+    assert [k for k in ours if not torch.equal(ours[k], theirs[k])] == ["trainer/counters"]
+    assert "env/recovery" in ours and len(ours) == len(theirs)
+    for trainer in (first, second):
+        trainer.env.close()
