@@ -96,12 +96,12 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
 
     from poise.cli.train import RECIPES
     from poise.metrics.tracking import RULES
-    from poise.recipes import RECIPE, ResidualForce, inbetween
+    from poise.recipes import RECIPE, ResidualForce, inbetween, perpetual
 
     hints = get_type_hints(ResidualForce)
     assert hints["method"] == options.Method and hints["reward"] == options.Reward
     assert get_args(options.Rule) == tuple(RULES)
-    assert (RECIPE["name"], inbetween.RECIPE["name"]) == RECIPES
+    assert (RECIPE["name"], inbetween.RECIPE["name"], perpetual.RECIPE["name"]) == RECIPES
     plain = ResidualForce()
     mine = options.Training()
     assert (plain.method, plain.reward, plain.seed, plain.num_envs) == (

@@ -12,19 +12,20 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.console import say
 from poise.cli.options import Body, Reading, Training
 from poise.cli.train_inbetween import Network
+from poise.cli.train_perpetual import Primitives
 from poise.cli.training import Job, command_line
 from poise.errors import PoiseError, did_you_mean
 
 #: Recipes that can be trained.
-RECIPES = ("residual-force", "inbetween")
+RECIPES = ("residual-force", "inbetween", "perpetual")
 
 
 @dataclass(frozen=True)
 class Options:
-    """Train a recipe on one clip or on several clips of one skeleton, and no more."""
+    """Train a recipe on one clip, on several clips of one skeleton or on a folder, and no more."""
 
     recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
-    """residual-force, or inbetween."""
+    """residual-force, inbetween, or perpetual."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
     clips: Annotated[
@@ -33,6 +34,7 @@ class Options:
     """Motion files."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     network: OmitArgPrefixes[Network] = field(default_factory=Network)
+    primitives: OmitArgPrefixes[Primitives] = field(default_factory=Primitives)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
@@ -44,6 +46,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
         raise PoiseError(f"there is no recipe '{o.recipe}'. {did_you_mean(o.recipe, RECIPES)}")
     if o.recipe == "inbetween":
         return _inbetween(o, argv)
+    if o.recipe == "perpetual":
+        return _perpetual(o, argv)
     if not o.clips:
         raise PoiseError("no clip was given", hint=f"Write poise train {o.recipe} CLIP -o RUNDIR")
     again = command_line("train", argv)
@@ -63,13 +67,26 @@ def run(options: Options, argv: Sequence[str]) -> int:
     return 0
 
 
+def _perpetual(o: Options, argv: Sequence[str]) -> int:
+    """One policy for a folder of clips."""
+    from poise.cli.train_perpetual import run as train
+
+    _only_a_folder(o)
+    again = command_line("train", argv)
+    return train(o.network, o.primitives, o.out, o.training, o.body, again)
+
+
+def _only_a_folder(o: Options) -> None:
+    if o.clips:
+        hint = f"Write poise train {o.recipe} --library DIR -o RUNDIR"
+        raise PoiseError(f"the recipe {o.recipe} learns from a folder, not from single clips", hint=hint)
+
+
 def _inbetween(o: Options, argv: Sequence[str]) -> int:
     """A network instead of a character: only some of the options have a meaning."""
     from poise.cli.train_inbetween import run as train
 
-    if o.clips:
-        hint = "Write poise train inbetween --library DIR -o RUNDIR"
-        raise PoiseError("the recipe inbetween learns from a folder, not from single clips", hint=hint)
+    _only_a_folder(o)
     o.training.check()
     t, again = o.training, command_line("train", argv)
     return train(o.network, o.out, t.minutes, t.seed, t.iterations, t.threads, t.resume, again)

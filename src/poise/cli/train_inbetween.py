@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Network:
-    """What only the recipe inbetween knows."""
+    """What only the recipe inbetween knows, and the folder that others learn from, too."""
 
     library: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """inbetween: the folder of clips of one skeleton to learn from."""
+    """inbetween, perpetual: the folder of clips to learn from."""
     net: Literal["transformer", "rtn"] = "transformer"
     """inbetween: the network; rtn is that of Harvey et al. 2020."""
     hold_out: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """inbetween: clips whose names match are kept for validation figures."""
+    """Clips whose names match are not learned from; inbetween keeps them for validation figures."""
     never: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """inbetween: clips whose names match are not used at all."""
+    """Clips whose names match are not used at all."""
 
 
 def run(network: Network, out: Path, minutes: float, seed: int, steps: int | None, threads: int,

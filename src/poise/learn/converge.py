@@ -45,10 +45,11 @@ class Convergence:
         """Begins another stage."""
         self.best, self.best_at, self.evaluations = -1.0, 0, 0
 
-    def add(self, succeeded: int, total: int) -> Decision:
+    def add(self, succeeded: int, total: int, improved: bool = False) -> Decision:
         """Notes an evaluation of the stage's hard set, of `total` clips, and decides.
 
-        An empty hard set is solved: there is nothing left to learn.
+        An empty hard set is solved: there is nothing left to learn. improved: something else was
+        gained, such as help that was taken away, so that the stage's patience begins anew.
         """
         if not 0 <= succeeded <= total:
             raise PoiseError(f"{succeeded} of {total} clips cannot have succeeded")
@@ -56,6 +57,8 @@ class Convergence:
         rate = succeeded / total if total else 1.0
         if rate > self.best + self.config.gain or self.evaluations == 1:
             self.best, self.best_at = rate, self.evaluations
+        if improved:
+            self.best_at = self.evaluations
         if succeeded == total:
             return "solved"
         c = self.config

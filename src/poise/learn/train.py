@@ -264,9 +264,10 @@ class Trainer:
         iteration, samples, self.seconds, a, b, c = take(state, "trainer/counters").tolist()
         self.iteration, self.samples, self._ended = int(iteration), int(samples), (a, b, c)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, extra: Mapping[str, Tensor] | None = None) -> None:
         """Writes the whole state as a checkpoint, from which `load` or `load_policy` reads.
 
+        extra: tensors that belong to the same moment, such as what decides when training ends.
         Of several processes all must call it, and rank 0 writes for all.
         """
         meta = {
@@ -284,7 +285,7 @@ class Trainer:
         }
         state = self.state()
         if self.comm.rank == 0:
-            save_checkpoint(path, state, meta)
+            save_checkpoint(path, state | dict(extra or {}), meta)
 
     def load(self, path: str | Path) -> dict[str, Any]:
         """Goes on from a checkpoint and returns its metadata.

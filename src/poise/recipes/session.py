@@ -45,6 +45,8 @@ from poise.sim import SimConfig
 
 #: The file that says what a run is.
 RUN_FILE = "run.safetensors"
+#: The policy of a run that comes to an end by itself; it needs no help.
+FINAL = "policy.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +100,10 @@ def reopen(folder: Path) -> Imitation:
             "Give the 'run' folder of a result",
         )
     tensors, meta = load_checkpoint(path)
+    if meta.get("recipe") == "perpetual":
+        from poise.recipes import perpetual_run
+
+        return perpetual_run.reopen(folder)
     config = _from_json(meta["config"])
     return build(ClipLibrary(tuple(unpack_clips(tensors, meta["clips"]))), config)
 
@@ -125,11 +131,13 @@ def train(
 
 
 def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, dict[str, Any]]:
-    """The run's latest policy and its checkpoint's metadata."""
-    path = folder / LATEST
+    """The run's latest policy, or that of a finished run, and its checkpoint's metadata."""
+    path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
     if not path.exists():
         raise PoiseError("nothing has been trained in it yet", folder, "Train it with --resume first")
     policy = load_policy(path, character=imitation.humanoid.identity)
+    if path.name == FINAL:
+        return policy, policy.meta | policy.meta["metadata"] | {"help_limit": 0.0}
     left = scale_in(load_checkpoint(path)[0]) * most_help(imitation.config)
     return policy, {**policy.meta, "help_limit": left}
 

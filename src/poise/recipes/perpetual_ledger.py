@@ -1,0 +1,100 @@
+"""What is known of the clips while a library is learned: who fails, who learned which, what did best."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from poise.learn import Convergence, Decision, HardNegatives, PolicyBundle
+from poise.learn.state import State, prefixed, take, under
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_eval import ClipResults
+
+#: Help that is less by this share of its limit is a gain of a stage.
+LESS_HELP = 0.01
+
+
+class Ledger:
+    """The evaluations of a run; everything by which stages end and begin.
+
+    Args:
+        config: the recipe's settings.
+        length: `(C,)` frames of the clips, by which they are drawn where none fails.
+
+    Attributes: `owner (C,)`, the primitive that learned each clip, from 0; `best`, the state of the
+    stage's policy that did best, which had `best_failed (C,)`; `seen`, how many clips of how many
+    succeeded in the last evaluation.
+    """
+
+    def __init__(self, config: Perpetual, length: Tensor):
+        clips = len(length)
+        self.mining = HardNegatives(clips, config.mining, (length.cpu() - 1).double())
+        self.convergence = Convergence(config.convergence)
+        self.owner = torch.zeros(clips, dtype=torch.long)
+        self.begin(torch.ones(clips, dtype=torch.bool))
+
+    def begin(self, member: Tensor) -> None:
+        """Another stage, on the clips `member (C,)` bool; what is counted per stage begins anew."""
+        self.mining.next_stage(member)
+        self.convergence.reset()
+        self.least = 1.0
+        self.best: State = {}
+        self.best_key: tuple[float, ...] = ()
+        self.best_failed = torch.zeros_like(self.mining.member)
+        self.seen: tuple[int | None, int] = (None, int(member.sum()))
+
+    @property
+    def clips(self) -> Tensor:
+        """Indices of the stage's clips."""
+        return self.mining.member.nonzero().squeeze(-1)
+
+    @property
+    def hard(self) -> Tensor:
+        """`(C,)` bool, what the next primitive is to learn."""
+        return self.mining.hard | self.best_failed
+
+    def record(self, results: ClipResults, policy: PolicyBundle, scale: float) -> None:
+        """Notes what `policy` did with the stage's clips, with the share `scale` of the help."""
+        member = self.mining.member
+        won = results.spread(results.succeeded, len(member))
+        self.mining.record(won, member)
+        self.seen = (int(won.sum()), len(results.clip))
+        # Less help counts before more clips, more clips before a smaller error.
+        key = (-scale, results.rate, -results.error_mm)
+        if not self.best or key > self.best_key:
+            self.best, self.best_key, self.best_failed = policy.state(), key, member & ~won
+
+    def decide(self, scale: float) -> Decision:
+        """What the last evaluation, with this share of the help, says of the stage.
+
+        A stage with help is never solved; that it needs less help is a gain.
+        """
+        succeeded, clips = self.seen
+        assert succeeded is not None
+        improved = scale < self.least - LESS_HELP
+        self.least = min(self.least, scale)
+        decision = self.convergence.add(succeeded, clips, improved)
+        return "go on" if decision == "solved" and scale > 0 else decision
+
+    def state(self) -> State:
+        """Copies of all tensors."""
+        own = {"owner": self.owner.clone(), "best_failed": self.best_failed.clone()}
+        mining, convergence = prefixed("mining", self.mining.state()), self.convergence.state()
+        return own | mining | convergence | prefixed("best", self.best)
+
+    def facts(self) -> dict[str, Any]:
+        """The rest of what `load` takes, as JSON data."""
+        return {"least": self.least, "best_key": list(self.best_key), "seen": list(self.seen)}
+
+    def load(self, state: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
+        """Goes on from `state` and `facts`."""
+        self.mining.load_state(under("mining", state))
+        self.convergence.load_state(state)
+        self.owner, self.best_failed = take(state, "owner"), take(state, "best_failed")
+        self.best, self.best_key = under("best", state), tuple(facts["best_key"])
+        self.least = facts["least"]
+        succeeded, clips = facts["seen"]
+        self.seen = (succeeded, clips)

@@ -1,0 +1,148 @@
+"""How each stage begins: from a clone of the expert, from the primitive before, from all primitives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from poise.env import ImitationEnv
+from poise.learn import (
+    PolicyBundle,
+    PPOConfig,
+    Trainer,
+    VecEnv,
+    WarmStart,
+    clone,
+    columns_of,
+    compose,
+    first_column,
+    next_column,
+)
+from poise.learn.state import State, make_generator
+from poise.nets import Composer
+from poise.recipes.expert import Beginning, clone_expert, finetuning
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_progress import Stage
+from poise.sim import UnstableError
+
+
+def begin_first(
+    imitation: Imitation, threads: int, dumps: Path | None, tell: Beginning
+) -> tuple[Stage, WarmStart | None]:
+    """The first stage, and the policy it starts from; None starts the single network from nothing."""
+    config: Perpetual = imitation.config
+    stage = Stage("single" if config.single else "primitive")
+    sized = replace(imitation, config=replace(config, ppo=_sized(config, stage)))
+    start = None
+    if config.expert:
+        try:
+            start = clone_expert(sized, threads, dumps, tell, config.clone)
+        except UnstableError as problem:
+            # Clips that throw the expert off may still be learned from nothing.
+            if tell.failed is not None:
+                tell.failed(str(problem))
+    if config.single:
+        return stage, start
+    if start is not None:
+        return stage, replace(start, policy=columns_of(start.policy, config.lateral))
+    ppo, env = sized.ppo(), imitation.env(1, threads=1)
+    env.close()
+    std = ppo.std if isinstance(ppo.std, tuple) else float(ppo.std)
+    sizes = (env.num_obs, env.num_actions, ppo.policy_hidden, ppo.activation, std, config.lateral)
+    rng = make_generator(config.seed, "primitive 1")
+    return stage, WarmStart(first_column(*sizes, obs_clip=ppo.obs_clip, generator=rng))
+
+
+def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmStart:
+    """One primitive more; the critic goes on, as in the paper."""
+    rng = make_generator(config.seed, f"primitive {number}")
+    return replace(before, policy=next_column(before.policy, config.start, generator=rng))
+
+
+def begin_composer(
+    before: WarmStart, imitation: Imitation, owner: Tensor, threads: int, dumps: Path | None,
+    tell: Beginning,
+) -> WarmStart:  # fmt: skip
+    """The composer over all primitives, taught at first to do as the primitive that learned the clip.
+
+    owner: `(C,)`, the primitive of each clip.
+    """
+    config: Perpetual = imitation.config
+    rng = make_generator(config.seed, "composer")
+    parts = (config.combine, config.weights, config.composer_hidden, config.ppo.std)
+    combine, weights, hidden, std = parts
+    std = float(std) if isinstance(std, float | int) else 0.1
+    policy = compose(before.policy, combine, weights, hidden, std, generator=rng)
+    if not config.composer_clone:
+        return replace(before, policy=policy)
+    env = unhelped(imitation).env(
+        min(config.num_envs, 512), threads=threads, dumps=dumps, help_scale=0.0
+    )
+    # Choosing among primitives is learned sooner than acting; the critic goes on from them.
+    settings = replace(config.clone, rounds=min(1, config.clone.rounds), critic_steps=0)
+    try:
+        taught, _ = clone(
+            cast(VecEnv, env), Owners(env, policy, owner), settings, imitation.ppo(), config.seed,
+            tell.round, policy,
+        )  # fmt: skip
+    except UnstableError as problem:
+        if tell.failed is not None:
+            tell.failed(str(problem))
+        return replace(before, policy=policy)
+    finally:
+        env.close()
+    cost = {"samples": before.samples + taught.samples, "seconds": before.seconds + taught.seconds}
+    return replace(before, policy=taught.policy, **cost)
+
+
+class Owners:
+    """Acts for each world as the primitive that learned its clip: a teacher for the composer."""
+
+    def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor):
+        assert isinstance(policy.policy, Composer)
+        self.env, self.norm, self.primitives = env, policy.norm, policy.policy.primitives
+        self.owner = owner.to(env.device)
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> Tensor:
+        """Mean actions `(N, A)` for raw observations `(N, O)` of the worlds as they stand."""
+        actions = self.primitives.all(self.norm.forward(obs))
+        return actions[torch.arange(len(obs), device=obs.device), self.owner[self.env.clip]]
+
+
+def make_trainer(
+    imitation: Imitation, stage: Stage, start: WarmStart | None, warm: bool, threads: int,
+    dumps: Path | None, device: str,
+) -> Trainer:  # fmt: skip
+    """The stage's trainer on fresh worlds, with draws of its own.
+
+    warm: whether `start` acts well already, so that it is changed in small steps.
+    """
+    config: Perpetual = imitation.config
+    # Another stage draws other starts and noise.
+    seed = (config.seed + 1_000_003 * (stage.number - 1)) % 2**31
+    own = unhelped(imitation) if stage.kind == "composer" else imitation
+    own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
+    ppo = finetuning(own.ppo()) if warm else own.ppo()
+    return own.trainer(threads, dumps, warm_start=start, ppo=ppo, device=device, style=config.style)
+
+
+def unhelped(imitation: Imitation) -> Imitation:
+    """The same task, where no success or failure changes the help."""
+    return replace(imitation, task=replace(imitation.task, help=None))
+
+
+def critic_of(trainer: Trainer) -> State:
+    """The critic of a trainer, for a `WarmStart`."""
+    return {k: v for k, v in trainer.ppo.state().items() if k.startswith(("critic/", "return_norm/"))}
+
+
+def _sized(config: Perpetual, stage: Stage) -> PPOConfig:
+    if stage.kind != "single":
+        return config.ppo
+    return replace(config.ppo, policy_hidden=config.single_hidden)

@@ -1,0 +1,109 @@
+"""`poise train perpetual` in miniature: the run, going on, Ctrl-C, what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from tiny_clips import deepmimic, put
+
+from poise.cli.main import main
+from poise.learn import CloneConfig, PPOConfig
+from poise.recipes import perpetual
+from poise.recipes.perpetual import Perpetual
+
+MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recipe with networks that are trained in no time."""
+    ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
+    own = {"ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None}
+    monkeypatch.setattr(perpetual, "Perpetual", lambda **k: Perpetual(**(own | k)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    where = tmp_path_factory.mktemp("clips")
+    put(where, "bend.txt", deepmimic(24))
+    put(where, "stand.txt", deepmimic(16))
+    return where
+
+
+def command(folder: Path, out: Path, *more: str) -> list[str]:
+    return ["train", "perpetual", "--library", str(folder), "-o", str(out), *MINIATURE, *more]
+
+
+def test_all_stages_by_one_command(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert main(command(folder, out)) == 0
+    said, told = capsys.readouterr()
+    assert "2 clips" in said and "Without help" in said and str(out) in said
+    assert "primitive 1:" in told and "of 2 clips succeed" in told and "left" in told
+    result = json.loads((out / "result.json").read_text())
+    assert result["clips"] == 2 and result["help_n"] == 0.0 and result["iterations"] <= 4
+    # The run is evaluated and played as any other, without help.
+    assert main(["eval", str(out), "--json"]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["method"] == "perpetual" and score["help"]["limit_n"] == 0.0
+    assert score["samples"] == result["samples"] > 0
+    assert main(["play", str(out), "--clip", "nobody"]) == 2
+    assert main(["play", str(out), "-o", str(tmp_path / "page.html")]) == 0
+    capsys.readouterr()
+    assert main(command(folder, out)) == 2
+    assert "already holds a run" in capsys.readouterr().err
+    assert main(command(folder, out, "--resume")) == 0
+    assert "nothing was trained" in capsys.readouterr().out
+    other = command(folder, out, "--resume", "--seed", "5", "--single")
+    assert main(other) == 2
+    assert "other settings (seed, single)" in capsys.readouterr().err
+    shutil.copytree(folder, tmp_path / "moved")
+    assert main(command(tmp_path / "moved", out, "--resume")) == 2
+    assert "a run on the library" in capsys.readouterr().err
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from poise.cli import train_perpetual
+
+    plain = train_perpetual.events
+
+    def stopped(p: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_perpetual, "events", stopped)
+    argv = command(folder, tmp_path / "run", "--single")
+    assert main(argv) == 130
+    told = capsys.readouterr().err
+    assert "Stopped in single; the training so far is saved. Go on with:" in told
+    assert told.rstrip().endswith("--single --resume") and "poise train perpetual --library" in told
+    monkeypatch.setattr(train_perpetual, "events", plain)
+    assert main([*argv, "--resume"]) == 0
+    assert "one network" in capsys.readouterr().out
+
+
+def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> None:
+    out = str(tmp_path / "out")
+    refused("train", "perpetual", "-o", out, words=("needs --library",))
+    refused("train", "perpetual", "x.bvh", "-o", out, words=("not from single clips",))
+    empty, lonely = tmp_path / "empty", tmp_path / "lonely"
+    empty.mkdir()
+    lonely.mkdir()
+    put(lonely, "stand.txt", deepmimic(16))
+    refused(*command(empty, tmp_path / "out"), words=("no motion file",))
+    refused(*command(tmp_path / "absent", tmp_path / "out"), words=("no such",))
+    refused(*command(lonely, tmp_path / "out"), words=("at least 2 clips", "poise imitate"))
+    for more, words in (
+        (("--method", "deepmimic"), "has no --method"),
+        (("--help-limit", "5"), "has no --help-limit"),
+        (("--max-primitives", "0"), "--max-primitives must"),
+        (("--minutes", "0"), "--minutes must be above 0"),
+        (("--hold-out", "nobody"), "fits no clip"),
+    ):
+        refused(*command(folder, tmp_path / "out", *more), words=(words,))

@@ -1,0 +1,164 @@
+"""A perpetual run that was stopped or killed anywhere ends like one that was not, bit for bit."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from toy_library import library, tiny
+
+from poise.errors import PoiseError
+from poise.learn import LATEST, Until, load_checkpoint
+from poise.motion import ClipLibrary
+from poise.recipes import perpetual_next, perpetual_stages
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_progress import Progress
+from poise.recipes.perpetual_run import begin, from_json, resume, to_json, train
+from poise.recipes.perpetual_stages import Course
+from poise.recipes.session import FINAL
+
+ITERATIONS = 12
+#: Stages end at iterations 6, 8, 10; evaluations are at every second of a stage.
+CONFIG = tiny()
+
+
+class KilledError(Exception):
+    """Ends a training without any farewell."""
+
+
+def go_on(
+    folder: Path,
+    show: Callable[[Progress], bool | None] | None = None,
+    save_s: float = 0.0,
+    config: Perpetual = CONFIG,
+) -> None:
+    imitation = begin(folder, library(), config)
+    until = Until(iterations=ITERATIONS)
+    train(imitation, folder, until, show, threads=1, tensorboard=False, save_s=save_s)
+
+
+def killing(at: int) -> Callable[[Progress], None]:
+    def show(p: Progress) -> None:
+        if p.iteration == at:
+            raise KilledError
+
+    return show
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run with real evaluations."""
+    folder = tmp_path_factory.mktemp("whole")
+    stages: list[str] = []
+    go_on(folder, lambda p: stages.append(p.stage.name))
+    # The third clip is too hard for so little training, so that all stages are there.
+    assert stages[0] == "primitive 1" and stages[-1] == "composer" and "primitive 2" in stages
+    return folder
+
+
+def assert_same(a: Path, b: Path) -> None:
+    """All numbers of two run folders, but for the clocks."""
+    for name in (LATEST, FINAL):
+        one, other = (load_checkpoint(f / name)[0] for f in (a, b))
+        for tensors in (one, other):
+            if "trainer/counters" in tensors:
+                tensors["trainer/counters"][2] = 0.0
+        assert one.keys() == other.keys()
+        different = [k for k in one if not torch.equal(one[k].nan_to_num(), other[k].nan_to_num())]
+        assert not different
+    assert (a / "success.csv").read_text() == (b / "success.csv").read_text()
+    assert curve(a) == curve(b)
+
+
+def curve(folder: Path) -> list[dict[str, str]]:
+    with (folder / "log.csv").open(newline="") as file:
+        return [{k: v for k, v in r.items() if not k.startswith("time/")} for r in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("at", [1, 6, 9])
+def test_a_stopped_run_goes_on(whole: Path, tmp_path: Path, at: int) -> None:
+    go_on(tmp_path, lambda p: p.iteration != at)
+    assert not (tmp_path / FINAL).exists()
+    go_on(tmp_path)
+    assert_same(whole, tmp_path)
+
+
+@pytest.mark.parametrize("at", [(3, 7)])
+def test_a_killed_run_goes_on_from_an_older_checkpoint(
+    whole: Path, tmp_path: Path, at: tuple[int, ...]
+) -> None:
+    for moment in at:
+        # Nothing but evaluations saves, so that some iterations are lost and made again.
+        with pytest.raises(KilledError):
+            go_on(tmp_path, killing(moment), save_s=1e9)
+    go_on(tmp_path, save_s=1e9)
+    assert_same(whole, tmp_path)
+
+
+@pytest.mark.parametrize("step", ["begin_composer", "make_trainer"])
+def test_a_run_killed_between_two_stages_ends_the_stage_again(
+    whole: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, calls = getattr(perpetual_next, step), [0]
+
+    def dying(*args: object, **more: object) -> object:
+        calls[0] += 1
+        # The first trainer is that of the first stage.
+        if calls[0] == 1 + (step == "make_trainer"):
+            raise KilledError
+        return plain(*args, **more)
+
+    monkeypatch.setattr(perpetual_stages, step, dying)
+    with pytest.raises(KilledError):
+        go_on(tmp_path)
+    go_on(tmp_path)
+    assert_same(whole, tmp_path)
+
+
+def test_a_run_killed_while_it_clones_begins_again(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = Course.save
+    monkeypatch.setattr(Course, "save", lambda self: (_ for _ in ()).throw(KilledError()))
+    with pytest.raises(KilledError):
+        go_on(tmp_path)
+    assert not (tmp_path / LATEST).exists()
+    monkeypatch.setattr(Course, "save", plain)
+    go_on(tmp_path)
+    assert_same(whole, tmp_path)
+
+
+def test_a_finished_run_goes_on_with_more_time(tmp_path: Path) -> None:
+    imitation = begin(tmp_path, library(), tiny(single=True, expert=False))
+    for iterations, trains in ((2, True), (2, False), (4, True)):
+        until = Until(iterations=iterations)
+        result = train(imitation, tmp_path, until, threads=1, tensorboard=False)
+        assert (result.last is not None) == trains and result.results is not None
+        assert (tmp_path / FINAL).exists() and len(curve(tmp_path)) == iterations
+
+
+def test_settings_survive_json() -> None:
+    for config in (tiny(), tiny(style=None, lateral=True, start="random"), Perpetual()):
+        assert from_json(to_json(config)) == config
+    with pytest.raises(PoiseError, match="another version"):
+        from_json(to_json(Perpetual()) | {"colour": 3})
+
+
+def test_another_run_in_the_folder_is_refused(tmp_path: Path) -> None:
+    begin(tmp_path, library(), CONFIG, "here")
+    with pytest.raises(PoiseError, match=r"other settings \(max_primitives, seed\)"):
+        begin(tmp_path, library(), tiny(seed=2, max_primitives=2), "here")
+    with pytest.raises(PoiseError, match=r"other clips \(3, here 2\)"):
+        begin(tmp_path, ClipLibrary(library().clips[:2]), CONFIG, "here")
+    with pytest.raises(PoiseError, match="on the library here"):
+        resume(tmp_path, CONFIG, "there")
+    assert resume(tmp_path, CONFIG, "here").config == CONFIG
+
+
+def test_a_single_clip_is_no_library(tmp_path: Path) -> None:
+    with pytest.raises(PoiseError, match=r"at least 2 clips.*'calm'.*poise imitate"):
+        begin(tmp_path / "run", ClipLibrary(library().clips[:1]), CONFIG)
+    assert not (tmp_path / "run").exists()

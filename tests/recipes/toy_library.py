@@ -1,0 +1,68 @@
+"""A tiny library with tiny networks for the perpetual recipe, and evaluations that are made up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
+from poise.motion import ClipLibrary
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_eval import ClipResults
+from toy_human import swing
+
+#: kind of policy, columns, share of the help, clip -> does it succeed?
+Script = Callable[[str, int, float, int], bool]
+STYLE = AmpConfig(frames=3, hidden=(8,), minibatch=16, steps=1, kept=16, replay=32)
+PPO = PPOConfig(
+    horizon=4, epochs=1, minibatch=64, std=0.02, policy_hidden=(16,), value_hidden=(16,), norm_warmup=2
+)
+
+
+def library() -> ClipLibrary:
+    """A calm clip, a walk and a walk that turns."""
+    clips = [
+        swing(0.5, name="calm"),
+        swing(0.6, speed=1.0, name="walk"),
+        swing(0.8, speed=2.0, bend=1.0, name="turn"),
+    ]
+    return ClipLibrary.of(clips)
+
+
+def tiny(**changes: object) -> Perpetual:
+    """Settings by which a stage takes a second."""
+    plain = {
+        "num_envs": 8,
+        "single_hidden": (24, 16),
+        "composer_hidden": (8,),
+        "evaluate_every": 2,
+        "seed": 1,
+        "clone": CloneConfig(steps=4, rounds=1, critic_steps=4),
+        "convergence": ConvergenceConfig(patience=1),
+        "style": STYLE,
+        "ppo": PPO,
+    }
+    return Perpetual(**(plain | changes))  # type: ignore[arg-type]
+
+
+class Scripted:
+    """In place of `evaluate_clips`: outcomes by rule; remembers every evaluation it was asked for."""
+
+    def __init__(self, script: Script):
+        self.script = script
+        self.asked: list[tuple[str, int, float, tuple[int, ...]]] = []
+
+    def __call__(
+        self, imitation: Imitation, policy: PolicyBundle, clips: Tensor | None, scale: float, *_: object
+    ) -> ClipResults:
+        length = imitation.reference.length
+        clips = torch.arange(len(length)) if clips is None else clips
+        kind, columns = policy.shape.get("kind", "perceptron"), policy.shape.get("columns", 0)
+        self.asked.append((kind, columns, scale, tuple(clips.tolist())))
+        won = torch.tensor([self.script(kind, columns, scale, c) for c in clips.tolist()])
+        frames = length[clips]
+        error = torch.where(won, 20.0, 200.0).double()
+        return ClipResults(clips, won, frames, torch.where(won, frames, frames // 2), error, error)
