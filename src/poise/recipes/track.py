@@ -1,0 +1,233 @@
+"""A trained controller tracks any motion: no training, no help, one episode from its first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.env import ImitationEnv, Reference
+from poise.errors import PoiseError
+from poise.eval import run_episodes, score_rollouts
+from poise.eval.episodes import Acts
+from poise.eval.judged import judge
+from poise.kin import hold_feet
+from poise.metrics import mpjpe_global, success_rule
+from poise.motion import Clip, ClipLibrary
+from poise.motion.io import home_suffix, write_clip
+from poise.motion.keypoints import Keypoints
+from poise.motion.noise import Noise, perturb_clip, perturb_points
+from poise.recipes.deliver import Delivery, deliver, simulated_clip
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import task
+from poise.recipes.session import Evaluation
+from poise.recipes.track_clip import Placed, home, place
+from poise.recipes.track_points import fitted, follow
+from poise.recipes.track_policy import Tracker
+
+#: Which failure ends tracking: a mean distance of 0.5 m.
+RULE = "phc"
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """How a motion is tracked.
+
+    noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
+    failed is put back onto the reference. smooth_hz: cut-off of a low-pass on keypoints.
+    threads: of the physics.
+    """
+
+    noise: tuple[Noise, ...] = ()
+    seed: int = 0
+    reset_on_fail: bool = False
+    smooth_hz: float | None = None
+    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What came of tracking.
+
+    imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
+    placed: the motion on the body. failed_s: seconds at which the character failed, in order; without
+    `reset_on_fail` at most one. notes: sentences on the input and the noise.
+    """
+
+    tracker: Tracker
+    imitation: Imitation
+    evaluation: Evaluation
+    placed: Placed
+    failed_s: tuple[float, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def motion(self) -> Clip:
+        """The simulated motion on the body's skeleton, as it was simulated."""
+        return simulated_clip(self.imitation, self.evaluation)
+
+
+def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None = None) -> Tracked:
+    """Tracks a motion from its first frame to its last with the deterministic policy, without help.
+
+    Keypoints reach a policy with goals of keypoints frame by frame (`kin.KeypointStream`); any other
+    policy gets the clip that is fitted to them.
+
+    Raises:
+        PoiseError: a motion that no human makes or that is too short, see `place`.
+    """
+    config = config or TrackConfig()
+    clip, points = _input(motion, config)
+    placed = place(clip, tracker)
+    imitation = imitation_of(tracker, [placed])
+    notes = list(placed.notes)
+    if points is not None:
+        notes += follow(tracker, placed, points, imitation.reference)
+    keeper = Keeper(tracker.policy, config.reset_on_fail)
+
+    def make_env(worlds: int) -> ImitationEnv:
+        keeper.env = imitation.env(worlds, auto_reset=False, threads=config.threads, help_scale=0.0)
+        check_fits(tracker, keeper.env)
+        return keeper.env
+
+    zero = torch.zeros(1, dtype=torch.long)
+    rollouts, recordings = run_episodes(make_env, keeper, zero, zero, cycles=1)
+    about, rate = tracker.about, imitation.reference.rate_hz
+    card = score_rollouts(
+        rollouts,
+        rule=RULE,
+        method=tracker.config.method,
+        seconds=float(about.get("seconds", 0.0)),
+        samples=int(about.get("samples", 0)),
+        seed=tracker.config.seed,
+    )
+    failed = int(judge(rollouts, success_rule(RULE)).failed_at[0])
+    frames = {frame for _, frame in keeper.fallen} | ({failed} if failed >= 0 else set())
+    if config.noise:
+        notes.append(_noise_note(tracker, motion, rollouts.pos[0], imitation.reference, config))
+    if float(about.get("help_n", 0.0)) > 0:
+        notes.append(
+            f"The policy is that of an unfinished training that still helped by up to "
+            f"{float(about['help_n']):.0f} N; here nothing helps."
+        )
+    evaluation = Evaluation(card, rollouts, recordings)
+    times = tuple(frame / rate for frame in sorted(frames))
+    return Tracked(tracker, imitation, evaluation, placed, times, tuple(notes))
+
+
+def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
+    """Motions on the tracker's body as one task; the report is that of the first."""
+    humanoid, config = tracker.humanoid, tracker.config
+    library = ClipLibrary(tuple(p.clip for p in placed), (1.0,) * len(placed))
+    names = [p.clip.name for p in placed]
+    reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)
+    return Imitation(library, humanoid, reference, placed[0].report, config, task(config, humanoid))
+
+
+def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
+    """Refuses a policy whose observations or actions are not those of its body here.
+
+    Raises:
+        PoiseError: it was trained for another body, or by another version of Poise.
+    """
+    have = (tracker.policy.num_obs, tracker.policy.num_actions)
+    need = (env.num_obs, env.num_actions)
+    if have != need:
+        env.close()
+        raise PoiseError(
+            f"the policy takes {have[0]} observations and gives {have[1]} actions, and its body here "
+            f"has {need[0]} and {need[1]}",
+            hint="It was trained for another body or by another version of Poise; export it anew",
+        )
+
+
+class Keeper:
+    """A policy that puts characters back onto the reference before it acts, where they failed.
+
+    resets: off, it only acts. fallen: (world, frame) of every failure that it mended.
+    """
+
+    def __init__(self, policy: Acts, resets: bool):
+        self.policy, self.resets = policy, resets
+        self.env: ImitationEnv | None = None
+        self.fallen: list[tuple[int, int]] = []
+        self._limit_mm = success_rule(RULE).limit_m * 1000.0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
+        env = self.env
+        if self.resets and env is not None:
+            ref = env.reference.gather(env.clip, env.frame).pos
+            failed = ~(mpjpe_global(env.pose().pos, ref) <= self._limit_mm)
+            if bool(failed.any()):
+                obs = self._mend(env, failed, obs)
+        return self.policy.act(obs)
+
+    def _mend(self, env: ImitationEnv, failed: Tensor, obs: Tensor) -> Tensor:
+        rows = failed.nonzero().flatten()
+        self.fallen += [(int(i), int(env.frame[i])) for i in rows]
+        clip, frame, before = env.clip.clone(), env.frame.clone(), env.backend.snapshot()
+        fresh = env.reset_to(clip, frame)
+        others = (~failed).nonzero().flatten()
+        if len(others):
+            # Starting anew is for all worlds at once; the others go on from where they were.
+            env.backend.restore(before[others], others)
+        return torch.where(failed[:, None], fresh, obs)
+
+
+def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
+    """Writes the motion, `score.json` and `report.html` into `out`, see `deliver`.
+
+    The motion is on the skeleton that came in; where that is not the body's, the motion on the body's
+    skeleton lies beside it as `body.bvh`.
+
+    Args:
+        motion: the file of the motion, in place of one in `out`. hold: see `deliver`.
+    """
+    t, placed = tracked, tracked.placed
+    other = placed.moved is not None
+    inner = out / "body.bvh" if other else motion
+    done = deliver(t.imitation, t.evaluation, out, {}, inner, hold)
+    paths = dict(done.paths)
+    if other:
+        made = t.motion
+        if hold:
+            made = hold_feet(made, t.imitation.humanoid.table)[0]
+        back = home(made, placed, t.tracker)
+        target = motion or out / f"simulated{home_suffix(back)}"
+        write_clip(back, target)
+        paths = {"simulated": target, "body": paths.pop("simulated"), **paths}
+    return replace(done, paths=paths)
+
+
+def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoints | None]:
+    """The motion with noise as a clip, and as keypoints where it is."""
+    if isinstance(motion, Keypoints):
+        if config.noise:
+            motion = perturb_points(motion, config.noise, config.seed)
+        return fitted(motion, config.smooth_hz), motion
+    clip = motion
+    return (perturb_clip(clip, config.noise, config.seed) if config.noise else clip), None
+
+
+def _noise_note(
+    tracker: Tracker, motion: Clip | Keypoints, sim: Tensor, noisy: Reference, config: TrackConfig
+) -> str:
+    """How far the input lies from the motion without noise, and the character from it."""
+    clean, _ = _input(motion, replace(config, noise=()))
+    pos = imitation_of(tracker, [place(clean, tracker)]).reference.pose.pos
+    frames = min(len(pos), len(sim), len(noisy.pose.pos))
+
+    def off(a: Any) -> float:
+        return float(mpjpe_global(torch.as_tensor(np.asarray(a[:frames])), pos[:frames]).mean())
+
+    return (
+        f"The score is that against the input with noise. The noise moved the bodies by "
+        f"{off(noisy.pose.pos):.0f} mm on average; the character is {off(sim):.0f} mm from the motion "
+        "without noise."
+    )
