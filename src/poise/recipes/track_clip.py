@@ -71,7 +71,7 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
     moved = {row.target for row in report.joints.rows if row.source}
     moved |= {j for _, j in report.joints.direct}
     skeleton, rot = back.skeleton, back.rot.copy()
-    # Depth first: a joint's children have larger indices.
+    # What carries a joint that was moved must stay as it is; parents come before their children.
     carries = set(moved)
     for j in reversed(range(len(skeleton))):
         if j in carries and skeleton.parents[j] >= 0:

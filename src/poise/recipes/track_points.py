@@ -23,6 +23,7 @@ from poise.motion.io.points_csv import csv_points
 from poise.motion.io.raw import Options
 from poise.motion.io.trc import trc_points
 from poise.motion.keypoints import Keypoints
+from poise.motion.noise import hold_missing
 from poise.motion.points import FitConfig, fit_clip
 from poise.recipes.track_clip import Placed
 from poise.recipes.track_policy import Tracker
@@ -60,13 +61,16 @@ def follow(tracker: Tracker, placed: Placed, points: Keypoints, reference: Refer
         return ["The policy follows rotations: it got the clip that was fitted to the keypoints."]
     if placed.source.frames != points.frames:
         return ["The keypoints have long gaps: the longest stretch without was fitted and tracked."]
+    points = _seen(points)
+    # The performer is measured on frames without gaps; the stream itself sees them.
+    held = points.replaced(positions=hold_missing(points.positions))
     try:
-        body = PointBody.calibrate(points, tracker.example, tracker.humanoid.table)
+        body = PointBody.calibrate(held, tracker.example, tracker.humanoid.table)
     except PoiseError as problem:
         return [f"The keypoints cannot be followed one by one ({problem.what}): they were fitted."]
     goals = list(KeypointStream(body, reference.rate_hz, StreamConfig()).follow(points))
-    if not goals:
-        return ["Some keypoint is never seen: the clip that was fitted to the others was tracked."]
+    if len(goals) < 2:
+        return ["The keypoints give no goals: the clip that was fitted to them was tracked."]
     pose = reference.pose
     times = np.array([g.time_s for g in goals])
     at = np.arange(len(pose.pos)) / reference.rate_hz
@@ -86,3 +90,10 @@ def follow(tracker: Tracker, placed: Placed, points: Keypoints, reference: Refer
     late = StreamConfig().lookahead / reference.rate_hz
     lost = f"; the longest gap of a keypoint is {stale:.1f} s" if stale > 0 else ""
     return [f"Each goal comes from the keypoints up to {late * 1000:.0f} ms after it alone{lost}."]
+
+
+def _seen(points: Keypoints) -> Keypoints:
+    """Without those that are missing in every frame."""
+    kept = np.flatnonzero(~points.missing.all(0))
+    names = tuple(points.names[k] for k in kept)
+    return points.replaced(names=names, positions=points.positions[:, kept], confidence=None)

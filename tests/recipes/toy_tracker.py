@@ -1,0 +1,28 @@
+"""A run of the perpetual recipe on two cuts of the embedded walk, with tiny networks, in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from toy_library import tiny
+
+import poise
+from poise.learn import Until
+from poise.motion import Clip, ClipLibrary, read_clip, trim
+from poise.recipes import perpetual_run
+
+WALK = Path(poise.__file__).parent / "data/walk.bvh"
+
+
+def walk(start: int = 0, stop: int | None = None, name: str = "walk") -> Clip:
+    """A cut of the embedded walk, 30 frames per second."""
+    return trim(read_clip(WALK), start, stop).replaced(name=name)
+
+
+def toy_run(folder: Path, goal: str = "rotations") -> Path:
+    """A run folder with a policy that was trained for three iterations, and falls soon."""
+    library = ClipLibrary.of([walk(0, 30, "first"), walk(25, 60, "second")])
+    config = tiny(goal=goal, single=True, style=None, expert=False, evaluate_every=100)
+    imitation = perpetual_run.begin(folder, library, config)
+    perpetual_run.train(imitation, folder, Until(iterations=3), threads=1, tensorboard=False)
+    return folder
