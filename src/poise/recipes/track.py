@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,13 +48,35 @@ class TrackConfig:
     threads: int = 1
 
 
+@dataclass(frozen=True)
+class Clean:
+    """An input with noise, and the character that followed it, beside the motion without noise.
+
+    noise_mm: mean distance of the bodies in the input. off_mm: that of the character, up to where it
+    failed. succeeded: whether the character stayed within 0.5 m of the motion without noise.
+    """
+
+    noise_mm: float
+    off_mm: float
+    succeeded: bool
+
+    def sentence(self) -> str:
+        """The figures in words."""
+        return (
+            f"The score is that against the input with noise, which moved the bodies by "
+            f"{self.noise_mm:.0f} mm on average; the character is {self.off_mm:.0f} mm from the motion "
+            "without noise."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """What came of tracking.
 
     imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
     placed: the motion on the body. failed_s: seconds at which the character failed, in order; without
-    `reset_on_fail` at most one. notes: sentences on the input and the noise.
+    `reset_on_fail` at most one. clean: what the noise changed, None without noise. notes: sentences on
+    the input and the noise.
     """
 
     tracker: Tracker
@@ -64,6 +84,7 @@ class Tracked:
     evaluation: Evaluation
     placed: Placed
     failed_s: tuple[float, ...]
+    clean: Clean | None
     notes: tuple[str, ...]
 
     @property
@@ -87,7 +108,7 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
     imitation = imitation_of(tracker, [placed])
     notes = list(placed.notes)
     if points is not None:
-        notes += follow(tracker, placed, points, imitation.reference)
+        notes += follow(tracker, placed, points, imitation.reference, config.smooth_hz)
     keeper = Keeper(tracker.policy, config.reset_on_fail)
 
     def make_env(worlds: int) -> ImitationEnv:
@@ -106,10 +127,14 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
         samples=int(about.get("samples", 0)),
         seed=tracker.config.seed,
     )
-    failed = int(judge(rollouts, success_rule(RULE)).failed_at[0])
+    judged = judge(rollouts, success_rule(RULE))
+    failed = int(judged.failed_at[0])
     frames = {frame for _, frame in keeper.fallen} | ({failed} if failed >= 0 else set())
+    clean = None
     if config.noise:
-        notes.append(_noise_note(tracker, motion, rollouts.pos[0], imitation.reference, config))
+        seen = rollouts.pos[0], imitation.reference.pose.pos
+        clean = _beside_clean(tracker, motion, judged.mask[0], *seen, config)
+        notes.append(clean.sentence())
     if float(about.get("help_n", 0.0)) > 0:
         notes.append(
             f"The policy is that of an unfinished training that still helped by up to "
@@ -117,7 +142,7 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
         )
     evaluation = Evaluation(card, rollouts, recordings)
     times = tuple(frame / rate for frame in sorted(frames))
-    return Tracked(tracker, imitation, evaluation, placed, times, tuple(notes))
+    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes))
 
 
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
@@ -215,19 +240,16 @@ def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoin
     return (perturb_clip(clip, config.noise, config.seed) if config.noise else clip), None
 
 
-def _noise_note(
-    tracker: Tracker, motion: Clip | Keypoints, sim: Tensor, noisy: Reference, config: TrackConfig
-) -> str:
-    """How far the input lies from the motion without noise, and the character from it."""
+def _beside_clean(
+    tracker: Tracker, motion: Clip | Keypoints, judged: Tensor, sim: Tensor, noisy: Tensor,
+    config: TrackConfig,
+) -> Clean:  # fmt: skip
+    """The character `sim (T, B, 3)` beside the motion without noise, in the frames `judged (T)`."""
     clean, _ = _input(motion, replace(config, noise=()))
     pos = imitation_of(tracker, [place(clean, tracker)]).reference.pose.pos
-    frames = min(len(pos), len(sim), len(noisy.pose.pos))
-
-    def off(a: Any) -> float:
-        return float(mpjpe_global(torch.as_tensor(np.asarray(a[:frames])), pos[:frames]).mean())
-
-    return (
-        f"The score is that against the input with noise. The noise moved the bodies by "
-        f"{off(noisy.pose.pos):.0f} mm on average; the character is {off(sim):.0f} mm from the motion "
-        "without noise."
-    )
+    # A gap at an end of noisy keypoints may have cut some frames off.
+    frames = min(len(pos), len(sim), len(noisy))
+    pos, sim, noisy, kept = pos[:frames], sim[:frames], noisy[:frames], judged[:frames]
+    off = mpjpe_global(sim, pos)
+    won = bool((off <= success_rule(RULE).limit_m * 1000.0).all())
+    return Clean(float(mpjpe_global(noisy, pos).mean()), float(off[kept].mean()), won)

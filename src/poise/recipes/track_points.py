@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,11 +52,19 @@ def fitted(points: Keypoints, smooth_hz: float | None = None) -> Clip:
     return fit_clip(points, FitConfig(smooth_hz=smooth_hz))
 
 
-def follow(tracker: Tracker, placed: Placed, points: Keypoints, reference: Reference) -> list[str]:
+def follow(
+    tracker: Tracker,
+    placed: Placed,
+    points: Keypoints,
+    reference: Reference,
+    smooth_hz: float | None = None,
+) -> list[str]:
     """Puts goals from the stream of keypoints into the reference of a keypoint policy.
 
     The character begins as the fitted clip does; places and velocities of its goals are those that the
     stream gives from what came so far. Returns what is to be said about it.
+
+    smooth_hz: cut-off of the stream's filter, which sees the past alone.
     """
     if tracker.config.goal != "keypoints":
         return ["The policy follows rotations: it got the clip that was fitted to the keypoints."]
@@ -68,7 +77,8 @@ def follow(tracker: Tracker, placed: Placed, points: Keypoints, reference: Refer
         body = PointBody.calibrate(held, tracker.example, tracker.humanoid.table)
     except PoiseError as problem:
         return [f"The keypoints cannot be followed one by one ({problem.what}): they were fitted."]
-    goals = list(KeypointStream(body, reference.rate_hz, StreamConfig()).follow(points))
+    config = StreamConfig(smooth_s=1.0 / (2.0 * math.pi * smooth_hz) if smooth_hz else 0.0)
+    goals = list(KeypointStream(body, reference.rate_hz, config).follow(points))
     if len(goals) < 2:
         return ["The keypoints give no goals: the clip that was fitted to them was tracked."]
     pose = reference.pose
@@ -87,7 +97,7 @@ def follow(tracker: Tracker, placed: Placed, points: Keypoints, reference: Refer
         linvel=torch.where(inside, between([g.linvel for g in goals]), pose.linvel),
     )
     stale = max(g.stale_s for g in goals)
-    late = StreamConfig().lookahead / reference.rate_hz
+    late = config.lookahead / reference.rate_hz
     lost = f"; the longest gap of a keypoint is {stale:.1f} s" if stale > 0 else ""
     return [f"Each goal comes from the keypoints up to {late * 1000:.0f} ms after it alone{lost}."]
 
