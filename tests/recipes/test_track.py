@@ -59,7 +59,7 @@ def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> N
     far = (r.pos[0] - r.ref_pos[0]).norm(dim=-1).mean(-1)
     first = int((far > 0.5).nonzero()[0])
     assert failed == pytest.approx(first / 30.0)
-    motion = tracked.motion
+    motion = tracked.motion()
     assert (motion.frames, motion.fps, motion.skeleton) == (40, 30.0, clip.skeleton)
     done = write(tracked, tmp_path / "out", tmp_path / "out.bvh")
     assert set(done.paths) == {"simulated", "score", "report"} and done.paths["simulated"].exists()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.console import say
+from poise.cli.console import notes, say
 from poise.cli.options import Reading
 from poise.cli.output import claimed
 from poise.cli.progress import working
@@ -40,6 +40,8 @@ class Options:
     Poise."""
     reset_on_fail: bool = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
+    count: Annotated[int, arg(metavar="N")] = 1
+    """Characters who do the motion side by side in one world, where they may collide."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -54,9 +56,13 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> int:
     """Opens the policy, reads, tracks, writes; says where the character failed."""
     o = options
+    if not 1 <= o.count <= 64:
+        raise PoiseError(f"--count must lie in 1 to 64, got {o.count}")
     if not 0 <= o.seed < 2**31:
         raise PoiseError(f"--seed must be a whole number of at least 0, got {o.seed}")
     out, motion = places(o.clip, o.out)
+    if motion is not None and o.count > 1:
+        raise PoiseError("several characters make several files", motion, "Give a folder as -o")
     from poise.recipes.track import TrackConfig, track, write
     from poise.recipes.track_noise import noise_of
     from poise.recipes.track_policy import open_tracker, save_tracker
@@ -66,14 +72,14 @@ def run(options: Options, argv: Sequence[str]) -> int:
     with working("opening the policy"):
         tracker = open_tracker(o.policy)
     with claimed(out), working("tracking"):
-        config = TrackConfig(noise, o.seed, o.reset_on_fail, o.reading.smooth)
+        config = TrackConfig(noise, o.seed, o.reset_on_fail, o.reading.smooth, o.count)
         tracked = track(tracker, given, config)
         done = write(tracked, out, motion, o.hold_feet)
         if o.save_policy is not None:
             save_tracker(tracker, o.save_policy)
     print_card(done.card)
-    for note in (*tracked.notes, *done.notes, outcome(tracked, o.reset_on_fail)):
-        say(note)
+    notes((*tracked.notes, *done.notes))
+    say(outcome(tracked, o.reset_on_fail))
     for path in (*done.paths.values(), *((o.save_policy,) if o.save_policy else ())):
         say(str(path))
     return 0
@@ -81,8 +87,13 @@ def run(options: Options, argv: Sequence[str]) -> int:
 
 def outcome(tracked: Tracked, reset: bool) -> str:
     """Where the character failed, in one sentence."""
-    times = tracked.failed_s
-    seconds = (int(tracked.imitation.reference.length[0]) - 1) / tracked.imitation.reference.rate_hz
+    reference, times = tracked.imitation.reference, tracked.failed_s
+    seconds = (int(reference.length[0]) - 1) / reference.rate_hz
+    count, fell = len(reference.length), {who for who, _ in tracked.failures}
+    if count > 1:
+        first = f", the first at {tracked.failures[0][1]:.1f} s" if fell else ""
+        again = f"; they were put back {len(tracked.failures)} times" if fell and reset else ""
+        return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if not times:
         return f"Tracked to its end, {seconds:.1f} s, without help."
     if not reset:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,9 +26,12 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
 from poise.recipes.session import Evaluation
 from poise.recipes.track_clip import Placed, home, place
+from poise.recipes.track_crowd import crowd_env, places
 from poise.recipes.track_points import fitted, follow
 from poise.recipes.track_policy import Tracker
 
+#: Characters in one world.
+MOST = 64
 #: Which failure ends tracking: a mean distance of 0.5 m.
 RULE = "phc"
 
@@ -38,14 +42,20 @@ class TrackConfig:
 
     noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
     failed is put back onto the reference. smooth_hz: cut-off of a low-pass on keypoints.
-    threads: of the physics.
+    count: characters who do the motion side by side in one world, see `track_crowd`. threads: of the
+    physics.
     """
 
     noise: tuple[Noise, ...] = ()
     seed: int = 0
     reset_on_fail: bool = False
     smooth_hz: float | None = None
+    count: int = 1
     threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= MOST:
+            raise PoiseError(f"there can be 1 to {MOST} characters, got {self.count}")
 
 
 @dataclass(frozen=True)
@@ -74,23 +84,27 @@ class Tracked:
     """What came of tracking.
 
     imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
-    placed: the motion on the body. failed_s: seconds at which the character failed, in order; without
-    `reset_on_fail` at most one. clean: what the noise changed, None without noise. notes: sentences on
-    the input and the noise.
+    placed: the motion on the body. failures: (character, seconds) of each failure in the order of time;
+    without `reset_on_fail` at most one per character. clean: what the noise changed, None without
+    noise. notes: sentences on the input and the noise.
     """
 
     tracker: Tracker
     imitation: Imitation
     evaluation: Evaluation
     placed: Placed
-    failed_s: tuple[float, ...]
+    failures: tuple[tuple[int, float], ...]
     clean: Clean | None
     notes: tuple[str, ...]
 
     @property
-    def motion(self) -> Clip:
+    def failed_s(self) -> tuple[float, ...]:
+        """Seconds at which the first character failed."""
+        return tuple(t for who, t in self.failures if who == 0)
+
+    def motion(self, character: int = 0) -> Clip:
         """The simulated motion on the body's skeleton, as it was simulated."""
-        return simulated_clip(self.imitation, self.evaluation)
+        return simulated_clip(self.imitation, self.evaluation, character)
 
 
 def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None = None) -> Tracked:
@@ -109,15 +123,22 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
     notes = list(placed.notes)
     if points is not None:
         notes += follow(tracker, placed, points, imitation.reference, config.smooth_hz)
+    goals = imitation.reference.pose.pos
+    if config.count > 1:
+        imitation = side_by_side(imitation, config.count)
     keeper = Keeper(tracker.policy, config.reset_on_fail)
 
     def make_env(worlds: int) -> ImitationEnv:
-        keeper.env = imitation.env(worlds, auto_reset=False, threads=config.threads, help_scale=0.0)
+        if worlds > 1:
+            keeper.env = crowd_env(imitation, worlds)
+        else:
+            keeper.env = imitation.env(1, auto_reset=False, threads=config.threads, help_scale=0.0)
         check_fits(tracker, keeper.env)
         return keeper.env
 
-    zero = torch.zeros(1, dtype=torch.long)
-    rollouts, recordings = run_episodes(make_env, keeper, zero, zero, cycles=1)
+    all_of_them = torch.arange(config.count)
+    starts = torch.zeros_like(all_of_them)
+    rollouts, recordings = run_episodes(make_env, keeper, all_of_them, starts, cycles=1)
     about, rate = tracker.about, imitation.reference.rate_hz
     card = score_rollouts(
         rollouts,
@@ -128,11 +149,11 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
         seed=tracker.config.seed,
     )
     judged = judge(rollouts, success_rule(RULE))
-    failed = int(judged.failed_at[0])
-    frames = {frame for _, frame in keeper.fallen} | ({failed} if failed >= 0 else set())
+    failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
+    frames = sorted({*keeper.fallen, *failed}, key=lambda x: (x[1], x[0]))
     clean = None
     if config.noise:
-        seen = rollouts.pos[0], imitation.reference.pose.pos
+        seen = rollouts.pos[0], goals
         clean = _beside_clean(tracker, motion, judged.mask[0], *seen, config)
         notes.append(clean.sentence())
     if float(about.get("help_n", 0.0)) > 0:
@@ -141,7 +162,7 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
             f"{float(about['help_n']):.0f} N; here nothing helps."
         )
     evaluation = Evaluation(card, rollouts, recordings)
-    times = tuple(frame / rate for frame in sorted(frames))
+    times = tuple((who, frame / rate) for who, frame in frames)
     return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes))
 
 
@@ -152,6 +173,33 @@ def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
     names = [p.clip.name for p in placed]
     reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)
     return Imitation(library, humanoid, reference, placed[0].report, config, task(config, humanoid))
+
+
+def side_by_side(imitation: Imitation, count: int) -> Imitation:
+    """The first motion `count` times, each some metres from the others; clips are called NAME-1, ..."""
+    clip, reference = imitation.library.clips[0], imitation.reference
+    names = [f"{clip.name}-{k + 1}" for k in range(count)]
+    moves = np.pad(places(count), ((0, 0), (0, 1)))
+    motions = []
+    for move in moves:
+        qpos = reference.qpos.numpy().copy()
+        qpos[:, :3] += move
+        motions.append(qpos)
+    made = Reference(reference.humanoid, motions, reference.rate_hz, names)
+    # Goals that came from keypoints are no function of the coordinates.
+    pose = reference.pose
+    many = {f.name: torch.cat([getattr(pose, f.name)] * count) for f in fields(pose)}
+    shift = torch.tensor(moves).repeat_interleave(len(reference.qpos), 0).to(pose.pos)
+    many["pos"] = many["pos"] + shift[:, None]
+    many["com"] = many["com"] + shift
+    many["qpos"] = made.pose.qpos
+    made.pose = replace(pose, **many)
+    report = imitation.report
+    each = ("fps", "flights", "clean", "cycles", "ground", "joint_error_mm")
+    copies = {name: getattr(report, name) * count for name in each}
+    report = replace(report, names=tuple(names), **copies)
+    clips = ClipLibrary(tuple(clip.replaced(name=n) for n in names), (1.0,) * count)
+    return replace(imitation, library=clips, reference=made, report=report)
 
 
 def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
@@ -214,19 +262,27 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
     Args:
         motion: the file of the motion, in place of one in `out`. hold: see `deliver`.
     """
-    t, placed = tracked, tracked.placed
+    t, placed, count = tracked, tracked.placed, len(tracked.evaluation.recordings)
+    if count > 1 and motion is not None:
+        raise PoiseError(f"{count} characters make {count} files", motion, "Give a folder as -o")
     other = placed.moved is not None
-    inner = out / "body.bvh" if other else motion
+    inner = out / "body.bvh" if other and count == 1 else motion
     done = deliver(t.imitation, t.evaluation, out, {}, inner, hold)
-    paths = dict(done.paths)
-    if other:
-        made = t.motion
+    if not other:
+        return done
+    paths: dict[str, Path] = {}
+    for k, (name, path) in enumerate(done.paths.items()):
+        if k >= count:
+            paths[name] = path
+            continue
+        made = t.motion(k)
         if hold:
             made = hold_feet(made, t.imitation.humanoid.table)[0]
-        back = home(made, placed, t.tracker)
-        target = motion or out / f"simulated{home_suffix(back)}"
-        write_clip(back, target)
-        paths = {"simulated": target, "body": paths.pop("simulated"), **paths}
+        back = home(made, placed, t.tracker).replaced(name=made.name)
+        body = name.replace("simulated", "body", 1)
+        paths[body] = path.rename(out / f"{body}{path.suffix}")
+        paths[name] = motion or out / f"{name}{home_suffix(back)}"
+        write_clip(back, paths[name])
     return replace(done, paths=paths)
 
 
