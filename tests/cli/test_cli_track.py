@@ -10,28 +10,16 @@ import numpy as np
 import pytest
 from tiny_clips import deepmimic, put
 
-import poise
 from poise.cli.main import main
-from poise.learn import PPOConfig, Until
-from poise.motion import ClipLibrary, read_clip, trim, write_clip
-from poise.recipes import perpetual_run, track_policy
-from poise.recipes.perpetual import Perpetual
-
-WALK = Path(poise.__file__).parent / "data/walk.bvh"
+from poise.motion import read_clip, trim, write_clip
+from poise.recipes import track_policy
+from toy_policy import WALK, toy_run
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run on two cuts of the embedded walk, trained for two iterations."""
-    folder = tmp_path_factory.mktemp("run")
-    ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
-    own = {"single": True, "expert": False, "style": None, "evaluate_every": 100, "num_envs": 4}
-    config = Perpetual(ppo=ppo, single_hidden=(8,), **own)  # type: ignore[arg-type]
-    walk = read_clip(WALK)
-    clips = [trim(walk, 0, 25).replaced(name="a"), trim(walk, 25, 50).replaced(name="b")]
-    imitation = perpetual_run.begin(folder, ClipLibrary.of(clips), config)
-    perpetual_run.train(imitation, folder, Until(iterations=2), threads=1, tensorboard=False)
-    return folder
+    """A run on two cuts of the embedded walk."""
+    return toy_run(tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture(scope="module")

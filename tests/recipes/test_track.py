@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_tracker import toy_run, walk
 
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
@@ -25,6 +24,7 @@ from poise.recipes.track_clip import home, place, within_turns
 from poise.recipes.track_points import points_of
 from poise.recipes.track_policy import Tracker, policy_of_run
 from toy_human import swing
+from toy_policy import toy_run, walk
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_tracker import toy_run, walk
 
 from poise.errors import PoiseError
 from poise.motion import read_clip
@@ -17,6 +16,7 @@ from poise.recipes.track_crowd import APART_M, Crowd, crowd_model, places
 from poise.recipes.track_policy import Tracker, policy_of_run
 from poise.sim import CpuBackend
 from toy_human import swing
+from toy_policy import toy_run, walk
 
 
 @pytest.fixture(scope="module")

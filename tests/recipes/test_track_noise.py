@@ -7,13 +7,13 @@ import math
 from pathlib import Path
 
 import pytest
-from toy_tracker import toy_run, walk
 
 from poise.errors import PoiseError
 from poise.motion.noise import VIDEO, Drift, FrameLoss, Jitter, Level, robustness_levels
 from poise.recipes.track import TrackConfig, track
 from poise.recipes.track_noise import KINDS, Robustness, Rung, noise_of, robustness, write_robustness
 from poise.recipes.track_policy import Tracker, policy_of_run
+from toy_policy import toy_run, walk
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from toy_tracker import toy_run, walk
 
 from poise.errors import PoiseError
 from poise.learn import load_checkpoint, save_checkpoint
@@ -21,6 +22,7 @@ from poise.recipes.track_policy import (
     open_tracker,
     policy_of_run,
 )
+from toy_policy import toy_run, walk
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +127,14 @@ def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
     perpetual_run.begin(tmp_path, ClipLibrary.of([walk(0, 20), walk(20, 40, "b")]), config)
     with pytest.raises(PoiseError, match="nothing has been trained"):
         open_tracker(tmp_path)
+
+
+def test_a_program_that_only_tracks_starts_without_heavy_packages(file: Path) -> None:
+    """They would take longer to import than the policy takes to open."""
+    code = (
+        "import sys; from pathlib import Path; import poise.recipes.track; "
+        "from poise.recipes.track_policy import open_tracker; open_tracker(Path(sys.argv[1])); "
+        "print([m for m in ('sympy', 'scipy.optimize', 'scipy.spatial') if m in sys.modules])"
+    )
+    command = [sys.executable, "-c", code, str(file)]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"

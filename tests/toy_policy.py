@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toy_library import tiny
-
 import poise
-from poise.learn import Until
+from poise.learn import PPOConfig, Until
 from poise.motion import Clip, ClipLibrary, read_clip, trim
 from poise.recipes import perpetual_run
+from poise.recipes.perpetual import Perpetual
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
+PPO = PPOConfig(
+    horizon=4, epochs=1, minibatch=64, std=0.02, policy_hidden=(16,), value_hidden=(16,), norm_warmup=2
+)
 
 
 def walk(start: int = 0, stop: int | None = None, name: str = "walk") -> Clip:
@@ -22,7 +24,9 @@ def walk(start: int = 0, stop: int | None = None, name: str = "walk") -> Clip:
 def toy_run(folder: Path, goal: str = "rotations") -> Path:
     """A run folder with a policy that was trained for three iterations, and falls soon."""
     library = ClipLibrary.of([walk(0, 30, "first"), walk(25, 60, "second")])
-    config = tiny(goal=goal, single=True, style=None, expert=False, evaluate_every=100)
+    plain = {"num_envs": 8, "evaluate_every": 100, "seed": 1, "expert": False, "style": None}
+    sizes = {"single": True, "single_hidden": (24, 16), "ppo": PPO, "goal": goal}
+    config = Perpetual(**(plain | sizes))  # type: ignore[arg-type]
     imitation = perpetual_run.begin(folder, library, config)
     perpetual_run.train(imitation, folder, Until(iterations=3), threads=1, tensorboard=False)
     return folder
