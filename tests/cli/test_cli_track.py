@@ -70,6 +70,15 @@ def test_another_skeleton_with_noise_and_resets(
     assert (out / "body.bvh").exists()
 
 
+def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["track", str(short), "--policy", str(file), "-o", str(out), "--count", "2"]) == 0
+    assert "0 of 2 characters tracked all" in capsys.readouterr().out
+    assert {p.name for p in out.iterdir()} == {
+        "simulated_short-1.bvh", "simulated_short-2.bvh", "score.json", "report.html"
+    }  # fmt: skip
+
+
 def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, refused) -> None:
     out = str(tmp_path / "out")
     given = ("--policy", file, "-o", out)
@@ -81,6 +90,9 @@ def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, ref
     refused("track", short, *given, "--noise", "jiter:1", words=("no noise 'jiter'", "'jitter'"))
     refused("track", short, *given, "--noise", "jitter:lots", words=("must be a number",))
     refused("track", short, *given, "--seed", "-1", words=("--seed must",))
+    refused("track", short, *given, "--count", "0", words=("--count must",))
+    one = ("--policy", file, "-o", tmp_path / "one.bvh", "--count", "2")
+    refused("track", short, *one, words=("several files",))
     refused("track", short, "--policy", file, "-o", tmp_path / "a.fbx", words=("cannot be written",))
     refused("track", tmp_path / "absent.bvh", *given, words=("absent.bvh",))
 

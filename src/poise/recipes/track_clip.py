@@ -124,9 +124,10 @@ def _notes(qpos: np.ndarray, humanoid: Humanoid, moved: RetargetReport | None) -
     low, high = humanoid.model.jnt_range[1:].T
     over = np.maximum(low - qpos[:, 7:], qpos[:, 7:] - high).max(0)
     if (over > BEYOND).any():
-        worst = int(over.argmax())
+        worst, many = int(over.argmax()), int((over > BEYOND).sum())
+        which = f"{many} joints go" if many > 1 else "One joint goes"
         out.append(
-            f"{int((over > BEYOND).sum())} joints go beyond the range of the policy's body, most "
+            f"{which} beyond the range of the policy's body, most "
             f"{humanoid.hinges[worst]} by {math.degrees(over[worst]):.0f} degrees."
         )
     return tuple(out)
