@@ -46,6 +46,17 @@ def _example_clip(request: pytest.FixtureRequest) -> Path:
     return request.getfixturevalue("data_dir") / "cmu_bvh" / "fairmotion" / "01_01.bvh"
 
 
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a toy `run` and its `policy.safetensors`."""
+    from poise.recipes.track_policy import export_policy
+    from toy_policy import toy_run
+
+    folder = tmp_path_factory.mktemp("policy")
+    export_policy(toy_run(folder / "run"), folder / "policy.safetensors")
+    return folder
+
+
 @pytest.mark.parametrize(("page", "index"), SNIPPETS, ids=lambda x: getattr(x, "name", str(x)))
 def test_python_snippets_run(
     page: Path,
@@ -59,6 +70,8 @@ def test_python_snippets_run(
         code = code.replace(long, short)
     for name in re.findall(r"read_clip\(\"([\w.]+)\"\)", code):
         shutil.copy(_example_clip(request), tmp_path / name)
+    if "policy.safetensors" in code:
+        shutil.copytree(request.getfixturevalue("policy"), tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
     if "deliver(" in code:

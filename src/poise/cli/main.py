@@ -24,6 +24,7 @@ VERBS = {
     "imitate": "give one clip a body: train, simulate, score, report",
     "train": "train a recipe on one clip or a library, and no more",
     "inbetween": "fill the frames between keyframes of a clip with a trained network",
+    "track": "let a trained policy do any motion, without training",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",

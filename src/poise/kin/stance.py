@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
-from scipy.optimize import least_squares
-from scipy.spatial import ConvexHull, QhullError
 
 from poise.body import Humanoid
 from poise.body.table import BodyRow
@@ -72,6 +70,9 @@ def relaxed_stance(humanoid: Humanoid) -> Stance:
 
 def support_polygon(points: np.ndarray) -> np.ndarray:
     """`(K, 2)` m, the convex hull of `points (N, 2)`, counter-clockwise."""
+    # Here, since whoever only tracks a motion would wait for SciPy otherwise.
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         return points[ConvexHull(points).vertices]
     except QhullError:
@@ -214,6 +215,8 @@ class _Solver:
         return np.concatenate([np.atleast_1d(v) for v in out])
 
     def solve(self) -> Stance:
+        from scipy.optimize import least_squares
+
         count = len(self.low)
         low, high = np.full(3 + count, -np.inf), np.full(3 + count, np.inf)
         low[3:], high[3:] = self.low - 1e-9, self.high + 1e-9

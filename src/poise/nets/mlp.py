@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +22,16 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 def _activation(name: str) -> nn.Module:
     # In place, ReLU spares the largest arrays of an update a copy (a twentieth of its time).
     return nn.ReLU(inplace=True) if name == "relu" else ACTIVATIONS[name]()
+
+
+def bare_linear(num_in: int, num_out: int, bias: bool = True) -> nn.Linear:
+    """A layer whose weights are yet to be filled; nothing is drawn from the global generator.
+
+    `nn.utils.skip_init` does the same by way of meta tensors, for which torch imports SymPy: half a
+    second for a program that only runs a policy.
+    """
+    with torch.random.fork_rng(devices=[]):
+        return nn.Linear(num_in, num_out, bias)
 
 
 class MLP(nn.Module):
@@ -58,8 +67,7 @@ class MLP(nn.Module):
             raise PoiseError(f"every layer needs at least 1 unit, got the sizes {sizes}")
         layers: list[nn.Module] = []
         for i, (a, b) in enumerate(pairwise(sizes)):
-            # The default initialisation would draw from the global generator.
-            linear = cast(nn.Linear, nn.utils.skip_init(nn.Linear, a, b))
+            linear = bare_linear(a, b)
             bound = a**-0.5
             with torch.no_grad():
                 linear.weight.uniform_(-bound, bound, generator=generator)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.nets.mlp import MLP
+from poise.nets.mlp import MLP, bare_linear
 
 Start = Literal["copy", "random"]
 
@@ -152,11 +152,7 @@ class ProgressiveNet(nn.Module):
         widths = [*self.hidden, self.num_out]
         earlier = nn.ModuleList()
         for _ in range(len(self) - 1 if self.lateral else 0):
-            matrices = [
-                # The default initialisation would draw from the global generator.
-                cast(nn.Linear, nn.utils.skip_init(nn.Linear, a, b, bias=False))
-                for a, b in pairwise(widths)
-            ]
+            matrices = [bare_linear(a, b, bias=False) for a, b in pairwise(widths)]
             for i, matrix in enumerate(matrices):
                 # As of the column's own layers, with a small last one.
                 bound = matrix.in_features**-0.5 * (0.1 if i == len(matrices) - 1 else 1.0)

@@ -1,0 +1,216 @@
+"""A trained controller as one small file: weights, body, settings, and what it was trained on.
+
+    policy = policy_of_run(Path("run"))          # or load_tracker("policy.safetensors")
+    save_tracker(policy, "policy.safetensors")
+
+The file is a checkpoint (`poise.learn.checkpoint`). Matrices are in half precision, everything else as
+it was trained; the body stands in it with every number, so that no clip of the training is needed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from poise import __version__
+from poise.body import BodyTable, Humanoid
+from poise.body.humanoid import make_humanoid
+from poise.body.table import BodyRow, Geom
+from poise.errors import PoiseError
+from poise.learn import PolicyBundle, load_checkpoint, save_checkpoint
+from poise.motion import Clip, trim
+from poise.motion.pack import pack_clips, unpack_clips
+from poise.recipes import perpetual_run
+from poise.recipes.perpetual import RECIPE, Perpetual
+from poise.recipes.session import FINAL, RUN_FILE, trained_policy
+
+#: What a policy file calls itself, and the version of what stands in it.
+KIND, VERSION = "tracker", 1
+#: The policy that comes with Poise lies here once there is one.
+SHIPPED = Path(__file__).parents[1] / "data/tracker.safetensors"
+#: Frames of a clip that are kept, by which the skeleton's standing is known.
+EXAMPLE_FRAMES = 300
+#: The largest number of half precision.
+_HALF_MAX = torch.finfo(torch.float16).max
+_EXAMPLE = "example/"
+
+
+@dataclass(frozen=True, eq=False)
+class Tracker:
+    """A policy with the body that it moves.
+
+    policy: acts deterministically on raw observations. humanoid: the body, its model with the physics
+    settings. example: a clip on the body's skeleton, which tells how it stands. config: the settings by
+    which it was trained. about: "clips" (names), "stage", "samples", "seconds", "help_n" (what help the
+    training still gave), "poise" (the version that wrote it).
+    """
+
+    policy: PolicyBundle
+    humanoid: Humanoid
+    example: Clip
+    config: Perpetual
+    about: Mapping[str, Any]
+
+
+def open_tracker(path: Path | None = None) -> Tracker:
+    """The policy in a file or a run folder; without a path the one that comes with Poise.
+
+    Raises:
+        PoiseError: there is none, or it cannot be used.
+    """
+    if path is None:
+        if not SHIPPED.exists():
+            raise PoiseError(
+                "no policy comes with this version of Poise yet",
+                hint="Train one with poise train perpetual --library DIR -o RUN and give --policy RUN",
+            )
+        path = SHIPPED
+    if not path.exists():
+        raise PoiseError(
+            "there is no such policy", path, "Give a policy file or the folder of a perpetual run"
+        )
+    return policy_of_run(path) if path.is_dir() else load_tracker(path)
+
+
+def policy_of_run(folder: Path) -> Tracker:
+    """The latest policy of a run of `poise train perpetual`; builds its body anew from all its clips.
+
+    Raises:
+        PoiseError: no run, a run of another recipe, or nothing was trained in it.
+    """
+    path = folder / RUN_FILE
+    if not path.exists() and (folder / "run" / RUN_FILE).exists():
+        path = folder / "run" / RUN_FILE
+    if not path.exists():
+        raise PoiseError(
+            f"is no run folder: there is no {RUN_FILE} in it",
+            folder,
+            "Give a policy file or the folder of a perpetual run",
+        )
+    _, meta = load_checkpoint(path)
+    if meta.get("recipe") != RECIPE["name"]:
+        raise PoiseError(
+            "its policy knows only the clips that it was trained on, and cannot track others",
+            folder,
+            "Give the run of poise train perpetual, or imitate the clip with poise imitate",
+        )
+    imitation = perpetual_run.reopen(path.parent)
+    policy, said = trained_policy(path.parent, imitation)
+    inner: Mapping[str, Any] = said.get("metadata", {})
+    about = {
+        "clips": list(imitation.library.names),
+        "stage": inner.get("stage") or inner.get("course", {}).get("stage", {}).get("kind", ""),
+        "finished": (path.parent / FINAL).exists(),
+        "samples": int(said.get("samples", 0)),
+        "seconds": float(said.get("seconds", 0.0)),
+        "help_n": float(said["help_limit"]),
+        "poise": __version__,
+    }
+    return Tracker(policy, imitation.humanoid, imitation.library.clips[0], imitation.config, about)
+
+
+def export_policy(run: Path, path: Path) -> Tracker:
+    """Writes the latest policy of a run folder as one file, and returns it as the file has it."""
+    save_tracker(policy_of_run(run), path)
+    return load_tracker(path)
+
+
+def save_tracker(tracker: Tracker, path: Path) -> None:
+    """Writes the file whole or not at all."""
+    example = trim(tracker.example, 0, EXAMPLE_FRAMES)
+    packed, clip = pack_clips([example])
+    # The rotations only show how the skeleton stands; offsets are the body's and stay exact.
+    small = {k: v if "offsets" in k else v.float() for k, v in packed.items()}
+    tensors = {k: _halved(k, v) for k, v in tracker.policy.state().items()}
+    meta = {
+        "kind": KIND,
+        "tracker": VERSION,
+        "recipe": RECIPE["name"],
+        "config": perpetual_run.to_json(tracker.config),
+        "table": dataclasses.asdict(tracker.humanoid.table),
+        "example": clip[0],
+        "about": dict(tracker.about),
+        **tracker.policy.identity(tracker.humanoid.identity),
+    }
+    save_checkpoint(path, {**tensors, **{_EXAMPLE + k: v for k, v in small.items()}}, meta)
+
+
+def load_tracker(path: Path) -> Tracker:
+    """The policy in a file that `save_tracker` wrote.
+
+    Raises:
+        PoiseError: missing, damaged, of another version, or another kind of file.
+    """
+    tensors, meta = load_checkpoint(path)
+    _check_kind(meta, path)
+    foreign = PoiseError(
+        f"the policy was written by Poise {meta.get('poise', 'of an unknown version')} and does not fit "
+        f"this version, {__version__}",
+        path,
+        "Export it anew from its run, or install that version",
+    )
+    if meta.get("tracker") != VERSION:
+        raise foreign
+    try:
+        config = perpetual_run.from_json(meta["config"])
+        table = _table(meta["table"])
+        wide = {k.removeprefix(_EXAMPLE): v.double() for k, v in tensors.items() if _EXAMPLE in k}
+        example = unpack_clips(wide, [meta["example"]])[0]
+        humanoid = make_humanoid(example.skeleton, table)
+        bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
+        bundle.load_state(tensors)
+        about, character = meta["about"], meta["character"]
+    except (PoiseError, KeyError, TypeError, ValueError, AttributeError):
+        raise foreign from None
+    if humanoid.identity != character:
+        raise PoiseError(
+            f"the policy was trained for the character '{character}', and its body is "
+            f"'{humanoid.identity}'",
+            path,
+            "Export it anew from its run",
+        )
+    config.sim.apply(humanoid.model)
+    bundle.meta = {"samples": about.get("samples", 0), "seconds": about.get("seconds", 0.0)}
+    return Tracker(bundle, humanoid, example, config, about)
+
+
+def _check_kind(meta: Mapping[str, Any], path: Path) -> None:
+    kind = meta.get("kind")
+    if kind == KIND:
+        return
+    if kind == "run":
+        raise PoiseError("it holds a run's clips and settings", path, f"Give the folder {path.parent}")
+    where = f"Give the folder {path.parent}" if (path.parent / RUN_FILE).exists() else ""
+    raise PoiseError(
+        "it holds a policy's weights without the body that they move",
+        path,
+        where or "Give the run's folder, or a file that poise track --save-policy wrote",
+    )
+
+
+def _halved(name: str, value: Tensor) -> Tensor:
+    """Matrices of the networks in half precision, where its range holds them."""
+    if not name.startswith("policy/") or value.ndim < 2 or not value.is_floating_point():
+        return value
+    return value.half() if float(value.abs().max()) < _HALF_MAX else value
+
+
+def _table(data: Mapping[str, Any]) -> BodyTable:
+    """The body's numbers from JSON, which knows only lists."""
+    rows = []
+    for row in data["rows"]:
+        plain = {k: _tuples(v) for k, v in row.items() if k != "geoms"}
+        geoms = tuple(Geom(**{k: _tuples(v) for k, v in geom.items()}) for geom in row["geoms"])
+        rows.append(BodyRow(**plain, geoms=geoms))
+    rest = {k: _tuples(v) for k, v in data.items() if k != "rows"}
+    return BodyTable(tuple(rows), **rest)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value

@@ -1,0 +1,118 @@
+"""`poise track` in miniature: a run, a policy file, other skeletons, noise, what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_clips import deepmimic, put
+
+from poise.cli.main import main
+from poise.motion import read_clip, trim, write_clip
+from poise.recipes import track_policy
+from toy_policy import WALK, toy_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on two cuts of the embedded walk."""
+    return toy_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second of the embedded walk as a file."""
+    path = tmp_path_factory.mktemp("short") / "short.bvh"
+    write_clip(trim(read_clip(WALK), 0, 30), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def file(run: Path, short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The policy as one file, as the command line writes it."""
+    folder = tmp_path_factory.mktemp("policy")
+    path = folder / "policy.safetensors"
+    argv = ["track", str(short), "--policy", str(run), "-o", str(folder / "out")]
+    assert main([*argv, "--save-policy", str(path)]) == 0
+    return path
+
+
+def test_motion_score_and_report(
+    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "made.bvh"
+    assert main(["track", str(short), "--policy", str(file), "-o", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "The character failed at" in said and "--reset-on-fail puts it back" in said
+    assert str(out) in said and (tmp_path / "made/report.html").exists()
+    score = json.loads((tmp_path / "made/score.json").read_text())
+    assert score["episodes"] == 1 and score["help"]["limit_n"] == 0.0
+    assert score["method"] == "perpetual-single"
+    made, source = read_clip(out), read_clip(short)
+    assert made.frames == source.frames and made.skeleton.names == source.skeleton.names
+    np.testing.assert_allclose(made.skeleton.offsets, source.skeleton.offsets, atol=1e-5)
+
+
+def test_another_skeleton_with_noise_and_resets(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    person = put(tmp_path, "person.txt", deepmimic(45))
+    out = tmp_path / "out"
+    argv = ["track", str(person), "--policy", str(file), "-o", str(out), "--noise", "jitter:0.2"]
+    assert main([*argv, "--seed", "3", "--reset-on-fail"]) == 0
+    said = capsys.readouterr().out
+    assert "on another skeleton" in said and "without noise" in said
+    back = read_clip(out / "simulated.bvh")
+    assert set(back.skeleton.names) == set(read_clip(person).skeleton.names)
+    assert (out / "body.bvh").exists()
+
+
+def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["track", str(short), "--policy", str(file), "-o", str(out), "--count", "2"]) == 0
+    assert "0 of 2 characters tracked all" in capsys.readouterr().out
+    assert {p.name for p in out.iterdir()} == {
+        "simulated_short-1.bvh", "simulated_short-2.bvh", "score.json", "report.html"
+    }  # fmt: skip
+
+
+def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, refused) -> None:
+    out = str(tmp_path / "out")
+    given = ("--policy", file, "-o", out)
+    if not track_policy.SHIPPED.exists():
+        refused("track", short, "-o", out, words=("no policy comes with", "poise train perpetual"))
+    refused("track", short, "--policy", tmp_path / "absent", "-o", out, words=("no such policy",))
+    weights = run / "policy.safetensors"
+    refused("track", short, "--policy", weights, "-o", out, words=("without the body", str(run)))
+    refused("track", short, *given, "--noise", "jiter:1", words=("no noise 'jiter'", "'jitter'"))
+    refused("track", short, *given, "--noise", "jitter:lots", words=("must be a number",))
+    refused("track", short, *given, "--seed", "-1", words=("--seed must",))
+    refused("track", short, *given, "--count", "0", words=("--count must",))
+    one = ("--policy", file, "-o", tmp_path / "one.bvh", "--count", "2")
+    refused("track", short, *one, words=("several files",))
+    refused("track", short, "--policy", file, "-o", tmp_path / "a.fbx", words=("cannot be written",))
+    refused("track", tmp_path / "absent.bvh", *given, words=("absent.bvh",))
+
+
+def test_motions_that_cannot_be_tracked(
+    file: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, refused
+) -> None:
+    folder, out = tmp_path_factory.mktemp("bad"), tmp_path / "out"
+    write_clip(trim(read_clip(WALK), 0, 2), folder / "brief.bvh")
+    refused("track", folder / "brief.bvh", "--policy", file, "-o", out, words=("at least 3",))
+    snake = ["HIERARCHY"]
+    for k in range(4):
+        snake += [f"{'JOINT' if k else 'ROOT'} b{k}", "{", "OFFSET 0 30 0"]
+        count = "6 Xposition Yposition Zposition" if k == 0 else "3"
+        snake += [f"CHANNELS {count} Zrotation Xrotation Yrotation"]
+    snake += ["End Site", "{", "OFFSET 0 30 0", "}", *["}"] * 4]
+    rows = [" ".join(["0", "50", "0", *["0"] * 12])] * 20
+    text = "\n".join([*snake, "MOTION", "Frames: 20", "Frame Time: 0.0333333", *rows]) + "\n"
+    refused("track", put(folder, "snake.bvh", text), "--policy", file, "-o", out)
+    damaged = folder / "damaged.safetensors"
+    shutil.copy(file, damaged)
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    refused("track", WALK, "--policy", damaged, "-o", out, words=("damaged",))
