@@ -17,9 +17,9 @@ from poise.body import BodyTable
 from poise.kin.flips import spells
 from poise.kin.ground import lowest_height, smooth_hull
 from poise.kin.lead import Sole, lead, led
+from poise.kin.support import soles_of
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
 from poise.motion import Clip
-from poise.spatial import quat_rotate
 
 #: Heights (m) over the floor up to which a sole's end bears wholly, and from which not at all.
 BEARS_M, CLEAR_M = 0.015, 0.03
@@ -55,20 +55,21 @@ def hold_feet(clip: Clip, table: BodyTable, ground: float = 0.0) -> tuple[Clip, 
     """
     if clip.frames < 3:
         return clip, Held(0.0, 0.0)
-    first, bears = clip, np.zeros((clip.frames, 0), dtype=bool)
+    first, bears = clip, {}
     for _ in range(ROUNDS):
         clip, bears = _hold_once(clip, table, ground)
-    feet = [r.joint for r in table.rows if r.kind == "foot"][: bears.shape[1]]
-    away = np.linalg.norm(clip.positions() - first.positions(), axis=-1)[:, feet] * 1000
-    return clip, Held(float(away[bears].mean()) if bears.any() else 0.0, float(away.max(initial=0.0)))
+    moved = np.linalg.norm(clip.positions() - first.positions(), axis=-1) * 1000
+    borne = np.concatenate([moved[when, foot] for foot, when in bears.items()] or [np.zeros(0)])
+    most = max((float(moved[:, foot].max()) for foot in bears), default=0.0)
+    return clip, Held(float(borne.mean()) if len(borne) else 0.0, most)
 
 
-def _hold_once(clip: Clip, table: BodyTable, ground: float) -> tuple[Clip, np.ndarray]:
-    """The clip with its feet led once, and which foot bears when `(T, F)`."""
+def _hold_once(clip: Clip, table: BodyTable, ground: float) -> tuple[Clip, dict[int, np.ndarray]]:
+    """The clip with its feet led once, and when `(T)` each foot joint bears."""
     pos, quat = (torch.tensor(x)[:, [r.joint for r in table.rows]] for x in clip.world())
-    soles = _soles_of(table, pos, quat)
+    soles = soles_of(table, pos, quat)
     low = lowest_height(table, pos, quat)
-    leads, bears = {}, []
+    leads, bears = {}, {}
     weights = _bearing([sole.ends for sole in soles.values()], clip.fps, ground)
     for (row, sole), weight in zip(soles.items(), weights, strict=True):
         weight = weight * ~_dragged(sole, weight, clip.fps)[:, None]
@@ -77,31 +78,11 @@ def _hold_once(clip: Clip, table: BodyTable, ground: float) -> tuple[Clip, np.nd
         if deep.any():
             lift = smooth_hull(deep, max(1, round(LIFT_S * clip.fps)), False)
             one.shift[:, 2] = torch.tensor(np.maximum(lift, 0.0))
-        leads[table.rows[row].joint] = one
-        bears.append(weight.amax(-1) > 0)
-    if not leads:
-        return clip, np.zeros((clip.frames, 0), dtype=bool)
+        foot, steps = table.rows[row].joint, (weight.amax(-1) > 0).numpy()
+        leads[foot], bears[foot] = one, np.append(steps, steps[-1])
     root, rot = clip.tensors()
-    steps = torch.stack(bears, -1)
-    held = clip.replaced(rot=led(clip.skeleton, rot, root, leads).numpy())
-    return held, torch.cat((steps, steps[-1:])).numpy()
-
-
-def _soles_of(table: BodyTable, pos: Tensor, quat: Tensor) -> dict[int, Sole]:
-    """The feet that have a sole, by their row; from poses of the table's rows."""
-    out = {}
-    for i, row in enumerate(table.rows):
-        box = next((g for g in row.geoms if g.kind == "box"), None)
-        if row.kind != "foot" or box is None:
-            continue
-        turn, middle = (torch.tensor(x, dtype=pos.dtype) for x in (box.quat, box.pos))
-        ends = []
-        for end in (-1.0, 1.0):
-            corner = torch.tensor([end * box.size[0], 0.0, -box.size[2]], dtype=pos.dtype)
-            local = middle + quat_rotate(turn, corner)
-            ends.append(pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i])))
-        out[i] = Sole(pos[:, i], torch.stack(ends, 1))
-    return out
+    held = clip.replaced(rot=led(clip.skeleton, rot, root, leads).numpy()) if leads else clip
+    return held, bears
 
 
 def _bearing(ends: list[Tensor], fps: float, ground: float) -> list[Tensor]:

@@ -15,6 +15,7 @@ from poise.kin.faults import Fault, spell_faults
 from poise.kin.flight import centre_of_mass
 from poise.kin.flips import spells
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights, lowest_height
+from poise.kin.lead import Sole
 from poise.metrics import foot_contacts
 from poise.motion import Clip
 from poise.spatial import quat_rotate
@@ -60,12 +61,12 @@ class Support:
         """The support of a clip with the body `table`, which was made from it."""
         world = [torch.tensor(x) for x in clip.world()]
         pos, quat = (x[:, [r.joint for r in table.rows]] for x in world)
-        soles, feet = _soles(table, pos, quat)
+        soles = soles_of(table, pos, quat)
         low, margin, names = _low_points(clip, anatomy, *world)
         return cls(
             clip.fps,
-            soles,
-            feet,
+            torch.cat([sole.ends for sole in soles.values()], 1),
+            tuple(table.rows[row].joint for row in soles for _ in range(2)),
             low,
             margin,
             names,
@@ -118,19 +119,21 @@ def support_of(clip: Clip, anatomy: Anatomy) -> Support | None:
     return Support.of(clip, anatomy, table) if anatomy.parts else None
 
 
-def _soles(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-    points, feet = [], []
+def soles_of(table: BodyTable, pos: Tensor, quat: Tensor) -> dict[int, Sole]:
+    """The feet that have a sole (a box), by their row of the table, from the rows' world poses."""
+    out = {}
     for i, row in enumerate(table.rows):
         box = next((g for g in row.geoms if g.kind == "box"), None)
         if row.kind != "foot" or box is None:
             continue
         turn, middle = (torch.tensor(x, dtype=pos.dtype) for x in (box.quat, box.pos))
+        ends = []
         for end in (-1.0, 1.0):
             corner = torch.tensor([end * box.size[0], 0.0, -box.size[2]], dtype=pos.dtype)
             local = middle + quat_rotate(turn, corner)
-            points.append(pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i])))
-            feet.append(row.joint)
-    return torch.stack(points, 1), tuple(feet)
+            ends.append(pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i])))
+        out[i] = Sole(pos[:, i], torch.stack(ends, 1))
+    return out
 
 
 def _low_points(

@@ -10,7 +10,7 @@ import numpy as np
 
 from poise import __version__
 from poise.eval import ScoreCard, clip_figures, write_score
-from poise.kin import Held, hold_feet, lowest_height, qpos_to_clip
+from poise.kin import hold_feet, lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
@@ -108,16 +108,13 @@ def _held(
     joints = tuple(row.joint for row in table.rows)
     held, moved = hold_feet(clip, table)
     source = imitation.library.clips[index]
-    found: dict[str, Any] = {"clip": source.name, **_moved(moved)}
+    found: dict[str, Any] = {"clip": source.name}
+    found |= {"held_mean_mm": moved.mean_mm, "held_max_mm": moved.max_mm}
     if r.shapes is not None and r.feet:
         ground = -imitation.report.ground[index].lift_m
         of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
         found |= {name: clip_figures(c, joints, r.shapes, r.feet, floor) for name, c, floor in of}
     return held, found
-
-
-def _moved(held: Held) -> dict[str, float]:
-    return {"held_mean_mm": held.mean_mm, "held_max_mm": held.max_mm}
 
 
 def _sentences(found: dict[str, Any]) -> list[str]:
