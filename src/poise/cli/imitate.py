@@ -29,7 +29,7 @@ class Options:
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
     hold_feet: bool = True
-    """Hold standing feet to the spot in the written motion; score.json shows the simulation itself."""
+    """In the written motion standing feet are held to the spot; so they stay as simulated."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)

@@ -47,7 +47,7 @@ class Options:
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise."""
     hold_feet: bool = True
-    """Hold standing feet to the spot in the written motion; score.json shows the simulation itself."""
+    """In the written motion standing feet are held to the spot; so they stay as simulated."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the policy as one file (.safetensors), which starts faster than a run folder."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
