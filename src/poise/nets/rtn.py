@@ -166,7 +166,8 @@ class RTN(nn.Module):
             memory = self.cell(torch.cat((s, aim), -1), memory)
             if i < past - 1:
                 continue
-            said = self.decoder(memory[0])
+            # Under autocast the state goes on in float32.
+            said = self.decoder(memory[0]).float()
             quats = rot.shape[1]
             rot = normalize((rot + said[:, :quats]).unflatten(-1, (-1, 4))).flatten(1)
             speed = said[:, quats : quats + 3] * self.velocity_std
