@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from poise.errors import PoiseError
 from poise.learn.adapt import Adaptation
-from poise.learn.model import InbetweenModel, make_net
+from poise.learn.model import InbetweenModel, load_model, make_net, save_model
 from poise.motion import Clip, Skeleton
+from poise.motion.pack import pack_clips, unpack_clips
 from poise.nets.between import Between
 from poise.spatial import quat_conj, quat_distance, quat_mul
 from poise.synth.inbetween import Filling, fill_keyframes
+from poise.synth.other_rig import OtherRig
 from toy_human import human, swing
 from toy_windows import SMALL, SMALL_RTN, bank, layout
 
@@ -99,13 +104,13 @@ def test_a_still_root_is_put_back() -> None:
     assert np.allclose(made.positions()[:, 1:], plain.positions(), atol=1e-9)
 
 
-def test_other_skeletons_are_refused_in_a_sentence() -> None:
+def test_a_model_that_shows_no_skeleton_refuses_others_in_a_sentence() -> None:
     clip = swing(2.0)
     s = clip.skeleton
-    renamed = Skeleton(("Pelvis", *s.names[1:]), s.parents, s.offsets)
-    with pytest.raises(PoiseError, match=r"'Pelvis' is unknown to the model.*Retarget"):
+    renamed = Skeleton(tuple(f"x_{n}" for n in s.names), s.parents, s.offsets, s.ends)
+    with pytest.raises(PoiseError, match="joints that are not the model's"):
         fill_keyframes(clip.replaced(skeleton=renamed), (0, 10), model())
-    mirrored = Skeleton(s.names, s.parents, s.offsets * [1, 1, -1])
+    mirrored = Skeleton(s.names, s.parents, -s.offsets, s.ends)
     with pytest.raises(PoiseError, match="another rest pose"):
         fill_keyframes(clip.replaced(skeleton=mirrored), (0, 10), model())
     # Another size is no other rig.
@@ -113,3 +118,59 @@ def test_other_skeletons_are_refused_in_a_sentence() -> None:
     assert fill_keyframes(clip.replaced(skeleton=larger), (0, 10), model()).clips
     with pytest.raises(PoiseError, match="number of samples"):
         fill_keyframes(clip, (0, 10), model(), Filling(samples=0))
+
+
+def other_human(clip: Clip, thumb: str = "LeftThumb") -> Clip:
+    """The clip on longer bones with other names, and a thumb that moves on its own."""
+    s = clip.skeleton
+    hand = next(j for j, n in enumerate(s.names) if "hand" in n.lower() or "wrist" in n.lower())
+    names = (*(n.replace("_", "").title() for n in s.names), thumb)
+    offsets = np.concatenate((1.2 * s.offsets, [[0.0, 0.03, 0.0]]))
+    own = Skeleton(names, (*s.parents, hand), offsets)
+    angle = np.linspace(0, 1.0, clip.frames)
+    turn = np.stack((np.cos(angle / 2), np.sin(angle / 2), 0 * angle, 0 * angle), -1)
+    rot = np.concatenate((clip.rot, turn[:, None]), 1)
+    return Clip(own, 1.2 * clip.root_pos, rot, clip.fps, clip.name)
+
+
+def test_another_skeleton_is_filled_on_the_models_and_brought_back() -> None:
+    clip = other_human(swing(3.0, speed=0.6, bend=0.5))
+    knows = dataclasses.replace(model(), example=pack_clips([swing(2.0, speed=0.3)]))
+    keys = (12, 40, 61)
+    filled = fill_keyframes(clip, keys, knows, Filling(foot_lock=False))
+    assert "brought back" in filled.warnings[0]
+    (made,) = filled.clips
+    kept = [*range(13), 40, *range(61, clip.frames)]
+    assert np.allclose(made.positions()[kept], clip.positions()[kept], atol=1e-9)
+    assert made.skeleton is clip.skeleton
+    # What the model does not know goes from keyframe to keyframe along the shortest arc.
+    assert np.allclose(np.abs((made.rot[26, -1] * clip.rot[26, -1]).sum()), 1.0, atol=1e-4)
+    # It moves about as the network makes its own skeleton move, which is 1.2 times smaller.
+    plain = fill_keyframes(swing(3.0, speed=0.6, bend=0.5), keys, knows, Filling(foot_lock=False))
+    steps = [np.abs(np.diff(c.positions()[12:42], axis=0)).max() for c in (made, plain.clips[0])]
+    assert 0.8 < steps[0] / (1.2 * steps[1]) < 1.25
+
+
+def test_on_the_models_own_skeleton_the_passage_changes_nothing() -> None:
+    clip = swing(3.0, speed=0.6, bend=0.5)
+    rig = OtherRig.between(other_human(clip), clip)
+    own = tuple(torch.tensor(x) for x in (other_human(clip).root_pos, other_human(clip).rot))
+    there = rig.to_model(own)
+    same = rig.changed(own, there)
+    assert torch.allclose(same[0], own[0], atol=1e-9)
+    assert torch.allclose((same[1] * own[1]).sum(-1).abs(), torch.ones(()).double(), atol=1e-9)
+    # The other human is the same one 1.2 times as large, so it comes to the model as the clip was.
+    on_model = clip.replaced(root_pos=there[0].numpy(), rot=there[1].numpy()).positions()
+    shift = (on_model - clip.positions())[:1, :1]
+    assert np.allclose(on_model - shift, clip.positions(), atol=0.02)
+
+
+def test_the_example_lies_in_the_models_file(tmp_path: Path) -> None:
+    knows = dataclasses.replace(model(), example=pack_clips([swing(1.0)]))
+    save_model(tmp_path / "model.safetensors", knows, half=True)
+    again = load_model(tmp_path)
+    assert again.example is not None
+    (shown,) = unpack_clips(*again.example)
+    assert np.allclose(shown.positions(), swing(1.0).positions(), atol=1e-6)
+    save_model(tmp_path / "model.safetensors", model())
+    assert load_model(tmp_path).example is None

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.state import load_module, prefixed
+from poise.learn.state import State, load_module, prefixed, under
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
@@ -30,6 +30,8 @@ class InbetweenModel:
     names: joints, in order. offsets `(J, 3)` m: bones of the training set (the mean over its clips).
     fps: frames per second. longest: frames of the longest gap it was trained for. past: frames before
     the gap that it was trained with at most. meta: data set, seed, steps, how it was made.
+    example: tensors and JSON notes of a clip as `motion.pack` packs it, which shows how the skeleton
+    stands; None where clips of other skeletons are not to be brought onto it.
     """
 
     kind: str
@@ -40,6 +42,7 @@ class InbetweenModel:
     longest: int
     past: int = 10
     meta: Mapping[str, Any] = field(default_factory=dict)
+    example: tuple[State, list[Any]] | None = None
 
     @property
     def layout(self) -> Layout:
@@ -70,7 +73,11 @@ def save_model(path: Path, model: InbetweenModel, half: bool = False) -> None:
         "names": list(model.names), "fps": model.fps, "longest": model.longest, "past": model.past,
         "meta": dict(model.meta),
     }  # fmt: skip
-    save_checkpoint(path, prefixed("net", tensors) | {"offsets": model.offsets}, meta)
+    tensors = prefixed("net", tensors) | {"offsets": model.offsets}
+    if model.example is not None:
+        tensors |= prefixed("example", model.example[0])
+        meta["example"] = model.example[1]
+    save_checkpoint(path, tensors, meta)
 
 
 def load_model(path: Path) -> InbetweenModel:
@@ -92,9 +99,12 @@ def load_model(path: Path) -> InbetweenModel:
         sizes = (BetweenConfig if meta["net"] == "transformer" else RTNConfig)(**meta["config"])
         net = make_net(meta["net"], layout, sizes, 0)
         load_module(net, {k: v.float() for k, v in tensors.items()}, "net")
+        example = None
+        if "example" in meta:
+            example = under("example", tensors), meta["example"]
         return InbetweenModel(
             meta["net"], net.eval(), tuple(meta["names"]), tensors["offsets"], meta["fps"],
-            meta["longest"], meta["past"], meta["meta"],
+            meta["longest"], meta["past"], meta["meta"], example,
         )  # fmt: skip
     except (KeyError, TypeError) as problem:
         raise PoiseError(

@@ -46,7 +46,7 @@ class FrameBank:
     root `(F, 3)`, rot `(F, J, 4)` wxyz local with signs continuous in each clip.
     offsets `(C, J, 3)`: each clip's own bones. first `(C + 1)`: where clips begin and the last ends.
     clips: names. feet: ankle and toe joints, left before right. facing: the root's local axis that,
-    projected on the ground, is the heading.
+    projected on the ground, is the heading. ends: where bones without a child end, see `Skeleton`.
     """
 
     names: tuple[str, ...]
@@ -59,6 +59,7 @@ class FrameBank:
     clips: tuple[str, ...]
     feet: tuple[int, ...]
     facing: tuple[float, float, float]
+    ends: tuple[tuple[int, tuple[float, float, float]], ...] = ()
 
     @property
     def frames(self) -> int:
@@ -92,7 +93,7 @@ class FrameBank:
         names = tuple(self.clips[c] for c in kept)
         return FrameBank(
             self.names, self.parents, self.fps, self.root[rows], self.rot[rows], self.offsets[kept],
-            sizes.cumsum(0), names, self.feet, self.facing,
+            sizes.cumsum(0), names, self.feet, self.facing, self.ends,
         )  # fmt: skip
 
 
@@ -145,6 +146,7 @@ def pack_frames(
         tuple(c.name for c in clips),
         joints,
         facing or (0.0, 0.0, 0.0),
+        one.ends,
     )
     if facing is None:
         object.__setattr__(bank, "facing", facing_axis(bank))

@@ -34,11 +34,15 @@ from poise.learn.inbetween import BlockStats, InbetweenTrainer, Objective, train
 from poise.learn.model import MODEL, InbetweenModel, make_net, save_model
 from poise.learn.rtn import RTNObjective, RTNTraining
 from poise.learn.state import make_generator
+from poise.motion import Clip, Skeleton
+from poise.motion.mirror import joined, mirrored
+from poise.motion.pack import pack_clips
 from poise.motion.windows import FrameBank, step_contacts
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
 from poise.recipes.inbetween_data import library_bank
+from poise.spatial import normalize
 
 RUN_FILE = "run.safetensors"
 FRAMES = "frames.safetensors"
@@ -51,6 +55,9 @@ class Inbetween:
     net: transformer or rtn. final, validation: regular expressions in the names of clips that are kept
     apart (see `eval.inbetween.Protocol`); final clips are never read by training or choices.
     contacts: whose labels the network learns. ema: of the averaged weights that are used.
+    mirror: whether it learns from every clip in a mirror, too.
+    onto: a motion file on whose skeleton all clips are brought by `perpetual_data.library_of`, which
+    also cuts what cannot be done alone on a floor; by default clips of the most common one are taken.
     """
 
     net: Literal["transformer", "rtn"] = "transformer"
@@ -61,6 +68,8 @@ class Inbetween:
     fps: float = 30.0
     seed: int = 0
     ema: float = 0.999
+    mirror: bool = False
+    onto: str | None = None
     between: BetweenConfig = field(default_factory=BetweenConfig)
     between_training: BetweenTraining = field(default_factory=BetweenTraining)
     rtn: RTNConfig = field(default_factory=RTNConfig)
@@ -101,6 +110,8 @@ def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> 
     # What never moves in a library has no deviation to divide by.
     std = deviation(train, protocol).clamp_min(1e-3)
     layout = Layout(bank.parents, bank.feet, bank.facing)
+    if config.mirror:
+        train = joined(train, mirrored(train))
     data = frame_data(train, layout, std, config.contacts)
     held = None
     if config.validation is not None:
@@ -164,11 +175,13 @@ def begin(
     said = json.loads(json.dumps(dataclasses.asdict(config)))
     if run.exists():
         _, meta = load_checkpoint(run)
-        if meta.get("config") != said:
+        # What a run of an earlier version does not name had today's default.
+        default = json.loads(json.dumps(dataclasses.asdict(Inbetween())))
+        if {**default, **meta.get("config", {})} != said:
             hint = "Resume it as it is or choose another folder"
             raise PoiseError("the folder holds a run with other settings", folder, hint)
         steps = int(meta["steps"])
-    bank, notes = library_bank(library, folder / FRAMES, config.fps, tell)
+    bank, notes = library_bank(library, folder / FRAMES, config.fps, tell, config.onto)
     task = prepare(bank, config, notes)
     steps = steps or steps_in(task, minutes)
     if not run.exists():
@@ -208,7 +221,18 @@ def as_model(task: Task, trainer: InbetweenTrainer) -> InbetweenModel:
         "seconds": round(trainer.seconds, 1), "clips": len(task.bank.clips),
     }  # fmt: skip
     bones = task.data.offsets.mean(0)
-    return InbetweenModel(c.net, net, task.bank.names, bones, c.fps, c.longest, 10, meta)
+    names, shown = task.bank.names, pack_clips([example_of(task.bank)])
+    return InbetweenModel(c.net, net, names, bones, c.fps, c.longest, 10, meta, shown)
+
+
+def example_of(bank: FrameBank, frames: int = 90) -> Clip:
+    """Poses of the longest clip, evenly spread, on its own bones: they show how the skeleton stands."""
+    sizes = torch.diff(bank.first)
+    c = int(sizes.argmax())
+    rows = bank.first[c] + torch.linspace(0, int(sizes[c]) - 1, min(frames, int(sizes[c]))).long()
+    skeleton = Skeleton(bank.names, bank.parents, bank.offsets[c].double().numpy(), bank.ends)
+    root, rot = bank.root[rows].double().numpy(), normalize(bank.rot[rows].double()).numpy()
+    return Clip(skeleton, root, rot, bank.fps, "example")
 
 
 def validation(task: Task, lengths: tuple[int, ...] = (5, 15, 30)) -> Callable[..., Mapping[str, float]]:

@@ -15,15 +15,21 @@ from poise.motion import Clip
 from poise.motion.io import read_clip
 from poise.motion.io.formats import READERS
 from poise.motion.windows import LAFAN1_FACING, FrameBank, pack_frames, without_still_root
+from poise.recipes.perpetual_data import library_of
 
 
 def library_bank(
-    library: Path, cache: Path, fps: float = 30.0, tell: Callable[[str], None] = lambda _: None
+    library: Path,
+    cache: Path,
+    fps: float = 30.0,
+    tell: Callable[[str], None] = lambda _: None,
+    onto: str | None = None,
 ) -> tuple[FrameBank, tuple[str, ...]]:
     """All motion files under a folder (or one file) that share the most common skeleton.
 
     Files that cannot be read and clips of other skeletons are left out, each with a sentence in the
-    notes. The bank is written to `cache` and taken from there while the files stay as they are.
+    notes. With `onto`, a motion file, all clips are retargeted onto its skeleton instead. The bank is
+    written to `cache` and taken from there while the files stay as they are.
 
     Raises:
         PoiseError: no file could be used.
@@ -32,13 +38,16 @@ def library_bank(
     key = [[str(f.relative_to(library.parent)), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
     if cache.exists():
         tensors, meta = load_checkpoint(cache)
-        if meta.get("key") == key and meta.get("fps") == fps:
+        if (meta.get("key"), meta.get("fps"), meta.get("onto")) == (key, fps, onto):
             return _bank(tensors, meta), tuple(meta["notes"])
-    clips, notes = read_all(files, tell)
-    common, notes = of_one_skeleton(clips, notes)
+    if onto is None:
+        common, notes = of_one_skeleton(*read_all(files, tell))
+    else:
+        made, report = library_of(library, Path(onto), fps, tell=tell)
+        common, notes = list(made.clips), tuple(report.sentences())
     bank = pack_frames(common, fps, LAFAN1_FACING if _is_lafan1(common[0]) else None)
     tensors, meta = _packed(bank)
-    save_checkpoint(cache, tensors, {**meta, "key": key, "notes": list(notes), "fps": fps})
+    save_checkpoint(cache, tensors, {**meta, "key": key, "notes": list(notes), "fps": fps, "onto": onto})
     return bank, notes
 
 
@@ -96,12 +105,13 @@ def _is_lafan1(clip: Clip) -> bool:
 def _packed(bank: FrameBank) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     tensors = {k: getattr(bank, k) for k in ("root", "rot", "offsets", "first")}
     meta = {k: list(getattr(bank, k)) for k in ("names", "parents", "clips", "feet", "facing")}
-    return tensors, {**meta, "bank_fps": bank.fps}
+    return tensors, {**meta, "bank_fps": bank.fps, "ends": [[j, list(tip)] for j, tip in bank.ends]}
 
 
 def _bank(tensors: dict[str, torch.Tensor], meta: dict[str, Any]) -> FrameBank:
     x, y, z = meta["facing"]
+    ends = tuple((j, (a, b, c)) for j, (a, b, c) in meta.get("ends", ()))
     return FrameBank(
         tuple(meta["names"]), tuple(meta["parents"]), meta["bank_fps"], tensors["root"], tensors["rot"],
-        tensors["offsets"], tensors["first"], tuple(meta["clips"]), tuple(meta["feet"]), (x, y, z),
+        tensors["offsets"], tensors["first"], tuple(meta["clips"]), tuple(meta["feet"]), (x, y, z), ends,
     )  # fmt: skip

@@ -13,13 +13,15 @@ from poise.errors import PoiseError
 from poise.learn.adapt import Adaptation, adapt
 from poise.learn.model import InbetweenModel
 from poise.motion.clip import Clip
-from poise.motion.windows import still_root, without_still_root
+from poise.motion.pack import unpack_clips
+from poise.motion.windows import foot_joints, still_root, without_still_root
 from poise.nets.between import Between
 from poise.nets.transition import Filled as Transition
 from poise.nets.transition import Known
 from poise.spatial import slerp
 from poise.synth.footlock import lock_feet
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
+from poise.synth.other_rig import OtherRig
 from poise.synth.seams import meet, sampled
 
 #: Bones whose directions differ by more than this (mean over joints, cosine) belong to another rig.
@@ -56,16 +58,17 @@ def fill_keyframes(
     """The clip with everything between its keyframes made anew; all other frames stay as they are.
 
     Frames before the first keyframe are what the network sees of the past, frames after the last one
-    are reached in their own speed. Keyframes themselves stay exactly as they are.
+    are reached in their own speed. Keyframes themselves stay exactly as they are. A clip of another
+    human skeleton is filled on the model's and brought back (see `synth.other_rig`).
 
     Raises:
-        PoiseError: keyframes that make no sense, or a skeleton that the model does not know.
+        PoiseError: keyframes that make no sense, or a skeleton that cannot be brought onto the model's.
     """
     filling = filling or Filling()
     if not 1 <= filling.samples <= 1000:
         raise PoiseError(f"the number of samples must be 1 to 1000, got {filling.samples}")
     keys = check_keyframes(keyframes, clip.frames, clip.name)
-    check_skeleton(clip, model)
+    other = unlike(clip, model)
     step = clip.fps / model.fps
     gaps, inserted, warnings = split_gaps(keys, (model.longest + 1) * step - 1)
     own = without_still_root(clip)
@@ -75,49 +78,77 @@ def fill_keyframes(
         t = torch.tensor((k - a) / (b - a), dtype=root.dtype)
         root[k] = root[a] + t * (root[b] - root[a])
         rot[k] = slerp(rot[a], rot[b], t.expand(rot.shape[1]))
+    rig = None
+    if other is not None:
+        rig = OtherRig.between(_interpolated(own, root, rot, gaps), _example(other, clip, model))
+        warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
     clips = []
     for sample in range(filling.samples):
         noise = None
         if sample:
             noise = torch.Generator().manual_seed(filling.seed * 100_003 + sample)
-        path = _filled(root.clone(), rot.clone(), gaps, keys, own, model, filling, noise)
+        path = _filled(root.clone(), rot.clone(), gaps, keys, own, model, filling, noise, rig)
         name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
         clips.append(_as_clip(clip, own, *path, name))
     return Filled(tuple(clips), tuple(warnings))
 
 
-def check_skeleton(clip: Clip, model: InbetweenModel) -> None:
-    """Refuses a clip whose joints are not the model's, or stand in other rest directions."""
+def unlike(clip: Clip, model: InbetweenModel) -> str | None:
+    """In what a clip's skeleton differs from the model's, as the beginning of a sentence; None if not:
+    the same joints, whose rest directions agree."""
     own = without_still_root(clip).skeleton
-    hint = "Retarget the clip to the model's skeleton, or train a model on clips of this one"
     if own.names != model.names or own.parents != model.layout.parents:
         here = [n for n in own.names if n not in model.names]
         more = f" ('{here[0]}' is unknown to the model)" if here else ""
-        raise PoiseError(
-            f"its skeleton has {len(own)} joints that are not the model's {len(model.names)}{more}",
-            clip.name, hint,
-        )  # fmt: skip
+        return f"its skeleton has {len(own)} joints that are not the model's {len(model.names)}{more}"
     a, b = np.array(own.offsets[1:]), model.offsets.double().numpy()[1:]
     sizes = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
     alike = (a * b).sum(-1)[sizes > 1e-9] / sizes[sizes > 1e-9]
     if len(alike) and alike.mean() < _SAME_RIG:
-        raise PoiseError("its joints have the model's names but another rest pose", clip.name, hint)
+        return "its joints have the model's names but another rest pose"
+    return None
+
+
+def _example(other: str, clip: Clip, model: InbetweenModel) -> Clip:
+    """The model's skeleton as it stands; a model without one knows no other skeletons."""
+    if model.example is not None:
+        return unpack_clips(*model.example)[0]
+    hint = "Retarget the clip to the model's skeleton, or train a model on clips of this one"
+    raise PoiseError(other, clip.name, hint)
+
+
+def _interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
+    """The clip with its gaps interpolated: what lies in them is not to be looked at."""
+    root, rot = root.clone(), rot.clone()
+    for gap in gaps:
+        root[gap.a + 1 : gap.b], rot[gap.a + 1 : gap.b] = _between(root, rot, gap)
+    return own.replaced(root_pos=root.numpy(), rot=rot.numpy())
+
+
+def _between(root: Tensor, rot: Tensor, gap: Gap) -> tuple[Tensor, Tensor]:
+    """The frames of a gap on straight lines and shortest arcs between its ends."""
+    a, b = gap
+    t = torch.arange(1, b - a, dtype=root.dtype) / (b - a)
+    line = root[a] + t[:, None] * (root[b] - root[a])
+    shape = (len(t), *rot.shape[1:])
+    return line, slerp(rot[a].expand(shape), rot[b].expand(shape), t[:, None].expand(shape[:2]))
 
 
 @torch.no_grad()
 def _filled(
     root: Tensor, rot: Tensor, gaps: list[Gap], keys: tuple[int, ...], own: Clip,
-    model: InbetweenModel, filling: Filling, noise: torch.Generator | None,
+    model: InbetweenModel, filling: Filling, noise: torch.Generator | None, rig: OtherRig | None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
+    feet = model.layout.feet if rig is None else foot_joints(own.skeleton)
     blend = max(1, round(filling.blend_s * own.fps))
     for gap in gaps:
         a, b = gap
-        new_root, new_rot, contact = _transition(root, rot, gap, keys, own, model, filling, noise)
+        new_root, new_rot, contact = _transition(root, rot, gap, keys, own, model, filling, noise, rig)
         root[a + 1 : b], rot[a + 1 : b] = new_root, new_rot
         # Two frames before, and after the gap where they are kept, say how fast it must be met.
         low = max(0, a - 1)
         high = min(len(root), b + 2) if b >= keys[-1] else b + 1
-        if filling.foot_lock:
+        if filling.foot_lock and len(feet) == contact.shape[1]:
             free = torch.zeros(high - low, dtype=torch.bool)
             free[a + 1 - low : b - low] = True
             stands = torch.zeros(high - low, contact.shape[1], dtype=torch.bool)
@@ -125,7 +156,7 @@ def _filled(
             # A keyframe next to a standing foot is where that foot stands.
             stands[a - low], stands[b - low] = stands[a + 1 - low], stands[b - 1 - low]
             rot[low:high] = lock_feet(
-                own.skeleton, model.layout.feet, root[low:high], rot[low:high], stands, free, own.fps
+                own.skeleton, feet, root[low:high], rot[low:high], stands, free, own.fps
             )
         met = meet(root[low:high], rot[low:high], a + 1 - low, high - b, blend)
         root[a + 1 : b], rot[a + 1 : b] = met[0][a + 1 - low : b - low], met[1][a + 1 - low : b - low]
@@ -134,7 +165,7 @@ def _filled(
 
 def _transition(
     root: Tensor, rot: Tensor, gap: Gap, keys: tuple[int, ...], own: Clip,
-    model: InbetweenModel, filling: Filling, noise: torch.Generator | None,
+    model: InbetweenModel, filling: Filling, noise: torch.Generator | None, rig: OtherRig | None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """What the network makes of one gap, at the clip's own frames."""
     a, b = gap
@@ -143,22 +174,29 @@ def _transition(
     step = (b - a) / (length + 1)
     past = min(model.past, 1 + int(a / step + 1e-6))
     before = sampled(root[: a + 1], rot[: a + 1], a - step * torch.arange(past - 1, -1, -1).double())
-    offsets = torch.tensor(np.array(own.skeleton.offsets))
-    seen = [x.unsqueeze(0).float() for x in (*before, root[b], rot[b], offsets)]
+    ahead = root[b : b + 1], rot[b : b + 1]
+    offsets = torch.tensor(np.array((own if rig is None else rig.example).skeleton.offsets))
+    if rig is not None:
+        before, ahead = rig.to_model(before), rig.to_model(ahead)
+    seen = [x.unsqueeze(0).float() for x in (*before, ahead[0][0], ahead[1][0], offsets)]
     known = Known(seen[0], seen[1], seen[2], seen[3], seen[4])
     net = model.net
     if filling.adaptation is not None:
         net = adapt(net, known, length, filling.adaptation)
     after = _after(root, rot, b, keys, step, model)
+    if rig is not None and after is not None:
+        after = rig.to_model(after)
     if isinstance(net, Between) and after is not None:
         filled = _with_after(net, known, length, after, noise)
     else:
         filled = net.fill(known, length, noise)
-    grid_root = torch.cat((before[0], filled.root[0].double(), root[b : b + 1]))
-    grid_rot = torch.cat((before[1], filled.rot[0].double(), rot[b : b + 1]))
+    grid_root = torch.cat((before[0], filled.root[0].double(), ahead[0]))
+    grid_rot = torch.cat((before[1], filled.rot[0].double(), ahead[1]))
     at = torch.arange(a + 1, b).double()
     places = past - 1 + (at - a) / step
     new_root, new_rot = sampled(grid_root, grid_rot, places)
+    if rig is not None:
+        new_root, new_rot = rig.changed(_between(root, rot, gap), (new_root, new_rot))
     nearest = ((at - a) / step).round().long().clamp(1, length) - 1
     return new_root, new_rot, filled.contact[0][nearest]
 
