@@ -119,11 +119,6 @@ class Course:
         return s.number - 1 - s.mixed if s.kind in ("recovery", "composer") else 0
 
     @property
-    def lasts(self) -> bool:
-        """Whether no stage follows, so that this one has all the time that is left."""
-        return lasts(self.config, self.stage)
-
-    @property
     def began(self) -> float:
         """The share of the whole training at which this stage began."""
         return share_of(self.until, self.before, *self.begun)
@@ -204,7 +199,7 @@ class Course:
         follows = following(self.config, stage, bool(hard.any()))
         if stage.kind == "primitive":
             ledger.owner[member] = stage.number - 1
-        if stage.kind in ("primitive", "recovery") and not self.lasts:
+        if stage.kind in ("primitive", "recovery") and not lasts(self.config, stage):
             about = {"stage": stage.name, "clips": int(member.sum()), "hard": int(hard.sum())}
             name = stage.name.replace(" ", "-")
             policy.save(self.folder / f"{name}.safetensors", t.character, about)
