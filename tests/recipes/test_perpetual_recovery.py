@@ -21,6 +21,7 @@ from poise.nets import Composer
 from poise.recipes import perpetual_recovery
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, build
+from poise.recipes.perpetual_data import library_of
 from poise.recipes.perpetual_eval import ClipResults
 from poise.recipes.perpetual_ledger import RECOVERY_WORTH, Ledger
 from poise.recipes.perpetual_next import Owners, staged
@@ -210,3 +211,13 @@ def test_runs_of_before_there_was_recovery_stay_as_they_were(tmp_path: Path) -> 
     begin(tmp_path, library(), replace(config, clone=None))
     with pytest.raises(PoiseError, match=r"other settings \(recovery\)"):
         begin(tmp_path, library(), replace(config, recovery=True))
+
+
+def test_real_walks_are_told_from_what_is_none(data_dir: Path) -> None:
+    names = ("walk", "zombie_walk", "run", "crawl", "roll", "getup_faceup", "backflip", "kick", "jump")
+    files = [data_dir / f"deepmimic_txt/humanoid3d_{name}.txt" for name in names]
+    clips, _ = library_of(files)
+    made = build(clips, tiny())
+    walks = walking_clips(made.reference)
+    found = {clips.names[c].partition("humanoid3d_")[2] for c in walks.nonzero().flatten().tolist()}
+    assert found == {"walk", "zombie_walk"}

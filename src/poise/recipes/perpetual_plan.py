@@ -75,6 +75,14 @@ def ends(config: Perpetual, stage: Stage, begun: float) -> float:
     return first + (last - first) * (stage.number - 1) / (config.max_primitives - 1)
 
 
+def primitives(stage: Stage) -> int:
+    """Primitives of tracking that were begun by this stage; 0 for a network that learns all at once."""
+    if stage.kind == "primitive":
+        return stage.number
+    # Before a composer comes the primitive of recovery, if there is one.
+    return stage.number - 1 - stage.mixed if stage.kind in ("recovery", "composer") else 0
+
+
 def is_over(config: Perpetual, stage: Stage, decision: Decision, share: float) -> bool:
     """Whether a stage ends of which an evaluation, made at this share of the whole training, says
     `decision`."""

@@ -22,11 +22,13 @@ from poise.recipes.perpetual_config import Perpetual
 from poise.recipes.perpetual_eval import bare_env
 from poise.sim import make_backend
 
-#: Of their medians over the library, between which the root's height and above which the body's top
-#: stay in a clip that walks or stands.
+#: Of those of who stands, between which the root's height and above which the body's top stay in a clip
+#: that walks or stands.
 HEIGHT, TOP = (0.85, 1.15), 0.85
+#: Share of a library's frames that are lower than who stands; jumps are rarer than crawling.
+STANDS = 0.7
 #: m/s: nobody runs faster, and limbs do not move faster about the root, on average.
-ROOT_SPEED, LIMB_SPEED = 2.5, 1.0
+ROOT_SPEED, LIMB_SPEED = 2.5, 0.7
 #: s: shorter clips are no walk.
 SECONDS = 1.0
 #: Distance from the reference, m, at which trials far from it begin (PHC, Sec. 4.2).
@@ -36,13 +38,13 @@ FAR = 3.0
 def walking_clips(reference: Reference) -> Tensor:
     """`(C,)` bool on the CPU: clips of somebody who walks or stands, for the recovery primitive.
 
-    In all frames the root is about as high, and the body about as tall, as in most frames of the
-    library, nobody runs fast, and on average the limbs move about the root no faster than in a walk. All
-    clips if there is no such one.
+    In all frames the root is about as high, and the body about as tall, as of who stands, nobody runs
+    fast, and on average the limbs move about the root no faster than in a walk. All clips if there is no
+    such one.
     """
     pos, vel = (getattr(reference.pose, k).cpu() for k in ("pos", "linvel"))
     height, top = pos[:, 0, 2], pos[:, :, 2].amax(-1)
-    usual, tall = height.median(), top.median()
+    usual, tall = _standing(height), _standing(top)
     good = (height > HEIGHT[0] * usual) & (height < HEIGHT[1] * usual) & (top > TOP * tall)
     good &= vel[:, 0, :2].norm(dim=-1) < ROOT_SPEED
     limbs = (vel - vel[:, :1]).norm(dim=-1).mean(-1)
@@ -62,11 +64,16 @@ def standing(reference: Reference) -> tuple[int, int]:
     quietly, on which it then goes on standing. Clips that go round and round end nowhere."""
     pos, vel = (getattr(reference.pose, k).cpu() for k in ("pos", "linvel"))
     last = (reference.start + reference.length - 1).cpu()
-    upright = pos[last, 0, 2] / pos[:, 0, 2].median()
+    upright = pos[last, 0, 2] / _standing(pos[:, 0, 2])
     restless = vel[last].norm(dim=-1).mean(-1)
     unfit = (upright < HEIGHT[0]) | (upright > HEIGHT[1]) | reference.cyclic.cpu()
     clip = int((restless + 1e3 * unfit).argmin())
     return clip, int(reference.length[clip]) - 1
+
+
+def _standing(heights: Tensor) -> Tensor:
+    """The height, m, of who stands, of the heights `(F,)` in all frames of a library."""
+    return heights.kthvalue(1 + int(STANDS * (len(heights) - 1))).values
 
 
 def check_falls(imitation: Imitation, count: int = 32) -> None:

@@ -36,7 +36,7 @@ from poise.recipes.perpetual_eval import History
 from poise.recipes.perpetual_judge import Judge, Judged
 from poise.recipes.perpetual_ledger import Ledger
 from poise.recipes.perpetual_next import begin_first, begin_stage, critic_of, make_trainer, members_of
-from poise.recipes.perpetual_plan import ends, following, is_over, lasts, most_help
+from poise.recipes.perpetual_plan import ends, following, is_over, lasts, most_help, primitives
 from poise.recipes.perpetual_progress import Progress, Stage, share_of
 from poise.recipes.perpetual_recovery import check_falls
 from poise.recipes.perpetual_trouble import Troubles
@@ -112,21 +112,12 @@ class Course:
     @property
     def primitives(self) -> int:
         """Primitives of tracking that were begun; 0 for a network that learns all clips at once."""
-        s = self.stage
-        if s.kind == "primitive":
-            return s.number
-        # Before a composer comes the primitive of recovery, if there is one.
-        return s.number - 1 - s.mixed if s.kind in ("recovery", "composer") else 0
+        return primitives(self.stage)
 
     @property
     def began(self) -> float:
         """The share of the whole training at which this stage began."""
         return share_of(self.until, self.before, *self.begun)
-
-    @property
-    def until_share(self) -> float:
-        """The share of the whole training at which this stage ends at the latest."""
-        return ends(self.config, self.stage, self.began)
 
     def policy(self) -> PolicyBundle:
         """The stage's policy that did best, or the present one before any was evaluated."""
@@ -147,13 +138,14 @@ class Course:
         row = stats.row() | {"iteration": iteration, "stage": stage.number}
         seen = self.ledger.seen
         every = self.judge.every(stage, self.trainer.rollout.samples)
-        if share >= self.until_share or self.trainer.iteration % every == 0:
-            judged = self._judge(share)
+        over = share >= ends(self.config, stage, self.began)
+        if over or self.trainer.iteration % every == 0:
+            judged = self._judge(over)
             self.troubles.lately = 0
             seen = self.ledger.seen
             row |= judged.row()
-            over = is_over(self.config, stage, judged.decision, share)
-            follows = self._advance(judged) if over else None
+            if is_over(self.config, stage, judged.decision, share):
+                follows = self._advance(judged)
         self.log.write(row)
         if judged is not None or time.monotonic() - self._saved_at >= self.save_s:
             self.save()
@@ -182,9 +174,8 @@ class Course:
         if self.help > most:
             self.env.help.set(most)
 
-    def _judge(self, share: float) -> Judged:
-        """Evaluates the present policy."""
-        over = share >= self.until_share
+    def _judge(self, over: bool) -> Judged:
+        """Evaluates the present policy. over: the stage's time is."""
         judged = self.judge.judge(self.stage, self.trainer.policy(), self.help, over, self.iteration)
         self.env.weights = self.ledger.mining.weights()
         return judged
