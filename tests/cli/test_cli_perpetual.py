@@ -12,7 +12,8 @@ from tiny_clips import deepmimic, put
 from poise.cli.main import main
 from poise.learn import CloneConfig, PPOConfig
 from poise.recipes import perpetual
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual import Perpetual, RecoveryPlan
+from poise.recipes.perpetual_run import reopen
 
 MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
 
@@ -22,6 +23,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The recipe with networks that are trained in no time."""
     ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
     own = {"ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None}
+    own["recovering"] = RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2))
     monkeypatch.setattr(perpetual, "Perpetual", lambda **k: Perpetual(**(own | k)))
 
 
@@ -70,22 +72,39 @@ def test_all_stages_by_one_command(
 def test_ctrl_c_saves_and_says_how_to_go_on(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from poise.cli import train_perpetual
+    from poise.cli import perpetual_shown
 
-    plain = train_perpetual.events
+    plain = perpetual_shown.events
 
     def stopped(p: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train_perpetual, "events", stopped)
+    monkeypatch.setattr(perpetual_shown, "events", stopped)
     argv = command(folder, tmp_path / "run", "--single")
     assert main(argv) == 130
     told = capsys.readouterr().err
     assert "Stopped in single; the training so far is saved. Go on with:" in told
     assert told.rstrip().endswith("--single --resume") and "poise train perpetual --library" in told
-    monkeypatch.setattr(train_perpetual, "events", plain)
+    monkeypatch.setattr(perpetual_shown, "events", plain)
     assert main([*argv, "--resume"]) == 0
     assert "one network" in capsys.readouterr().out
+
+
+def test_the_switches_reach_the_run(folder: Path, tmp_path: Path, capsys) -> None:
+    out, onto = tmp_path / "run", str(folder / "bend.txt")
+    more = ("--goal", "keypoints", "--no-multiplicative", "--termination", "all", "--onto", onto)
+    more += ("--library-fps", "stand=15", "--no-expert")
+    assert main(command(folder, out, *more)) == 0
+    said, told = capsys.readouterr()
+    assert "Recovery, 2 trials each: fallen " in said and "single with recovery begins" in told
+    config = reopen(out).config
+    assert (config.goal, config.multiplicative, config.termination) == ("keypoints", False, "all")
+    assert config.method == "perpetual-plain" and config.recovery
+    # Other frames per second of the same files are another library.
+    assert main(command(folder, out, *more, "--library-fps", "bend=15", "--resume")) == 2
+    assert "a run on the library" in capsys.readouterr().err
+    # Half as many frames a second last twice as long.
+    assert reopen(out).library.clips[1].seconds == pytest.approx(15 / 15)
 
 
 def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> None:
@@ -105,6 +124,14 @@ def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> Non
         (("--max-primitives", "0"), "--max-primitives must"),
         (("--minutes", "0"), "--minutes must be above 0"),
         (("--hold-out", "nobody"), "fits no clip"),
+        (("--single", "--no-progressive"), "only one of single"),
+        (("--library-fps", "walk"), "needs REGEX=VALUE"),
+        (("--library-fps", "walk=fast"), "frames per second above 0, got 'fast'"),
+        (("--library-fps", "(=30"), "no regular expression"),
+        (("--library-skeleton", "walk=none.asf"), "none.asf: there is no such file"),
+        (("--onto", "nothing.bvh"), "nothing.bvh"),
+        (("--fps", "60"), "Use --library-fps"),
+        (("--swap-sides",), "--swap-sides is about a single clip"),
     ):
         refused(*command(folder, tmp_path / "out", *more), words=(words,))
 

@@ -12,7 +12,8 @@ import torch
 from poise.control import ExplicitResidual
 from poise.env import Reference
 from poise.errors import PoiseError
-from poise.eval import run_episodes, start_frames
+from poise.eval import run_episodes, run_in_batches, score_rollouts, start_frames
+from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from toy_human import swing
@@ -114,3 +115,25 @@ def test_starts_of_another_shape_are_told():
             torch.zeros(2, dtype=torch.long),
             torch.zeros(3, dtype=torch.long),
         )
+
+
+def test_batches_give_the_same_score_and_hold_few_frames():
+    clips = [swing(0.5, name="a"), swing(0.8, cyclic=True, name="b"), swing(0.3, name="c")]
+    imitation = build(ClipLibrary.of(clips), ResidualForce(method="deepmimic"))
+    policy = Always(torch.zeros(len(imitation.humanoid.hinges)))
+    clip, start = torch.tensor([0, 1, 2, 0]), torch.tensor([0, 0, 0, 7])
+
+    def make(worlds: int):
+        return imitation.env(worlds, auto_reset=False, threads=1)
+
+    whole, _ = run_episodes(make, policy, clip, start)
+    ref = imitation.reference
+    parts = list(run_in_batches(make, policy, ref, clip, start, most=30))
+    assert sum(len(p.clip) for p in parts) == 4 and len(parts) == 3
+    # An episode that is longer than a part is one alone.
+    assert all(p.pos.shape[0] * p.pos.shape[1] <= 30 or len(p.clip) == 1 for p in parts)
+    a, b = score_rollouts(whole), score_rollouts(parts)
+    assert a.mpjpe_mm == pytest.approx(b.mpjpe_mm, rel=1e-6) and a.frames == b.frames
+    assert [c["clip"] for c in b.per_clip] == ["a", "b", "c"] and b.episodes == 4
+    only = list(run_in_batches(make, policy, ref, clip, start))
+    assert len(only) == 1 and torch.equal(only[0].pos, whole.pos) and torch.equal(only[0].clip, clip)

@@ -243,3 +243,31 @@ def test_random_rollouts_equal_a_naive_loop():
     assert card.mpjpe_global_mm == pytest.approx(sum(errors) / len(errors))
     assert card.help.force_mean_n == pytest.approx(sum(forces) / len(forces))
     assert math.isnan(card.reward["total"])
+
+
+def test_parts_of_an_evaluation_score_as_the_whole():
+    whole = rollouts(force=torch.rand(2, 12, 1, 3, generator=torch.Generator().manual_seed(0)))
+    parts = []
+    for k in (1, 0):
+        # Another part may be padded otherwise.
+        frames = int(whole.lengths[k])
+        cut = {
+            name: getattr(whole, name)[k : k + 1, :frames]
+            for name in ("pos", "quat", "ref_pos", "ref_quat", "alive", "force", "torque", "point_vel")
+        }
+        cut["ang_vel"] = whole.ang_vel[k : k + 1, :frames]
+        rows = {n: getattr(whole, n)[k : k + 1] for n in ("lengths", "reached_end", "clip", "start")}
+        reward = {n: v[k : k + 1, :frames] for n, v in whole.reward.items()}
+        parts.append(replace(whole, **cut, **rows, reward=reward))
+    one, other = (score_rollouts(x).to_dict() for x in (whole, iter(parts)))
+
+    def same(a, b):
+        if isinstance(a, dict):
+            return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+        if isinstance(a, list):
+            return len(a) == len(b) and all(map(same, a, b))
+        return a == (pytest.approx(b) if isinstance(b, float) else b)
+
+    assert same(one, other)
+    with pytest.raises(PoiseError, match="no rollouts to score"):
+        score_rollouts([])

@@ -14,7 +14,7 @@ from toy_library import Script, Scripted, library, tiny
 from poise.learn import LATEST, IterationStats, Trainer, Until, load_policy
 from poise.learn.progressive import primitive
 from poise.nets import Composer
-from poise.recipes import perpetual_run, perpetual_stages
+from poise.recipes import perpetual_judge, perpetual_result
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual_progress import Progress, share_of
@@ -46,7 +46,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Scripted]]:
 
     def install(rule: Script) -> Scripted:
         made = Scripted(rule)
-        for module in (perpetual_stages, perpetual_run):
+        for module in (perpetual_judge, perpetual_result):
             monkeypatch.setattr(module, "evaluate_clips", made)
         return made
 

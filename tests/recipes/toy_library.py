@@ -10,7 +10,7 @@ from torch import Tensor
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual import Perpetual, RecoveryPlan
 from poise.recipes.perpetual_eval import ClipResults
 from toy_human import swing
 
@@ -41,6 +41,8 @@ def tiny(**changes: object) -> Perpetual:
         "evaluate_every": 2,
         "seed": 1,
         "clone": CloneConfig(steps=4, rounds=1, critic_steps=4),
+        "recovery": False,
+        "recovering": RecoveryPlan(share=0.3, falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2)),
         "convergence": ConvergenceConfig(patience=1),
         "style": STYLE,
         "ppo": PPO,

@@ -17,6 +17,13 @@ def test_sentence_of_a_good_run():
     assert overall(score()) == "good"
 
 
+def test_one_episode_per_clip_is_not_every_start():
+    clips = [{"clip": "walk", "episodes": 1}, {"clip": "run", "episodes": 1}]
+    assert "the whole clip from its first frame: yes" in sentence(score() | {"per_clip": clips})
+    clips[1]["episodes"] = 30
+    assert "the whole clip from every start: yes" in sentence(score() | {"per_clip": clips})
+
+
 @pytest.mark.parametrize(
     ("changes", "level"),
     [

@@ -36,13 +36,13 @@ def run(options: Options, argv: Sequence[str]) -> int:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
     check_device(options.device)
     folder = run_folder(options.run)
-    from poise.recipes.session import evaluate, reopen, trained_policy
+    from poise.recipes.session import reopen, score, trained_policy
 
     with working("simulating every start frame"):
         imitation = reopen(folder)
         policy, meta = trained_policy(folder, imitation)
         o = options
-        card = evaluate(imitation, policy, meta, o.rule, o.help_limit, device=o.device).card
+        card = score(imitation, policy, meta, o.rule, o.help_limit, o.device)
     if options.json:
         say_json(card.to_dict())
     else:

@@ -11,13 +11,24 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import say
 from poise.cli.options import Body, Reading, Training
+from poise.cli.perpetual_options import Primitives
 from poise.cli.train_inbetween import Network
-from poise.cli.train_perpetual import Primitives
 from poise.cli.training import Job, command_line
 from poise.errors import PoiseError, did_you_mean
 
 #: Recipes that can be trained.
 RECIPES = ("residual-force", "inbetween", "perpetual")
+
+
+#: How a single file is read, which is nothing for a folder, and what to do about it.
+_OF_A_CLIP = (
+    ("skeleton", "Use --library-skeleton REGEX=FILE.asf"),
+    ("fps", "Use --library-fps REGEX=HZ"),
+    *(
+        (name, "Leave it out, or convert the files with poise convert first")
+        for name in ("unit", "up", "take", "ground", "swap_sides", "allow_pickle", "smooth")
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,10 @@ def _perpetual(o: Options, argv: Sequence[str]) -> int:
     from poise.cli.train_perpetual import run as train
 
     _only_a_folder(o)
+    plain = Reading()
+    for name, instead in _OF_A_CLIP:
+        if getattr(o.reading, name) != getattr(plain, name):
+            raise PoiseError(f"--{name.replace('_', '-')} is about a single clip", hint=instead)
     again = command_line("train", argv)
     return train(o.network, o.primitives, o.out, o.training, o.body, again)
 

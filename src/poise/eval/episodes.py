@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,6 +16,9 @@ from poise.errors import PoiseError
 from poise.eval.rolloutset import RolloutSet
 from poise.metrics import Shapes
 from poise.metrics.shapes import KINDS
+
+#: Frames of a part of rollouts: 110 MB of 20 bodies.
+PADDED = 100_000
 
 
 class Acts(Protocol):
@@ -125,6 +128,38 @@ def run_episodes(
     )
     env.close()
     return rollouts, recordings
+
+
+def run_in_batches(
+    make_env: Callable[[int], ImitationEnv],
+    policy: Acts,
+    reference: Reference,
+    clip: Tensor,
+    start: Tensor,
+    limit_n: float = 0.0,
+    limit_nm: float = 0.0,
+    cycles: int = 2,
+    most: int = PADDED,
+) -> Iterator[RolloutSet]:
+    """The rollouts of `run_episodes` in parts, each of episodes of like length.
+
+    So a library is scored (`score_rollouts` takes the parts) without all its frames in memory. Whatever
+    fits into one part comes in the given order.
+
+    Args:
+        reference: the clips, as the environments have them.
+        most: frames of a part, with the padding.
+    """
+    rounds = torch.where(reference.cyclic.cpu()[clip], cycles, 1)
+    length = (reference.length.cpu()[clip] - 1) * rounds - start + 1
+    order = torch.arange(len(clip))
+    if len(clip) * int(length.max()) > most:
+        order = length.argsort(stable=True)
+    while len(order):
+        # Episodes are sorted, so that a part is as long as its last one.
+        fits = (torch.arange(1, len(order) + 1) * length[order].cummax(0).values <= most).sum()
+        rows, order = order[: max(1, int(fits))], order[max(1, int(fits)) :]
+        yield run_episodes(make_env, policy, clip[rows], start[rows], limit_n, limit_nm, cycles)[0]
 
 
 def shapes_of(table: BodyTable) -> Shapes:

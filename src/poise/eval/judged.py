@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,6 +60,11 @@ class Sums:
         """From `(E, ...)` values under a mask of the same shape."""
         kept = torch.where(mask, values, torch.zeros_like(values)).double()
         return Sums(kept.flatten(1).sum(1), mask.flatten(1).sum(1))
+
+    @staticmethod
+    def cat(parts: Sequence[Sums]) -> Sums:
+        """Of the episodes of all parts, one after another."""
+        return Sums(torch.cat([p.total for p in parts]), torch.cat([p.count for p in parts]))
 
     def mean(self, rows: Tensor, weighting: Weighting) -> float:
         """Over the episodes `rows (E,)` bool; NaN when they hold no sample."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -73,42 +73,85 @@ def _tracking(r: RolloutSet, mask: Tensor) -> dict[str, Sums]:
     }
 
 
-def _help(r: RolloutSet, audit: HelpAudit) -> Help:
+class _Part(NamedTuple):
+    """What is left of some rollouts: sums per episode, and the wrenches of the frames that count."""
+
+    figures: dict[str, Sums]
+    of_reference: dict[str, Sums]
+    reward: dict[str, Sums]
+    force: Sums
+    won: Tensor
+    failed_at: Tensor
+    clip: Tensor
+    start: Tensor
+    frames: Tensor
+    # Force, torque, and the velocities where they act, `(n, M, 3)`.
+    wrench: tuple[Tensor, ...]
+
+
+def _part(r: RolloutSet, chosen: SuccessRule) -> _Part:
+    won, mask, failed_at = judge(r, chosen)
+    return _Part(
+        _tracking(r, mask) | _plausibility(r.pos, r.quat, mask, r.fps, r.shapes, r.feet),
+        _plausibility(r.ref_pos, r.ref_quat, mask, r.fps, r.shapes, r.feet),
+        {n: Sums.of(v, mask) for n, v in r.reward.items()},
+        Sums.of(r.force.norm(dim=-1).sum(-1), mask),
+        won,
+        failed_at,
+        r.clip,
+        r.start,
+        mask.sum(1),
+        tuple(x[mask] for x in (r.force, r.torque, r.point_vel, r.ang_vel)),
+    )
+
+
+def _joined(parts: Sequence[_Part]) -> _Part:
+    if len(parts) == 1:
+        return parts[0]
+
+    def cat(values: Sequence[Any]) -> Any:
+        one = values[0]
+        if isinstance(one, Sums):
+            return Sums.cat(values)
+        if isinstance(one, dict):
+            return {k: cat([v[k] for v in values]) for k in one}
+        if isinstance(one, tuple):
+            return tuple(cat(x) for x in zip(*values, strict=True))
+        return torch.cat(list(values))
+
+    return _Part(*(cat(x) for x in zip(*parts, strict=True)))
+
+
+def _help(limits: tuple[float, float], audit: HelpAudit) -> Help:
     used = {f.name: getattr(audit, f.name) for f in fields(Help) if not f.name.startswith("limit")}
-    return Help(float(r.limit_n), float(r.limit_nm), **used)
+    return Help(*limits, **used)
 
 
 def _per_clip(
-    r: RolloutSet,
-    sums: Mapping[str, Sums],
-    mask: Tensor,
-    won: Tensor,
-    failed_at: Tensor,
-    weighting: Weighting,
+    p: _Part, name: Callable[[int], str], fps: float, weighting: Weighting
 ) -> tuple[Mapping[str, Any], ...]:
     """One entry per clip, in order of the clip's index; forces are pooled over the clip's frames."""
-    force = Sums.of(r.force.norm(dim=-1).sum(-1), mask)
     entries = []
-    for index in sorted(set(r.clip.tolist())):
-        rows = r.clip == index
-        lost = rows & (failed_at >= 0)
-        seconds = float((r.start[lost] + failed_at[lost]).min()) / r.fps if bool(lost.any()) else NAN
+    for index in sorted(set(p.clip.tolist())):
+        rows = p.clip == index
+        lost = rows & (p.failed_at >= 0)
+        seconds = float((p.start[lost] + p.failed_at[lost]).min()) / fps if bool(lost.any()) else NAN
         entry: dict[str, Any] = {
-            "clip": r.clip_name(int(index)),
+            "clip": name(int(index)),
             "episodes": int(rows.sum()),
-            "frames": int(mask[rows].sum()),
-            "succ": float(won[rows].double().mean()),
+            "frames": int(p.frames[rows].sum()),
+            "succ": float(p.won[rows].double().mean()),
             "first_fail_s": seconds,
         }
-        for name in (*TRACKING, *PLAUSIBILITY):
-            entry[name] = sums[name].mean(rows, weighting) if name in sums else NAN
-        entry["force_mean_n"] = force.mean(rows, "frame")
+        for key in (*TRACKING, *PLAUSIBILITY):
+            entry[key] = p.figures[key].mean(rows, weighting) if key in p.figures else NAN
+        entry["force_mean_n"] = p.force.mean(rows, "frame")
         entries.append(entry)
     return tuple(entries)
 
 
 def score_rollouts(
-    rollouts: RolloutSet,
+    rollouts: RolloutSet | Iterable[RolloutSet],
     *,
     rule: str | SuccessRule = "phc",
     weighting: Weighting = "frame",
@@ -125,51 +168,55 @@ def score_rollouts(
     comes after a failure is not tracking. The reference is scored over the same frames.
 
     Args:
+        rollouts: all at once, or parts of one evaluation, of which only one is kept at a time.
         weighting: "frame" pools the frames of all episodes (PHC's way, the default); "episode"
             averages episode means. Help is always pooled over frames.
         seconds, samples, seed: wall-clock time, control steps and seed of the training that made it.
     """
-    r = rollouts
     if weighting not in ("frame", "episode"):
         raise PoiseError(f"the weighting must be 'frame' or 'episode', got '{weighting}'")
-    chosen = success_rule(rule)
-    won, mask, failed_at = judge(r, chosen)
-    sums = _tracking(r, mask) | _plausibility(r.pos, r.quat, mask, r.fps, r.shapes, r.feet)
-    of_reference = _plausibility(r.ref_pos, r.ref_quat, mask, r.fps, r.shapes, r.feet)
-    everyone = torch.ones_like(won)
-    audit = help_audit(r.force, r.torque, r.point_vel, r.ang_vel, r.mass, mask=mask)
+    chosen, parts, first = success_rule(rule), [], None
+    for r in [rollouts] if isinstance(rollouts, RolloutSet) else rollouts:
+        parts.append(_part(r, chosen))
+        # What all parts share, without the frames.
+        first = first or (r.clip_names, r.fps, r.mass, (float(r.limit_n), float(r.limit_nm)))
+    if first is None:
+        raise PoiseError("there are no rollouts to score")
+    (names, fps, mass, limits), p = first, _joined(parts)
+    everyone = torch.ones_like(p.won)
+    force, torque, point_vel, ang_vel = p.wrench
+    audit = help_audit(force, torque, point_vel, ang_vel, mass)
     variants = {
-        prefix + way: {name: sums[name].mean(rows, way) for name in TRACKING}
-        for prefix, rows in (("", everyone), ("succ_", won))
+        prefix + way: {name: p.figures[name].mean(rows, way) for name in TRACKING}
+        for prefix, rows in (("", everyone), ("succ_", p.won))
         for way in ("frame", "episode")
     }
-    figures: dict[str, Any] = {
-        n: sums[n].mean(everyone, weighting) if n in sums else NAN for n in (*TRACKING, *PLAUSIBILITY)
-    }
-    indices = sorted(set(r.clip.tolist()))
-    named = (
-        ", ".join(r.clip_name(int(i)) for i in indices) if len(indices) <= 3 else f"{len(indices)} clips"
-    )
+
+    def named(index: int) -> str:
+        return names[index] if names else str(index)
+
+    def means(sums: Mapping[str, Sums], keys: Iterable[str]) -> dict[str, float]:
+        return {n: sums[n].mean(everyone, weighting) if n in sums else NAN for n in keys}
+
+    indices = sorted(set(p.clip.tolist()))
+    whole = ", ".join(named(int(i)) for i in indices) if len(indices) <= 3 else f"{len(indices)} clips"
+    figures: dict[str, Any] = means(p.figures, (*TRACKING, *PLAUSIBILITY))
     return ScoreCard(
-        succ=float(won.double().mean()),
+        succ=float(p.won.double().mean()),
         succ_rule=chosen.name,
         **figures,
-        reward={"total": NAN}
-        | {n: Sums.of(v, mask).mean(everyone, weighting) for n, v in r.reward.items()},
-        help=_help(r, audit),
+        reward={"total": NAN} | means(p.reward, p.reward),
+        help=_help(limits, audit),
         seconds=float(seconds),
         samples=int(samples),
         seed=int(seed),
-        clip=named if clip is None else clip,
+        clip=whole if clip is None else clip,
         method=method,
-        episodes=len(won),
-        frames=int(mask.sum()),
+        episodes=len(p.won),
+        frames=int(p.frames.sum()),
         mpjpe_succ_mm=variants["succ_" + weighting]["mpjpe_mm"],
-        reference={
-            n: of_reference[n].mean(everyone, weighting) if n in of_reference else NAN
-            for n in PLAUSIBILITY
-        },
-        per_clip=_per_clip(r, sums, mask, won, failed_at, weighting),
+        reference=means(p.of_reference, PLAUSIBILITY),
+        per_clip=_per_clip(p, named, fps, weighting),
         weighting=weighting,
         variants=variants,
     )

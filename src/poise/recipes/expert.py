@@ -97,8 +97,12 @@ def clone_expert(
     dumps: Path | None = None,
     tell: Beginning | None = None,
     config: CloneConfig | None = None,
+    start: PolicyBundle | None = None,
 ) -> WarmStart:
-    """Scores the expert and clones it into a policy of the recipe's networks and observation."""
+    """Scores the expert and clones it into a policy of the recipe's networks and observation.
+
+    start: the policy that is taught, see `learn.clone`; a new perceptron by default.
+    """
     tell, plan = tell or Beginning(), make_plan(imitation.reference)
     if tell.expert is not None:
         tell.expert(score_expert(imitation, plan))
@@ -114,6 +118,7 @@ def clone_expert(
             imitation.ppo(),
             imitation.config.seed,
             tell.round,
+            start,
         )[0]
     finally:
         env.close()

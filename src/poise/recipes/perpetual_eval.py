@@ -112,7 +112,7 @@ def _batch(
     imitation: Imitation, policy: Acts, clip: Tensor, scale: float, threads: int, device: str
 ) -> tuple[Tensor, ...]:
     """Success, frames tracked, mean errors `(E,)` of clips that are simulated together."""
-    env = _env(imitation, len(clip), scale, threads, device)
+    env = bare_env(imitation, len(clip), scale, threads, device)
     limit = success_rule("phc").limit_m * 1000.0
     last = imitation.reference.length[clip].to(env.device) - 1
     clip = clip.to(env.device)
@@ -141,8 +141,11 @@ def _batch(
     return tuple(x.cpu() for x in (alive, tracked, local / count, far / count))
 
 
-def _env(imitation: Imitation, worlds: int, scale: float, threads: int, device: str) -> ImitationEnv:
-    """Worlds without a guard: one that goes bad is a failure and no reason to stop."""
+def bare_env(imitation: Imitation, worlds: int, scale: float, threads: int, device: str) -> ImitationEnv:
+    """Worlds without a guard, rewards and ends: one that goes bad is a failure and no reason to stop.
+
+    scale: what is left of the residual force's limits.
+    """
     config = imitation.config
     backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
     # Only what the policy sees is worked out.

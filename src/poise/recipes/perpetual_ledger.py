@@ -8,13 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from poise.eval import RecoveryCard
 from poise.learn import Convergence, Decision, HardNegatives, PolicyBundle
 from poise.learn.state import State, prefixed, take, under
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_config import Perpetual
 from poise.recipes.perpetual_eval import ClipResults
+from poise.recipes.perpetual_recovery import back
 
 #: Help that is less by this share of its limit is a gain of a stage.
 LESS_HELP = 0.01
+#: What a share of trials of recovery is worth beside the same share of clips, where both are learned.
+RECOVERY_WORTH = 0.25
 
 
 class Ledger:
@@ -25,8 +29,9 @@ class Ledger:
         length: `(C,)` frames of the clips, by which they are drawn where none fails.
 
     Attributes: `owner (C,)`, the primitive that learned each clip, from 0; `best`, the state of the
-    stage's policy that did best, which had `best_failed (C,)`; `seen`, how many clips of how many
-    succeeded in the last evaluation.
+    stage's policy that did best, which had `best_failed (C,)`; `seen`, how many clips (trials of the
+    recovery primitive) of how many succeeded in the last evaluation; `recovery`, the best trials of the
+    recovery primitive as JSON data.
     """
 
     def __init__(self, config: Perpetual, length: Tensor):
@@ -34,6 +39,7 @@ class Ledger:
         self.mining = HardNegatives(clips, config.mining, (length.cpu() - 1).double())
         self.convergence = Convergence(config.convergence)
         self.owner = torch.zeros(clips, dtype=torch.long)
+        self.recovery: dict[str, Any] | None = None
         self.begin(torch.ones(clips, dtype=torch.bool))
 
     def begin(self, member: Tensor) -> None:
@@ -56,16 +62,28 @@ class Ledger:
         """`(C,)` bool, what the next primitive is to learn."""
         return self.mining.hard | self.best_failed
 
-    def record(self, results: ClipResults, policy: PolicyBundle, scale: float) -> None:
-        """Notes what `policy` did with the stage's clips, with the share `scale` of the help."""
+    def record(
+        self, results: ClipResults, policy: PolicyBundle, scale: float, recovered: float = 0.0
+    ) -> None:
+        """Notes what `policy` did with the stage's clips, with the share `scale` of the help.
+
+        recovered: the share of its trials that were back, where the stage learns recovery, too.
+        """
         member = self.mining.member
         won = results.spread(results.succeeded, len(member))
         self.mining.record(won, member)
         self.seen = (int(won.sum()), len(results.clip))
         # Less help counts before more clips, more clips before a smaller error.
-        key = (-scale, results.rate, -results.error_mm)
+        key = (-scale, results.rate + RECOVERY_WORTH * recovered, -results.error_mm)
         if not self.best or key > self.best_key:
             self.best, self.best_key, self.best_failed = policy.state(), key, member & ~won
+
+    def record_trials(self, card: RecoveryCard, policy: PolicyBundle) -> None:
+        """Notes what `policy` did with trials of recovery alone; of equals the later one is the best."""
+        won, tried = self.seen = back(card)
+        if not self.best or won / tried >= self.best_key[0]:
+            self.best, self.best_key = policy.state(), (won / tried,)
+            self.recovery = card.to_dict()
 
     def decide(self, scale: float) -> Decision:
         """What the last evaluation, with this share of the help, says of the stage.
@@ -87,7 +105,12 @@ class Ledger:
 
     def facts(self) -> dict[str, Any]:
         """The rest of what `load` takes, as JSON data."""
-        return {"least": self.least, "best_key": list(self.best_key), "seen": list(self.seen)}
+        return {
+            "least": self.least,
+            "best_key": list(self.best_key),
+            "seen": list(self.seen),
+            "recovery": self.recovery,
+        }
 
     def load(self, state: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
         """Goes on from `state` and `facts`."""
@@ -98,3 +121,4 @@ class Ledger:
         self.least = facts["least"]
         succeeded, clips = facts["seen"]
         self.seen = (succeeded, clips)
+        self.recovery = facts.get("recovery")

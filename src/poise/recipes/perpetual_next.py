@@ -11,6 +11,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.learn import (
+    CloneConfig,
     PolicyBundle,
     PPOConfig,
     Trainer,
@@ -24,38 +25,81 @@ from poise.learn import (
 )
 from poise.learn.state import State, make_generator
 from poise.nets import Composer
-from poise.recipes.expert import Beginning, clone_expert, finetuning
+from poise.recipes.expert import CLONE_WORLDS, Beginning, clone_expert, finetuning
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual import Perpetual, stage_task
+from poise.recipes.perpetual_clone import clone_for
+from poise.recipes.perpetual_plan import first_stage
 from poise.recipes.perpetual_progress import Stage
+from poise.recipes.perpetual_recovery import walking_clips
 from poise.sim import UnstableError
 
 
 def begin_first(
     imitation: Imitation, threads: int, dumps: Path | None, tell: Beginning
 ) -> tuple[Stage, WarmStart | None]:
-    """The first stage, and the policy it starts from; None starts the single network from nothing."""
+    """The first stage, and the policy it starts from; None starts a single network from nothing."""
     config: Perpetual = imitation.config
-    stage = Stage("single" if config.single else "primitive")
-    sized = replace(imitation, config=replace(config, ppo=_sized(config, stage)))
+    stage = first_stage(config)
+    own = staged(imitation, stage)
+    sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
+    joint = _joint(sized) if stage.kind == "joint" else None
     start = None
     if config.expert:
         try:
-            start = clone_expert(sized, threads, dumps, tell, config.clone)
+            start = clone_expert(sized, threads, dumps, tell, clone_config(imitation), joint)
         except UnstableError as problem:
             # Clips that throw the expert off may still be learned from nothing.
             if tell.failed is not None:
                 tell.failed(str(problem))
-    if config.single:
+    if stage.kind == "single":
         return stage, start
+    if joint is not None:
+        return stage, start or WarmStart(joint)
     if start is not None:
         return stage, replace(start, policy=columns_of(start.policy, config.lateral))
-    ppo, env = sized.ppo(), imitation.env(1, threads=1)
+    return stage, WarmStart(_first_column(sized))
+
+
+def _first_column(sized: Imitation) -> PolicyBundle:
+    config, ppo, env = sized.config, sized.ppo(), sized.env(1, threads=1)
     env.close()
     std = ppo.std if isinstance(ppo.std, tuple) else float(ppo.std)
     sizes = (env.num_obs, env.num_actions, ppo.policy_hidden, ppo.activation, std, config.lateral)
     rng = make_generator(config.seed, "primitive 1")
-    return stage, WarmStart(first_column(*sizes, obs_clip=ppo.obs_clip, generator=rng))
+    return first_column(*sizes, obs_clip=ppo.obs_clip, generator=rng)
+
+
+def _joint(sized: Imitation) -> PolicyBundle:
+    """All primitives and their composer, untrained: MCP without progressive training."""
+    config, columns = sized.config, _first_column(sized)
+    for k in range(2, config.max_primitives + 1):
+        rng = make_generator(config.seed, f"primitive {k}")
+        columns = next_column(columns, "random", generator=rng)
+    rng, hidden = make_generator(config.seed, "composer"), config.composer_hidden
+    return compose(columns, "product", config.weights, hidden, joint=True, generator=rng)
+
+
+def begin_stage(
+    before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
+    dumps: Path | None, tell: Beginning,
+) -> WarmStart:  # fmt: skip
+    """What a later stage starts from: one primitive more, a composer, or the same network.
+
+    before: what the last stage learned, with its critic, which goes on. owner: see `begin_composer`.
+    """
+    if stage.kind == "composer":
+        return begin_composer(before, staged(imitation, stage), owner, threads, dumps, tell)
+    if stage.kind in ("primitive", "recovery"):
+        return begin_primitive(before, imitation.config, stage.number)
+    return before
+
+
+def members_of(stage: Stage, hard: Tensor, imitation: Imitation) -> Tensor:
+    """`(C,)` bool, the clips of a later stage. hard: what the primitives before it have failed."""
+    if stage.kind == "recovery":
+        return walking_clips(imitation.reference)
+    return hard if stage.kind == "primitive" else torch.ones_like(hard)
 
 
 def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmStart:
@@ -68,9 +112,10 @@ def begin_composer(
     before: WarmStart, imitation: Imitation, owner: Tensor, threads: int, dumps: Path | None,
     tell: Beginning,
 ) -> WarmStart:  # fmt: skip
-    """The composer over all primitives, taught at first to do as the primitive that learned the clip.
+    """The composer over all primitives, taught at first to do as the primitive that learned the clip,
+    and as the last one, that of recovery, for who is far.
 
-    owner: `(C,)`, the primitive of each clip.
+    imitation: with the task of the composer's stage. owner: `(C,)`, the primitive of each clip.
     """
     config: Perpetual = imitation.config
     rng = make_generator(config.seed, "composer")
@@ -81,10 +126,11 @@ def begin_composer(
     if not config.composer_clone:
         return replace(before, policy=policy)
     env = unhelped(imitation).env(
-        min(config.num_envs, 512), threads=threads, dumps=dumps, help_scale=0.0
+        min(config.num_envs, CLONE_WORLDS), threads=threads, dumps=dumps, help_scale=0.0
     )
     # Choosing among primitives is learned sooner than acting; the critic goes on from them.
-    settings = replace(config.clone, rounds=min(1, config.clone.rounds), critic_steps=0)
+    settings = clone_config(imitation)
+    settings = replace(settings, rounds=min(1, settings.rounds), critic_steps=0)
     try:
         taught, _ = clone(
             cast(VecEnv, env), Owners(env, policy, owner), settings, imitation.ppo(), config.seed,
@@ -101,7 +147,11 @@ def begin_composer(
 
 
 class Owners:
-    """Acts for each world as the primitive that learned its clip: a teacher for the composer."""
+    """Acts for each world as the primitive that learned its clip: a teacher for the composer.
+
+    Where the task knows recovery, the last primitive acts for whoever is so far from the reference, or
+    fallen below it, that the goal is a point, which is what the composer can see.
+    """
 
     def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor):
         assert isinstance(policy.policy, Composer)
@@ -112,7 +162,11 @@ class Owners:
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for raw observations `(N, O)` of the worlds as they stand."""
         actions = self.primitives.all(self.norm.forward(obs))
-        return actions[torch.arange(len(obs), device=obs.device), self.owner[self.env.clip]]
+        owner, recoveries = self.owner[self.env.clip], self.env.recoveries
+        if recoveries is not None:
+            far = recoveries.before > recoveries.config.switch
+            owner = torch.where(far, len(self.primitives) - 1, owner)
+        return actions[torch.arange(len(obs), device=obs.device), owner]
 
 
 def make_trainer(
@@ -126,10 +180,24 @@ def make_trainer(
     config: Perpetual = imitation.config
     # Another stage draws other starts and noise.
     seed = (config.seed + 1_000_003 * (stage.number - 1)) % 2**31
-    own = unhelped(imitation) if stage.kind == "composer" else imitation
+    own = staged(imitation, stage)
     own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
     ppo = finetuning(own.ppo()) if warm else own.ppo()
     return own.trainer(threads, dumps, warm_start=start, ppo=ppo, device=device, style=config.style)
+
+
+def staged(imitation: Imitation, stage: Stage) -> Imitation:
+    """The task of a stage: whether it recovers, and that no success changes a composer's help."""
+    task = stage_task(imitation.config, imitation.humanoid, stage.recovers)
+    own = replace(imitation, task=task)
+    return unhelped(own) if stage.kind == "composer" else own
+
+
+def clone_config(imitation: Imitation) -> CloneConfig:
+    """How an expert is cloned: as the settings say, or by the frames of the library."""
+    config: Perpetual = imitation.config
+    worlds = min(config.num_envs, CLONE_WORLDS)
+    return config.clone or clone_for(int(imitation.reference.length.sum()), worlds)
 
 
 def unhelped(imitation: Imitation) -> Imitation:
@@ -143,6 +211,6 @@ def critic_of(trainer: Trainer) -> State:
 
 
 def _sized(config: Perpetual, stage: Stage) -> PPOConfig:
-    if stage.kind != "single":
+    if not config.single or stage.kind != "single":
         return config.ppo
     return replace(config.ppo, policy_hidden=config.single_hidden)

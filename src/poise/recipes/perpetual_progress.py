@@ -5,36 +5,50 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from poise.eval import RecoveryCard
 from poise.learn import IterationStats, Until
 from poise.recipes.perpetual_eval import ClipResults
 
-Kind = Literal["primitive", "single", "composer"]
+Kind = Literal["primitive", "single", "joint", "recovery", "composer"]
+#: As what a stage learns recovery, see `Recovery.phc`.
+Recovers = Literal["primitive", "composer"]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One training after another: primitives 1 to K and the composer, or the single network.
+    """One training after another, see `perpetual_plan`.
 
-    number: counts all stages of a run from 1.
+    number: counts all stages of a run from 1. mixed: episodes of recovery are interleaved.
     """
 
     kind: Kind
     number: int = 1
+    mixed: bool = False
 
     @property
     def name(self) -> str:
         """As it is shown and noted: "primitive 2"."""
-        return f"primitive {self.number}" if self.kind == "primitive" else self.kind
+        if self.kind == "primitive":
+            return f"primitive {self.number}"
+        return f"{self.kind} with recovery" if self.mixed and self.kind != "composer" else self.kind
+
+    @property
+    def recovers(self) -> Recovers | None:
+        """As what the stage learns recovery; None: it tracks alone."""
+        if self.kind == "recovery":
+            return "primitive"
+        return "composer" if self.mixed else None
 
 
 @dataclass(frozen=True)
 class Progress:
     """What one iteration came to.
 
-    stage: the one that was trained, of whose `clips` the last evaluation saw `succeeded`, or None before
-    the first. iteration: over all stages. share: of the whole training, 0 to 1. help_n: N, what is left.
-    results: an evaluation that was made after this iteration. following: the stage that begins now.
-    trouble: what went wrong before this iteration, which then was made again from the last checkpoint.
+    stage: the one that was trained, of whose `clips` (of the recovery primitive: trials) the last
+    evaluation saw `succeeded`, or None before the first. iteration: over all stages. share: of the whole
+    training, 0 to 1. help_n: N, what is left. results, recovery: evaluations that were made after this
+    iteration. following: the stage that begins now. trouble: what went wrong before this iteration,
+    which then was made again from the last checkpoint.
     """
 
     stage: Stage
@@ -45,6 +59,7 @@ class Progress:
     clips: int
     help_n: float
     results: ClipResults | None
+    recovery: RecoveryCard | None
     following: Stage | None
     trouble: str = ""
 

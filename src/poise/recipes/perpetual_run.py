@@ -3,7 +3,7 @@
 run/
     run.safetensors         the clips and the settings, all that the run needs to be rebuilt
     checkpoint.safetensors  the stage in progress with everything that decides what comes next
-    primitive-K.safetensors each primitive as it was when its stage ended
+    primitive-K.safetensors each primitive as it was when its stage ended; recovery.safetensors likewise
     policy.safetensors      the policy of the finished run
     log.csv, success.csv    the learning curve; every evaluation of every clip
     result.json             what the finished run came to, without help
@@ -11,47 +11,27 @@ run/
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from poise import __version__
 from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.learn import Until, load_checkpoint, save_checkpoint
-from poise.learn.checkpoint import write_atomic
+from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
 from poise.learn.run import interruptible
 from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import RECIPE, Perpetual, build
+from poise.recipes.perpetual import RECIPE, Perpetual, build, task
+from poise.recipes.perpetual_config import from_json, to_json
 from poise.recipes.perpetual_data import LibraryConfig, library_of, split
-from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
-from poise.recipes.perpetual_progress import Progress
+from poise.recipes.perpetual_progress import Progress, Stage
+from poise.recipes.perpetual_result import RESULT, PerpetualResult, finish
 from poise.recipes.perpetual_stages import Course
 from poise.recipes.session import FINAL, RUN_FILE
-
-RESULT = "result.json"
-
-
-@dataclass(frozen=True, eq=False)
-class PerpetualResult:
-    """How a training ended.
-
-    last: the last iteration, None where nothing was left to do. interrupted: by Ctrl-C; then there is no
-    `results`, which are those of the finished policy on every clip, without help. solved: nothing
-    failed any more before the time was over. primitives: how many were trained.
-    """
-
-    last: Progress | None
-    interrupted: bool
-    solved: bool
-    primitives: int
-    results: ClipResults | None
 
 
 def clips_of(
@@ -60,14 +40,17 @@ def clips_of(
     hold_out: Sequence[str] = (),
     leave_out: Sequence[str] = (),
     tell: Callable[[str], None] = lambda _: None,
+    onto: Path | None = None,
+    config: LibraryConfig | None = None,
 ) -> tuple[ClipLibrary, tuple[str, ...]]:
     """The clips of a folder on one skeleton, see `library_of`, and sentences on what became of them.
 
     hold_out: clips and performers that are not learned from, see `split`. leave_out: regular expressions
-    of clips that are not even read.
+    of clips that are not even read. onto: a motion file or an MJCF body whose skeleton all clips come
+    onto; by default that on which most of the library is. config: how files are read.
     """
-    config = LibraryConfig(leave_out=tuple(leave_out))
-    library, report = library_of(folder, config=config, body=body, tell=tell)
+    config = replace(config or LibraryConfig(), leave_out=tuple(leave_out))
+    library, report = library_of(folder, onto, config=config, body=body, tell=tell)
     notes = tuple(report.sentences())
     if not hold_out:
         return library, notes
@@ -118,7 +101,7 @@ def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu
         PoiseError: other settings, another source of clips, or another recipe.
     """
     _checked(folder, to_json(config), source)
-    imitation = reopen(folder)
+    imitation = _rebuilt(folder)
     imitation.check_room(config.num_envs, device)
     return imitation
 
@@ -128,8 +111,10 @@ def _checked(folder: Path, config: dict[str, Any], source: str) -> dict[str, Any
     _, meta = load_checkpoint(folder / RUN_FILE)
     if meta.get("recipe") != RECIPE["name"]:
         raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
-    found = meta["config"]
-    names = sorted(k for k in {*config, *found} if config.get(k) != found.get(k))
+    # As this version reads it, so that a run of an older one is compared in what it knew, too.
+    found = to_json(from_json(meta["config"]))
+    # How long the expert was cloned is over and done; a run keeps its own.
+    names = sorted(k for k in config if k != "clone" and config[k] != found[k])
     if names:
         raise PoiseError(
             f"the folder holds a run with other settings ({', '.join(names)})",
@@ -146,10 +131,33 @@ def _checked(folder: Path, config: dict[str, Any], source: str) -> dict[str, Any
 
 
 def reopen(folder: Path) -> Imitation:
-    """The task of an existing run, rebuilt from its folder alone."""
+    """The task of an existing run as its latest policy knows it, rebuilt from its folder alone.
+
+    A policy that has not come to recovery yet must not see point goals; its `config` is without.
+    """
+    imitation = _rebuilt(folder)
+    config: Perpetual = imitation.config
+    if not config.recovery or _knows_recovery(folder):
+        return imitation
+    config = replace(config, recovery=False)
+    return replace(imitation, config=config, task=task(config, imitation.humanoid))
+
+
+def _rebuilt(folder: Path) -> Imitation:
     tensors, meta = load_checkpoint(folder / RUN_FILE)
     library = ClipLibrary(tuple(unpack_clips(tensors, meta["clips"])))
     return build(library, from_json(meta["config"]))
+
+
+def _knows_recovery(folder: Path) -> bool:
+    """Whether the stage of a run's latest policy learned to recover."""
+    path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
+    if not path.exists():
+        return True
+    said = load_checkpoint(path)[1]["metadata"]
+    if path.name == FINAL:
+        return bool(said["recovers"])
+    return Stage(**said["course"]["stage"]).recovers is not None
 
 
 def train(
@@ -191,68 +199,8 @@ def train(
         if last is not None:
             course.save()
         stopped = interrupted and not course.finished and course.share < 1
-        results = None if stopped else finish(course)
-        return PerpetualResult(last, stopped, course.finished, course.primitives, results)
+        results, card = (None, None) if stopped else finish(course)
+        done = (course.finished, course.primitives, results, card)
+        return PerpetualResult(last, stopped, *done)
     finally:
         course.close()
-
-
-def finish(course: Course) -> ClipResults:
-    """The policy as a file, and what it does with every clip, without help, as `result.json`."""
-    policy, t, imitation = course.policy(), course.trainer, course.imitation
-    facts = {
-        "method": imitation.config.method, "seed": imitation.config.seed, "stage": course.stage.name,
-        "primitives": course.primitives, "solved": course.finished, "iterations": course.iteration,
-    }  # fmt: skip
-    cost = {"samples": t.samples, "seconds": round(t.seconds, 1)}
-    results = evaluate_clips(imitation, policy, None, 0.0, course.threads, course.device)
-    course.history.add(course.iteration, FINAL_STAGE, 0.0, results)
-    policy.save(course.folder / FINAL, t.character, facts | cost)
-    names, owner = imitation.library.names, course.ledger.owner.tolist()
-    rows = [
-        {
-            "clip": names[c], "succeeded": bool(results.succeeded[k]), "frames": int(results.frames[k]),
-            "tracked": int(results.tracked[k]), "mpjpe_mm": round(float(results.mpjpe_mm[k]), 3),
-            "mpjpe_global_mm": round(float(results.global_mm[k]), 3), "primitive": owner[c] + 1,
-        }
-        for k, c in enumerate(results.clip.tolist())
-    ]  # fmt: skip
-    said = facts | cost | {
-        "version": __version__, "help_n": 0.0, "succ": results.rate, "clips": len(rows),
-        "mpjpe_global_mm": round(results.error_mm, 3),
-        "hardest": [names[c] for c in results.hardest(20)], "per_clip": rows,
-    }  # fmt: skip
-    write_atomic(course.folder / RESULT, json.dumps(said, indent=2, allow_nan=False).encode())
-    return results
-
-
-def to_json(config: Perpetual) -> dict[str, Any]:
-    """The settings as JSON data."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
-
-
-def from_json(data: Mapping[str, Any]) -> Perpetual:
-    """Settings from JSON data.
-
-    Raises:
-        PoiseError: they are of another version.
-    """
-    try:
-        return _filled(Perpetual(), data)
-    except (TypeError, KeyError, AttributeError) as problem:
-        raise PoiseError(
-            f"the run was made by another version of Poise ({problem})", hint="Train it again"
-        ) from None
-
-
-def _filled(default: Any, data: Mapping[str, Any]) -> Any:
-    """A dataclass of the default's type; its own dataclasses are filled likewise, lists are tuples."""
-    values = {
-        k: _filled(getattr(default, k), v) if isinstance(v, Mapping) else _tuples(v)
-        for k, v in data.items()
-    }
-    return type(default)(**values)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

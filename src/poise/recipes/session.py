@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,15 @@ import numpy as np
 from poise.body import BodyConfig
 from poise.env.budget import scale_in
 from poise.errors import PoiseError
-from poise.eval import Recording, RolloutSet, ScoreCard, run_episodes, score_rollouts, start_frames
+from poise.eval import (
+    Recording,
+    RolloutSet,
+    ScoreCard,
+    run_episodes,
+    run_in_batches,
+    score_rollouts,
+    start_frames,
+)
 from poise.learn import (
     LATEST,
     IterationStats,
@@ -177,7 +185,7 @@ def evaluate(
     """
     if isinstance(policy, PolicyBundle):
         policy = policy.copy().to(device)
-    config, (limit, scale) = imitation.config, help_left(imitation, meta, help_limit)
+    limit, scale = help_left(imitation, meta, help_limit)
     clip, start = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
     rollouts, recordings = run_episodes(
         lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device),
@@ -187,15 +195,41 @@ def evaluate(
         limit,
         limit,
     )
-    card = score_rollouts(
+    card = _score(rollouts, imitation, meta, rule)
+    return Evaluation(card, rollouts, recordings)
+
+
+def score(
+    imitation: Imitation,
+    policy: Policy,
+    meta: Mapping[str, Any],
+    rule: str = "phc",
+    help_limit: float | None = None,
+    device: str = "cpu",
+) -> ScoreCard:
+    """The score card of `evaluate`, without all frames of a large library in memory at once."""
+    if isinstance(policy, PolicyBundle):
+        policy = policy.copy().to(device)
+    limit, scale = help_left(imitation, meta, help_limit)
+    clip, start = start_frames(imitation.reference)
+    parts = run_in_batches(
+        lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device),
+        policy, imitation.reference, clip, start, limit, limit,
+    )  # fmt: skip
+    return _score(parts, imitation, meta, rule)
+
+
+def _score(
+    rollouts: RolloutSet | Iterable[RolloutSet], imitation: Imitation, meta: Mapping[str, Any], rule: str
+) -> ScoreCard:
+    return score_rollouts(
         rollouts,
         rule=rule,
-        method=config.method,
+        method=imitation.config.method,
         seconds=float(meta.get("seconds", 0.0)),
         samples=int(meta.get("samples", 0)),
-        seed=config.seed,
+        seed=imitation.config.seed,
     )
-    return Evaluation(card, rollouts, recordings)
 
 
 def learning_curve(folder: Path) -> dict[str, np.ndarray]:

@@ -143,4 +143,11 @@ def overall(score: dict[str, Any]) -> str:
 def sentence(score: dict[str, Any]) -> str:
     """The verdict line, e.g. "Tracks the whole clip from every start: yes (100 %) · joint error …"."""
     track, error, aid, _ = grades(score)
-    return f"{track.name} from every start: {track.value} · joint error {error.value} · help {aid.value}"
+    began = "its first frame" if _only_from_the_first(score) else "every start"
+    return f"{track.name} from {began}: {track.value} · joint error {error.value} · help {aid.value}"
+
+
+def _only_from_the_first(score: dict[str, Any]) -> bool:
+    """Whether there is one episode per clip, as of `poise track`; frame 0 is always among the starts."""
+    clips = score.get("per_clip") or ()
+    return bool(clips) and all(number(c.get("episodes")) == 1 for c in clips)

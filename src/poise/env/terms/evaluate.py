@@ -113,7 +113,9 @@ class Terms:
         self._weights = torch.tensor(shares).reshape(-1, 2).T.contiguous().to(device)
         # Which terms count near the reference and which far from it.
         counts = [[t.when != "far", t.when != "near"] for t in rewards]
-        self._near, self._far = torch.tensor(counts).reshape(-1, 2, 1).to(device).unbind(1)
+        self._near, self._far = (
+            torch.tensor(counts, dtype=torch.bool).reshape(-1, 2, 1).to(device).unbind(1)
+        )
         self._recorded: dict[str, TensorFunction] = {}
         self._pool: ThreadPoolExecutor | None = None
 

@@ -1,0 +1,195 @@
+"""The settings of a run of the perpetual controller, each ablation of the paper one switch of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from poise.body import BodyConfig
+from poise.errors import PoiseError
+from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
+from poise.sim import SimConfig
+
+
+@dataclass(frozen=True)
+class RecoveryPlan:
+    """How recovery is learned and judged.
+
+    share: of the whole training, what the recovery primitive has at least; of a single network it is
+    taken from the part without recovery. falls: different fallen characters to begin from.
+    trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
+    final_trials: with the finished policy. seconds: within which who is back is counted; the last one
+    decides. enough: share of all trials with which recovery is learned.
+    """
+
+    share: float = 0.15
+    falls: int = 512
+    trials: int = 32
+    final_trials: int = 100
+    seconds: tuple[float, ...] = (5.0, 10.0)
+    enough: float = 0.98
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share < 1 or not 0 < self.enough <= 1:
+            what = f"share must lie in (0, 1) and enough in (0, 1], got {self.share} and {self.enough}"
+            raise PoiseError(what, "RecoveryPlan")
+        if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
+            raise PoiseError("recovery needs falls, trials and seconds", "RecoveryPlan")
+
+
+@dataclass(frozen=True)
+class Perpetual:
+    """Settings of one run.
+
+    goal: what is told of the next frame, "rotations" and places or "keypoints", which are places alone.
+    shape: limb lengths and masses are observed, too. action: "absolute" as in the paper, or "additive"
+    to the reference's angles. faithful: where the paper and its code disagree about Eq. 2 and about
+    recovery.
+    energy: weight of the energy penalty in the code's form, 0 for none; by default that of the code's
+    composer, since with ten times as much falling early would pay, see `phc_reward.energy_term`.
+    style: the motion prior, None for none.
+    termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
+    "code". first: share of the episodes that begin on frame 0, as evaluations do.
+    recovery: fallen and far characters get up and come back, by a primitive of its own and in the
+    composer's training; `recovering` says how. Without, nobody learns it.
+    multiplicative: off, there is one network of a primitive's size and nothing that combines.
+    progressive: off, all primitives and the composer learn together from the beginning, on all clips.
+    single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
+    `ppo.policy_hidden` and a composer of `composer_hidden`.
+    max_primitives: no more than so many; fewer where nothing fails any more. That of recovery is one
+    more.
+    start: a primitive begins as a "copy" of the one before it, or "random". lateral: whether it sees the
+    hidden layers of the earlier ones. combine, weights: see `nets.Composer`.
+    composer_clone: the composer first imitates for each clip the primitive that learned it.
+    expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
+    frames of the library where that is None, see `perpetual_clone.clone_for`.
+    help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
+    has ended at the share `help_share` of the stage's time, or before by success.
+    residual_std: deviation of the noise on the residual action, in units of the limits.
+    shares: where in the training the first and the last primitive end at the latest; with recovery, of
+    what `recovering.share` leaves.
+    evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of the
+    control steps. mining, convergence: what fails is trained more; when a stage has learned what it can.
+    """
+
+    goal: Literal["rotations", "keypoints"] = "rotations"
+    shape: bool = False
+    action: Literal["absolute", "additive"] = "absolute"
+    faithful: Literal["paper", "code"] = "code"
+    energy: float = 0.00005
+    style: AmpConfig | None = field(default_factory=AmpConfig)
+    termination: Literal["relaxed", "all", "code"] = "relaxed"
+    first: float = 0.1
+    recovery: bool = True
+    recovering: RecoveryPlan = field(default_factory=RecoveryPlan)
+    multiplicative: bool = True
+    progressive: bool = True
+    single: bool = False
+    max_primitives: int = 3
+    start: Literal["copy", "random"] = "copy"
+    lateral: bool = False
+    combine: Literal["product", "means"] = "product"
+    weights: Literal["softmax", "softplus", "relu", "silu"] = "softmax"
+    single_hidden: tuple[int, ...] = (1024, 512, 512)
+    composer_hidden: tuple[int, ...] = (256, 128)
+    composer_clone: bool = True
+    expert: bool = True
+    help_start: float = 100.0
+    help_share: float = 0.8
+    residual_std: float = 0.3
+    shares: tuple[float, float] = (0.5, 0.8)
+    evaluate_every: int = 0
+    num_envs: int = 512
+    horizon: int = 300
+    seed: int = 0
+    mining: MiningConfig = field(default_factory=MiningConfig)
+    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
+    clone: CloneConfig | None = None
+    body: BodyConfig = field(default_factory=BodyConfig)
+    sim: SimConfig = field(default_factory=SimConfig)
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            std=0.02,
+            policy_lr=2e-5,
+            kl_target=0.05,
+            lr_range=(5e-6, 3e-4),
+            policy_hidden=(512, 256),
+        )
+    )
+
+    def __post_init__(self) -> None:
+        if self.max_primitives < 1:
+            raise PoiseError(f"there must be at least 1 primitive, got {self.max_primitives}")
+        first, last = self.shares
+        if not 0 < first <= last <= 1:
+            raise PoiseError(f"shares must rise within (0, 1], got {self.shares}", "Perpetual")
+        if self.recovery and last == 1:
+            what = "with recovery something must follow the last primitive, got shares up to 1"
+            raise PoiseError(what, "Perpetual")
+        if not 0 < self.help_share <= 1:
+            raise PoiseError(f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual")
+        if self.ppo.learn_std:
+            raise PoiseError("primitives keep their action noise", "Perpetual", "Set learn_std=False")
+        self._check_networks()
+
+    def _check_networks(self) -> None:
+        other = [n for n in ("multiplicative", "progressive") if not getattr(self, n)]
+        if len(other) + self.single > 1:
+            given = " and ".join([*(["single"] if self.single else []), *(f"no {n}" for n in other)])
+            what = f"only one of single, no multiplicative and no progressive can be, got {given}"
+            raise PoiseError(what, hint="Each of them is another network; leave one out")
+        if not self.progressive and self.combine != "product":
+            raise PoiseError(
+                "primitives that learn with their composer are combined as a product", "Perpetual",
+                "Set combine='product'",
+            )  # fmt: skip
+        if not self.progressive and self.max_primitives < 2:
+            raise PoiseError("a composer without progressive training needs at least 2 primitives")
+
+    @property
+    def method(self) -> str:
+        """What a score card calls it."""
+        kinds = {"single": self.single, "plain": not self.multiplicative, "joint": not self.progressive}
+        return "-".join(["perpetual", *(name for name, other in kinds.items() if other)])
+
+    @property
+    def help_limit(self) -> float:
+        """N and N m that are left at the end."""
+        return 0.0
+
+
+def to_json(config: Perpetual) -> dict[str, Any]:
+    """The settings as JSON data."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_json(data: Mapping[str, Any]) -> Perpetual:
+    """Settings from JSON data.
+
+    Raises:
+        PoiseError: they are of another version.
+    """
+    # The types of what may be left out; runs of before there was recovery did without.
+    types = replace(Perpetual(), clone=CloneConfig())
+    try:
+        return _filled(types, {"recovery": False} | dict(data))
+    except (TypeError, KeyError, AttributeError) as problem:
+        raise PoiseError(
+            f"the run was made by another version of Poise ({problem})", hint="Train it again"
+        ) from None
+
+
+def _filled(default: Any, data: Mapping[str, Any]) -> Any:
+    """A dataclass of the default's type; its own dataclasses are filled likewise, lists are tuples."""
+    values = {
+        k: _filled(getattr(default, k), v) if isinstance(v, Mapping) else _tuples(v)
+        for k, v in data.items()
+    }
+    return type(default)(**values)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value

@@ -1,0 +1,106 @@
+"""Evaluations of a stage, and whether it goes on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from poise.eval import RecoveryCard
+from poise.eval.recovery import KINDS
+from poise.learn import Decision, PolicyBundle
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual_config import Perpetual
+from poise.recipes.perpetual_eval import ClipResults, History, evaluate_clips
+from poise.recipes.perpetual_ledger import Ledger
+from poise.recipes.perpetual_next import staged
+from poise.recipes.perpetual_progress import Stage
+from poise.recipes.perpetual_recovery import back, try_recovery
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What an evaluation saw and says: every clip of the stage, trials of recovery, or both."""
+
+    decision: Decision
+    clips: ClipResults | None
+    recovery: RecoveryCard | None
+
+    def row(self) -> dict[str, float]:
+        """For the log."""
+        row: dict[str, float] = {}
+        if (r := self.clips) is not None:
+            row = {"eval/clips": len(r.clip), "eval/succeeded": int(r.succeeded.sum())}
+            row["eval/mpjpe_global_mm"] = r.error_mm
+        if self.recovery is not None:
+            won, tried = back(self.recovery)
+            row |= {"eval/trials": tried, "eval/recovered": won}
+        return row
+
+
+class Judge:
+    """Evaluates the policies of a run's stages and notes it in the ledger and the history."""
+
+    def __init__(
+        self, imitation: Imitation, ledger: Ledger, history: History, threads: int, device: str
+    ):
+        self.imitation, self.ledger, self.history = imitation, ledger, history
+        self.config: Perpetual = imitation.config
+        self.where = (threads, device)
+
+    def every(self, stage: Stage, samples: int) -> int:
+        """Iterations of so many control steps between evaluations of a stage."""
+        if self.config.evaluate_every:
+            return self.config.evaluate_every
+        steps, plan = 0.0, self.config.recovering
+        if stage.kind != "recovery":
+            steps += int(self.imitation.reference.length.cpu()[self.ledger.mining.member].sum())
+        if stage.recovers is not None:
+            steps += len(KINDS) * plan.trials * max(plan.seconds) * self.config.sim.control_hz
+        return max(25, round(10 * steps / samples))
+
+    def judge(
+        self, stage: Stage, policy: PolicyBundle, scale: float, over: bool, iteration: int
+    ) -> Judged:
+        """Evaluates the stage's clips, or trials of recovery, and decides.
+
+        A stage ends by what is done without help. scale: what is left of it. over: the stage's time is.
+        """
+        if stage.kind == "recovery":
+            return self._recovery(stage, policy, over)
+        clips, card = self._both(stage, policy, scale, iteration)
+        decision = self.ledger.decide(scale)
+        if over and decision == "go on":
+            decision = "next"
+        if decision == "next" and scale > 0:
+            clips, card = self._both(stage, policy, 0.0, iteration)
+            decision = "solved" if bool(clips.succeeded.all()) else "next"
+        if card is not None and decision == "solved" and not self._enough(card):
+            decision = "next"
+        return Judged(decision, clips, card)
+
+    def _recovery(self, stage: Stage, policy: PolicyBundle, over: bool) -> Judged:
+        """Getting up is learned late and all at once, so that only success ends the stage, or time."""
+        card = self.trials(stage, policy, self.config.recovering.trials)
+        self.ledger.record_trials(card, policy)
+        ended: Decision = "solved" if self._enough(card) else "next"
+        return Judged(ended if over or ended == "solved" else "go on", None, card)
+
+    def _both(
+        self, stage: Stage, policy: PolicyBundle, scale: float, iteration: int
+    ) -> tuple[ClipResults, RecoveryCard | None]:
+        own, clips = staged(self.imitation, stage), self.ledger.clips
+        results, card, recovered = evaluate_clips(own, policy, clips, scale, *self.where), None, 0.0
+        if stage.mixed:
+            card = self.trials(stage, policy, self.config.recovering.trials)
+            won, tried = back(card)
+            recovered = won / tried
+        self.ledger.record(results, policy, scale, recovered)
+        self.history.add(iteration, stage.name, scale * self.config.help_start, results)
+        return results, card
+
+    def trials(self, stage: Stage, policy: PolicyBundle, count: int) -> RecoveryCard:
+        """Trials of recovery in a stage that learns it."""
+        return try_recovery(staged(self.imitation, stage), policy, count, *self.where)
+
+    def _enough(self, card: RecoveryCard) -> bool:
+        won, tried = back(card)
+        return won >= self.config.recovering.enough * tried
