@@ -131,26 +131,23 @@ def held_out(
 ) -> tuple[ClipLibrary, list[str]]:
     """Clips of a folder on the run's skeleton that it did not learn from, and sentences on them.
 
-    patterns: subjects or regular expressions, see `perpetual_data.split`; without any, all that were
-    not learned.
+    patterns: subjects or regular expressions, see `perpetual_data.split`; without any, whatever was not
+    learned.
 
     Raises:
-        PoiseError: one of them was learned, by its name or by its motion, or none is left.
+        PoiseError: one that a pattern asks for was learned, or none is left.
     """
     config = LibraryConfig(leave_out=tuple(never))
     library, report = library_of(
         folder, run.tracker.example, run.imitation.config.sim.control_hz, config=config,
         body=run.imitation.config.body, cache=cache, tell=tell,
     )  # fmt: skip
-    learned = {c.name: c for c in run.imitation.library}
     clips = [c for c in library if not patterns or matches(tuple(patterns), c.name, subject_of(c.name))]
-    if not patterns:
-        clips = [c for c in clips if c.name not in learned]
-    for clip in clips:
-        twin = next((c for c in learned.values() if _same(c, clip)), None)
-        if clip.name in learned or twin is not None:
-            known = f"as '{twin.name}'" if twin is not None else "by that name"
-            raise PoiseError(f"'{clip.name}' was learned, {known}; it cannot be held out", folder)
+    seen = {c.name: twin for c in clips if (twin := _learned(run, c)) is not None}
+    if patterns and seen:
+        name, twin = next(iter(seen.items()))
+        raise PoiseError(f"'{name}' was learned, as '{twin}'; it cannot be held out", folder)
+    clips = [c for c in clips if c.name not in seen]
     if not clips:
         raise PoiseError("holds no clip that was held out of the training", folder)
     both = sorted({*subjects([c.name for c in clips])} & {*subjects(run.imitation.library.names)})
@@ -158,6 +155,14 @@ def held_out(
     if both:
         notes.append(f"Subjects with clips on both sides: {', '.join(both)}.")
     return ClipLibrary.of(clips), notes
+
+
+def _learned(run: Run, clip: Clip) -> str | None:
+    """Which clip of the training this one is, by its name or by its motion."""
+    library = run.imitation.library
+    if clip.name in library.names:
+        return clip.name
+    return next((c.name for c in library if _same(c, clip)), None)
 
 
 def _same(a: Clip, b: Clip) -> bool:
@@ -318,39 +323,46 @@ def noisy(run: Run, folders: Sequence[Path], tell: Tell) -> dict[str, Any]:
 
 
 def speed(run: Run, steps: int, count: int) -> dict[str, Any]:
-    """One character on one thread, and `count` in one world on two, without help."""
+    """One character on one thread, and `count` in one world on one and on two, without help."""
     return {
         "machine": machine(),
         "one": bench_latency(run.imitation, run.policy, steps),
-        "crowd": crowd(run, steps, count),
+        "crowds": [crowd(run, steps, *how) for how in ((1, 1), (count, 1), (count, 2))],
     }
 
 
-def crowd(run: Run, steps: int, count: int) -> dict[str, Any]:
-    """Control steps of `count` characters who share a world; policy and terms on two threads."""
+def crowd(run: Run, steps: int, count: int, threads: int) -> dict[str, Any]:
+    """Control steps of `count` characters who share a world, policy and terms on `threads` threads.
+
+    "ms" is the median of the time that passed, "cpu_ms" the mean of the processor's time of all threads,
+    which other programs on the machine hardly change.
+    """
     longest = max(run.imitation.library, key=lambda c: c.seconds)
-    task = side_by_side(library_task(run, ClipLibrary.of(longest)), count)
-    threads = torch.get_num_threads()
+    task = library_task(run, ClipLibrary.of(longest))
+    if count > 1:
+        task = side_by_side(task, count)
+    before = torch.get_num_threads()
     env = crowd_env(task, count)
-    torch.set_num_threads(2)
+    torch.set_num_threads(threads)
     clip, zero = torch.arange(count), torch.zeros(count, dtype=torch.long)
-    last, spent = int(task.reference.length[0]) - 1, []
+    last, spent, worked = int(task.reference.length[0]) - 1, [], 0.0
     try:
         obs = env.reset_to(clip, zero)
         for k in range(steps + 20):
             if int(env.frame[0]) >= last:
                 obs = env.reset_to(clip, zero)
-            start = time.perf_counter()
+            start, work = time.perf_counter(), time.process_time()
             obs = env.step(run.policy.act(obs)).obs
             # The first steps make buffers and recordings.
             if k >= 20:
                 spent.append(time.perf_counter() - start)
+                worked += time.process_time() - work
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)
         env.close()
-    middle = statistics.median(spent)
-    slow = sorted(spent)[int(0.95 * len(spent))]
+    middle, slow = statistics.median(spent), sorted(spent)[int(0.95 * len(spent))]
     return {
-        "characters": count, "threads": 2, "steps": steps, "ms": round(1e3 * middle, 3),
-        "ms_95": round(1e3 * slow, 3), "hz": round(1 / middle, 1), "hz_95": round(1 / slow, 1),
+        "characters": count, "threads": threads, "steps": steps, "ms": round(1e3 * middle, 3),
+        "ms_95": round(1e3 * slow, 3), "cpu_ms": round(1e3 * worked / steps, 3),
+        "hz": round(1 / middle, 1), "hz_95": round(1 / slow, 1),
     }  # fmt: skip
