@@ -108,9 +108,7 @@ def _value(row: Mapping[str, Any], key: str) -> float:
 
 def _stack(plots: Sequence[str], path: Path) -> None:
     """Plots of one size below each other as one file."""
-    parts = [
-        re.sub(r"<svg ", f'<svg y="{k * HIGH}" ', plot, count=1) for k, plot in enumerate(plots)
-    ]
+    parts = [re.sub(r"<svg ", f'<svg y="{k * HIGH}" ', plot, count=1) for k, plot in enumerate(plots)]
     high = HIGH * len(plots)
     text = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {high}" width="{WIDE}" '
@@ -121,7 +119,5 @@ def _stack(plots: Sequence[str], path: Path) -> None:
 
 def at_samples(curve: Mapping[str, Any], samples: int, clips: int) -> dict[str, Any] | None:
     """The latest evaluation of all `clips` at or before so many samples; None if there was none."""
-    rows = [
-        r for r in curve["evaluations"] if r["samples"] <= samples and r["clips"] == clips
-    ]
+    rows = [r for r in curve["evaluations"] if r["samples"] <= samples and r["clips"] == clips]
     return rows[-1] if rows else None

@@ -1,4 +1,4 @@
-"""What `perpetual.py` measures of one run: tables, recovery, composer against primitives, noise, speed."""
+"""What `perpetual.py` measures of one run: tables, recovery, composer and primitives, noise, speed."""
 
 from __future__ import annotations
 
@@ -246,7 +246,9 @@ def owners(run: Run, threads: int) -> dict[str, Any]:
     rows = []
     for c, name in enumerate(names):
         k = int(run.owner[c])
-        tried = [(bool(p.succeeded[c]), -round(float(p.global_mm[c]), 2), -j) for j, p in enumerate(parts)]
+        tried = [
+            (bool(p.succeeded[c]), -round(float(p.global_mm[c]), 2), -j) for j, p in enumerate(parts)
+        ]
         won, less, j = max(tried)
         own, all_ = parts[k], whole
         rows.append({

@@ -42,8 +42,8 @@ def about(a: Mapping[str, Any]) -> list[str]:
     more = f" and {len(a['subjects']) - 12} more" if len(a["subjects"]) > 12 else ""
     state = "finished" if a["finished"] else f"unfinished, help of up to {a['help_n']:.0f} N left"
     return [
-        f"{a['clips']} clips, {a['minutes_of_motion']:.1f} minutes ({who}{more}). Body: {b['bodies']} bodies, "
-        f"{b['hinges']} hinges, {b['mass_kg']:g} kg, {b['height_m']:g} m. {_network(a)}, "
+        f"{a['clips']} clips, {a['minutes_of_motion']:.1f} minutes ({who}{more}). Body: "
+        f"{b['bodies']} bodies, {b['hinges']} hinges, {b['mass_kg']:g} kg, {b['height_m']:g} m. {_network(a)}, "
         f"{a['policy_numbers']:,} numbers; {state}.",
         "",
         _lines(
@@ -106,12 +106,19 @@ def _table(part: Mapping[str, Any]) -> list[str]:
 
 
 def _recovery(part: Mapping[str, Any]) -> list[str]:
-    rows = [("start", "trials", "Succ-5s", "Succ-10s", "median s", "slowest s", "paper 5 s", "paper 10 s")]
+    rows = [
+        ("start", "trials", "Succ-5s", "Succ-10s", "median s", "slowest s", "paper 5 s", "paper 10 s")
+    ]
     told = {r.start: r for r in PHC_RECOVERY if r.method == "PHC"}
     card: Mapping[str, Any] = {}
     for kind, card in part["kinds"].items():
         p = told[kind]
-        ends = (_number(card["median"]), _number(card["slowest"]), f"{p.succ_5s:.1f}", f"{p.succ_10s:.1f}")
+        ends = (
+            _number(card["median"]),
+            _number(card["slowest"]),
+            f"{p.succ_5s:.1f}",
+            f"{p.succ_10s:.1f}",
+        )
         rows.append((kind, str(card["trials"]), *(_percent(x) for x in card["within"]), *ends))
     learned = (
         "Recovery was part of the training."
@@ -120,9 +127,9 @@ def _recovery(part: Mapping[str, Any]) -> list[str]:
     )
     return [
         "### Recovery", "", _lines(rows), "",
-        f"Reference: a body that {part['reference'].replace('standing', 'stands')}. Back: bodies on average "
-        f"within {card.get('near', 0.5):g} m for {card.get('held', 0.5):g} s; far is 3 m. The paper does not "
-        f"say what counts as back. {learned}",
+        f"Reference: a body that {part['reference'].replace('standing', 'stands')}. Back: bodies "
+        f"on average within {card.get('near', 0.5):g} m for {card.get('held', 0.5):g} s; far is 3 m. The "
+        f"paper does not say what counts as back. {learned}",
     ]  # fmt: skip
 
 
@@ -184,7 +191,8 @@ def _curves(part: Mapping[str, Any]) -> list[str]:
         last = own[-1] if own else None
         figures = (
             ("-",) * 4 if last is None else
-            (str(last["clips"]), str(last["succeeded"]), f"{last['error_mm']:.0f}", f"{last['help_n']:.0f}")
+            (*(str(last[k]) for k in ("clips", "succeeded")), f"{last['error_mm']:.0f}",
+             f"{last['help_n']:.0f}")
         )  # fmt: skip
         rows.append((stage["stage"], f"{stage['from_samples']:,}", str(len(own)), *figures))
     return ["### Learning", "", f"![Learning curves]({part['image']})", "", _lines(rows)]
@@ -196,8 +204,8 @@ def _skipped(part: str, parts: Mapping[str, Any]) -> str:
 
 def _machine(m: Mapping[str, Any]) -> str:
     return (
-        f"Measured on {m['cores']} cores ({m['machine']}), MuJoCo {m['mujoco']}, PyTorch {m['torch']}, load "
-        f"{m['load_before']} at the beginning."
+        f"Measured on {m['cores']} cores ({m['machine']}), MuJoCo {m['mujoco']}, PyTorch {m['torch']}, "
+        f"load {m['load_before']} at the beginning."
     )
 
 

@@ -53,8 +53,8 @@ def _summary(a: Mapping[str, Any]) -> list[str]:
     goal = "body places and rotations" if a["config"]["goal"] == "rotations" else "body places alone"
     state = "" if a["finished"] else " **The training is not finished.**"
     return [
-        f"A physics-based controller ({network}, {a['policy_numbers']:,} numbers) that tracks human motion "
-        f"from {goal}, one frame ahead, at {a['config']['sim']['control_hz']:g} Hz; policy "
+        f"A physics-based controller ({network}, {a['policy_numbers']:,} numbers) that tracks human "
+        f"motion from {goal}, one frame ahead, at {a['config']['sim']['control_hz']:g} Hz; policy "
         f"`{a['policy']}`.{state}",
         "",
         f"Body `{body['identity']}`: {body['bodies']} rigid bodies, {body['hinges']} hinges, "

@@ -68,8 +68,15 @@ def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
 
 
 def shape(frame: Frame, sizes: Tensor) -> Tensor:
-    """Sizes of the body `(N, S)`, the same in all worlds; see `shape_of`."""
-    return sizes.expand(frame.phase.shape[0], -1)
+    """Sizes of the body `(N, K)`; see `shape_of`.
+
+    sizes: `(K,)`, the same in all worlds, or `(S, K)` of each of the reference's bodies.
+    """
+    if sizes.ndim == 1:
+        return sizes.expand(frame.phase.shape[0], -1)
+    if frame.body is None:
+        raise ValueError("several bodies need to know which one a character has")
+    return sizes.index_select(0, frame.body.long())
 
 
 def shape_of(humanoid: Humanoid) -> Tensor:
