@@ -212,7 +212,7 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
     humanoid, config = run.imitation.humanoid, run.imitation.config
     still = np.tile(relaxed_stance(humanoid).qpos, (30, 1))
     reference = Reference(humanoid, [still], config.sim.control_hz, ["standing at ease"])
-    task = trial_task(run.imitation.task)
+    task = trial_task(run.imitation.task, falls=trials)
 
     def make(worlds: int) -> ImitationEnv:
         backend = make_backend(humanoid.model, worlds, threads=threads)

@@ -43,7 +43,8 @@ def about(a: Mapping[str, Any]) -> list[str]:
     state = "finished" if a["finished"] else f"unfinished, help of up to {a['help_n']:.0f} N left"
     return [
         f"{a['clips']} clips, {a['minutes_of_motion']:.1f} minutes ({who}{more}). Body: "
-        f"{b['bodies']} bodies, {b['hinges']} hinges, {b['mass_kg']:g} kg, {b['height_m']:g} m. {_network(a)}, "
+        f"{b['bodies']} bodies, {b['hinges']} hinges, {b['mass_kg']:g} kg, {b['height_m']:g} m. "
+        f"{_network(a)}, "
         f"{a['policy_numbers']:,} numbers; {state}.",
         "",
         _lines(
@@ -128,8 +129,8 @@ def _recovery(part: Mapping[str, Any]) -> list[str]:
     return [
         "### Recovery", "", _lines(rows), "",
         f"Reference: a body that {part['reference'].replace('standing', 'stands')}. Back: bodies "
-        f"on average within {card.get('near', 0.5):g} m for {card.get('held', 0.5):g} s; far is 3 m. The "
-        f"paper does not say what counts as back. {learned}",
+        f"on average within {card.get('near', 0.5):g} m for {card.get('held', 0.5):g} s; far is 3 m. "
+        f"The paper does not say what counts as back. {learned}",
     ]  # fmt: skip
 
 

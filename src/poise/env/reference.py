@@ -115,16 +115,17 @@ class Reference:
     def _poses(self, qpos: Tensor, qvel: Tensor, body: Tensor) -> Pose:
         """The poses of frames, of which each is one of the body `body (F,)`."""
         if len(self.bodies) == 1:
-            return self._pose(qpos, qvel, self.humanoid)
+            return self._pose(qpos, qvel)
         rows = [(body == k).nonzero().squeeze(-1) for k in range(len(self.bodies))]
         pairs = zip(rows, self.bodies, strict=True)
         parts = [self._pose(qpos[own], qvel[own], humanoid) for own, humanoid in pairs]
         back = torch.cat(rows).argsort()
         return Pose(*(torch.cat([getattr(p, name) for p in parts])[back] for name in FIELDS))
 
-    def _pose(self, qpos: Tensor, qvel: Tensor, humanoid: Humanoid) -> Pose:
-        own = humanoid is self.humanoid
-        body = (self.kinematics if own else Kinematics(humanoid.table))(qpos, qvel)
+    def _pose(self, qpos: Tensor, qvel: Tensor, humanoid: Humanoid | None = None) -> Pose:
+        """Poses of one body, by default the first."""
+        kinematics = self.kinematics if humanoid is None else Kinematics(humanoid.table)
+        body, humanoid = kinematics(qpos, qvel), humanoid or self.humanoid
         quat32 = qpos[:, 3:7].float()
         return Pose(
             qpos.float(),
