@@ -31,6 +31,7 @@ import torch
 from perpetual_curves import draw, draw_runs, read_curve
 from perpetual_measure import (
     Run,
+    by_body,
     held_out,
     library_task,
     noise,
@@ -84,7 +85,8 @@ class Measurement:
             task = library_task(run, clips)
             out["held_out"] = table(task, run.policy, "held-out clips", run.name, threads).to_dict()
         library = table(run.imitation, run.policy, "training library", run.name, threads)
-        return out | {"library": library.to_dict()}
+        bodies = by_body(run.imitation, library)
+        return out | {"library": library.to_dict()} | ({"bodies": bodies} if bodies else {})
 
     def _recovery(self) -> None:
         done = self.parts.setdefault("recovery", {"kinds": {}, "reference": "standing at ease"})

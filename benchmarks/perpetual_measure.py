@@ -204,6 +204,25 @@ def table(task: Imitation, policy: PolicyBundle, data: str, method: str, threads
     return field_table(rollouts(), method=method, data=data)
 
 
+def by_body(task: Imitation, whole: FieldTable) -> list[dict[str, Any]]:
+    """The same table body by body, where a library was learned on several; else nothing."""
+    reference, rows = task.reference, {c.clip: c for c in whole.clips}
+    if len(reference.bodies) == 1:
+        return []
+    out = []
+    for k, humanoid in enumerate(reference.bodies):
+        own = [rows[n] for n, b in zip(reference.names, reference.body.tolist(), strict=True) if b == k]
+        frames = sum(c.frames for c in own)
+        error = sum(c.frames * c.errors.g_mpjpe for c in own if c.frames)
+        out.append({
+            "body": k, "mass_kg": round(humanoid.mass, 1),
+            "height_m": round(humanoid.table.height_m, 2), "clips": len(own),
+            "succ": sum(not c.failed for c in own) / len(own) if own else None,
+            "g_mpjpe": round(error / frames, 2) if frames else None,
+        })  # fmt: skip
+    return out
+
+
 # --- (b) recovery -------------------------------------------------------------------------------
 
 

@@ -103,6 +103,12 @@ def _table(part: Mapping[str, Any]) -> list[str]:
     out = ["### Tracking, without help", "", markdown(tables, paper, WORST).rstrip(), "", DIFFERENCE]
     if part.get("held_out_subjects"):
         out += ["", f"Held out: {', '.join(part['held_out_subjects'])}."]
+    if part.get("bodies"):
+        rows = [("body", "kg", "m", "clips", "Succ %", "g-MPJPE mm")]
+        for b in part["bodies"]:
+            size = (f"{b['mass_kg']:g}", f"{b['height_m']:g}", str(b["clips"]))
+            rows.append((str(b["body"]), *size, _percent(b["succ"]), _number(b["g_mpjpe"])))
+        out += ["", "The library body by body:", "", _lines(rows)]
     return out + ([""] if part.get("notes") else []) + [f"- {n}" for n in part.get("notes", ())]
 
 

@@ -19,8 +19,9 @@ from poise.learn import ConvergenceConfig, Until
 from poise.motion import ClipLibrary, write_clip
 from poise.nets import Composer
 from poise.recipes import perpetual_run
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual import Perpetual, build, task
 from poise.recipes.perpetual_eval import evaluate_clips
+from poise.recipes.perpetual_shapes import BodyShapes, shaped
 from toy_policy import PPO, toy_run, walk
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -274,6 +275,24 @@ def test_runs_side_by_side(logged: Path, run: Path, composed: Path, tmp_path: Pa
     assert "the same samples to within 2 %" in text.side_by_side(runs)
 
 
+def test_a_library_on_several_bodies_is_told_body_by_body(run: Path) -> None:
+    opened = measure.Run.open("toy", run)
+    config = replace(opened.imitation.config, shape=True)
+    plain = build(opened.imitation.library, config)
+    several = shaped(plain, BodyShapes(count=2, seed=1), lambda body: task(config, body))
+    trainer = several.trainer(threads=1)
+    whole = measure.table(several, trainer.policy(), "library", "toy", 1)
+    trainer.env.close()
+    assert measure.by_body(opened.imitation, whole) == []
+    first, second = measure.by_body(several, whole)
+    assert (first["body"], first["clips"], second["clips"]) == (0, 2, 2)
+    assert first["mass_kg"] != second["mass_kg"]
+    both = (first["succ"] + second["succ"]) / 2
+    assert both == pytest.approx(whole.succ)
+    said = text._table({"library": whole.to_dict(), "bodies": [first, second]})
+    assert "The library body by body:" in said
+
+
 def test_the_mark_is_the_policys(run: Path) -> None:
     opened = measure.Run.open("toy", run)
     again = measure.Run.open("toy", run)
@@ -285,7 +304,7 @@ def test_the_mark_is_the_policys(run: Path) -> None:
 
 
 def test_a_command_without_what_is_this_machines_alone() -> None:
-    words = ["--runs", "a=/home/me/runs/a", "--clips", "/data/cmu", "--hold-out", "'cmu 02'"]
+    words = ["--runs", "a=/srv/runs/a", "--clips", "/srv/cmu", "--hold-out", "'cmu 02'"]
     assert script._plain(words) == "--runs a=a --clips cmu --hold-out 'cmu 02'"
     with pytest.raises(PoiseError, match="DATA=TEXT, got 'cmu'"):
         script._licences(["cmu"])

@@ -119,7 +119,8 @@ def _figures(parts: Mapping[str, Any]) -> list[str]:
             f"- {m['characters']} characters in one world on {m['threads']} threads: {m['hz']:.0f} Hz."
             for m in speed["crowds"] if m["characters"] > 1
         ]  # fmt: skip
-    missing = [p for p in ("table", "recovery", "noise", "noisy", "speed", "curves") if p not in parts]
+    asked = ("table", "recovery", "noise", "noisy", "speed", "curves")
+    missing = [p for p in asked if p not in parts or "skipped" in parts[p]]
     if missing:
         out += ["", f"Not measured: {', '.join(missing)}."]
     return out

@@ -48,7 +48,7 @@ class BodyShapes:
 
     count: S bodies, of which the first is the library's own; 1 is that alone. low, high: between which
     the sizes of the parts are drawn, 1 being the library's. per_clip: on how many bodies each clip is
-    done, the first among them; 0 for all. Memory goes with it: about 1.7 kB a frame. seed: of the draws.
+    done, the first among them; 0 for all. Memory goes with it: about 2 kB a frame. seed: of the draws.
     """
 
     count: int = 1
