@@ -24,6 +24,7 @@ from poise.eval.recovery import KINDS, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
 from poise.kin import relaxed_stance
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
+from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary
 from poise.motion.io import read_clip
 from poise.motion.io.raw import Options as Stated
@@ -258,8 +259,10 @@ def owners(run: Run, threads: int) -> dict[str, Any]:
     names, task = run.imitation.library.names, run.imitation
     parts: list[ClipResults] = []
     for k in range(_columns(run.policy)):
+        # As it was when its stage ended; that of recovery, which owns no clip, is only in the composer.
         path = run.folder / f"primitive-{k + 1}.safetensors"
-        own = load_policy(path, character=run.imitation.humanoid.identity)
+        kept = path.exists()
+        own = load_policy(path, task.humanoid.identity) if kept else primitive(run.policy, k)
         parts.append(evaluate_clips(task, own, threads=threads))
     whole = evaluate_clips(task, run.policy, threads=threads)
     rows = []

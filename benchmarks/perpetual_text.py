@@ -149,8 +149,9 @@ def _owners(part: Mapping[str, Any]) -> list[str]:
             ", ".join(s["lost"]) or "none", _number(s["worse_mm"]), _number(s["worse_best_mm"]),
         ))  # fmt: skip
     worse = [r for r in part["per_clip"] if r["best_succeeded"] and not r["composer_succeeded"]]
+    done = sum(r["best_succeeded"] for r in part["per_clip"])
     said = (
-        "The composer does every clip that some primitive does."
+        f"The composer does all of the {done} clips that some primitive does."
         if not worse
         else f"{len(worse)} clips that a primitive does, the composer does not: "
         + ", ".join(r["clip"] for r in worse[:WORST])

@@ -30,7 +30,7 @@ from poise.recipes.perpetual_stages import Course
 from poise.sim import CpuBackend
 
 SHAPES = BodyShapes(count=3, seed=2)
-CONFIG = tiny(max_primitives=1, expert=False, style=None)
+CONFIG = tiny(max_primitives=1, expert=False, style=None, shape=True)
 
 
 def make(shapes: BodyShapes = SHAPES, config: Perpetual = CONFIG) -> Imitation:
@@ -224,7 +224,7 @@ def test_one_body_changes_nothing() -> None:
 
 
 def test_a_policy_for_shapes_also_takes_the_observation_of_one(imitation: Imitation) -> None:
-    single = build(library(), replace(CONFIG, shape=True)).env(1, threads=1)
+    single = build(library(), CONFIG).env(1, threads=1)
     several = imitation.env(1, threads=1)
     assert single.num_obs == several.num_obs
     single.close(), several.close()
@@ -237,6 +237,9 @@ def test_bad_settings_and_bodies(imitation: Imitation) -> None:
         BodyShapes(low=1.2, high=1.1)
     with pytest.raises(PoiseError, match="on 1 to 3 bodies, got 4"):
         BodyShapes(count=3, per_clip=4)
+    blind = replace(CONFIG, shape=False)
+    with pytest.raises(PoiseError, match="must observe them"):
+        make(config=blind)
     base = imitation.humanoid
     fewer = replace(base.table, contact_exclusions=())
     with pytest.raises(PoiseError, match="differ in more than numbers"):

@@ -16,6 +16,7 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from poise.body import Humanoid
+from poise.env.terms.phc_obs import shape_of
 from poise.errors import PoiseError
 from poise.sim import Backend
 
@@ -46,7 +47,7 @@ def differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
 class Bodies:
     """The bodies of a backend's worlds.
 
-    worn: `(N,)`, which body each world has.
+    worn: `(N,)`, which body each world has. sizes: `(S, K)` float32 of the bodies, see `shape_of`.
 
     Args:
         backend: its model is that of the first body, which all worlds have at first.
@@ -61,7 +62,12 @@ class Bodies:
             name: torch.from_numpy(fields[name]).to(live).view(len(humanoids), *live.shape[1:])
             for name, live in self._live.items()
         }
+        self.sizes = torch.stack([shape_of(h) for h in humanoids]).to(backend.device)
         self.worn = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
+
+    def sizes_of(self, body: Tensor) -> Tensor:
+        """`(n, K)` sizes of bodies `body (n,)`, float32 as the packed reference has them."""
+        return self.sizes.index_select(0, body.long())
 
     def take(self, rows: Tensor | None, clip: Tensor) -> None:
         """Worlds `rows (n,)`, all for None, take the bodies of `clip (n,)`; write their states then."""

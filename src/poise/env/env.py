@@ -315,7 +315,7 @@ class ImitationEnv:
             seen.age,
             torque,
             point,
-            place.body,
+            self._bodies and self._bodies.sizes_of(place.body),
         )
 
     def _frame(self) -> Frame:

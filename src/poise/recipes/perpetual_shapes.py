@@ -19,12 +19,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from poise.body import BodyTable, Humanoid, make_humanoid
 from poise.body.scaling import Strength
 from poise.body.table import BodyRow, Geom
-from poise.env import ObsTerm, Reference, TaskConfig
+from poise.env import Reference, TaskConfig
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
 from poise.kin import clean_clip, clip_to_qpos, fit_ground, retarget
@@ -94,8 +93,11 @@ def shaped(
     keep their names on it and are called NAME@K on body K; cyclic clips go on in cycles there alone.
 
     Args:
-        make_task: makes the task for a humanoid; its observation of the shape becomes that of the
-            world's body, or is added behind the character's own state.
+        make_task: makes the task for a humanoid; its observation `phc_obs.shape` then is that
+            of each world's own body.
+
+    Raises:
+        PoiseError: the task does not observe the shape, or a clip that cannot be retargeted.
     """
     if shapes.count == 1:
         return imitation
@@ -124,7 +126,11 @@ def shaped(
         imitation.config.sim.apply(humanoid.model)
     library = ClipLibrary(tuple(clips), tuple(weights))
     reference = Reference(bodies[0], motions, rate, library.names, cyclic, bodies, body)
-    task = _seeing(make_task(bodies[0]), bodies)
+    task = make_task(bodies[0])
+    if not any(term.fn is phc_obs.shape for term in task.obs):
+        raise PoiseError(
+            f"a policy for {shapes.count} bodies must observe them", hint="Set Perpetual(shape=True)"
+        )
     return replace(imitation, library=library, humanoid=bodies[0], reference=reference, task=task)
 
 
@@ -220,12 +226,3 @@ def _widened(
         replace(t, rows=tuple(replace(r, ranges=e) for r, e in zip(t.rows, ends, strict=True)))
         for t in tables
     ]
-
-
-def _seeing(task: TaskConfig, bodies: Sequence[Humanoid]) -> TaskConfig:
-    """The task whose observation of the shape is that of the world's body."""
-    sizes = torch.stack([phc_obs.shape_of(h) for h in bodies])
-    term = ObsTerm("shape", phc_obs.shape, {"sizes": sizes})
-    if any(t.name == "shape" for t in task.obs):
-        return replace(task, obs=tuple(term if t.name == "shape" else t for t in task.obs))
-    return replace(task, obs=(task.obs[0], term, *task.obs[1:]))

@@ -68,15 +68,11 @@ def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
 
 
 def shape(frame: Frame, sizes: Tensor) -> Tensor:
-    """Sizes of the body `(N, K)`; see `shape_of`.
+    """Sizes of each character's body `(N, K)`; see `shape_of`.
 
-    sizes: `(K,)`, the same in all worlds, or `(S, K)` of each of the reference's bodies.
+    sizes: `(K,)` of all of them, where the reference has one body.
     """
-    if sizes.ndim == 1:
-        return sizes.expand(frame.phase.shape[0], -1)
-    if frame.body is None:
-        raise ValueError("several bodies need to know which one a character has")
-    return sizes.index_select(0, frame.body.long())
+    return sizes.expand(frame.phase.shape[0], -1) if frame.sizes is None else frame.sizes
 
 
 def shape_of(humanoid: Humanoid) -> Tensor:
