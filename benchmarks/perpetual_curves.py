@@ -25,7 +25,8 @@ HIGH, WIDE = 300, 560
 def read_curve(folder: Path) -> dict[str, Any]:
     """The evaluations in `log.csv`, one row each, and where each stage begins.
 
-    Rows: samples, seconds, stage, clips, succeeded, error_mm, help_n. "stages": (name, samples before).
+    Rows: samples, seconds, stage, clips, succeeded, error_mm, help_n. "recoveries": samples, stage's
+    name, trials, recovered. "stages": name, samples before it.
 
     Raises:
         PoiseError: no log, or one without an evaluation.
@@ -35,13 +36,17 @@ def read_curve(folder: Path) -> dict[str, Any]:
         raise PoiseError("there is no log of the training", path)
     with path.open(newline="", encoding="utf-8") as file:
         lines = [r for r in csv.DictReader(file) if None not in r.values()]
-    named, rows, stages, before = _stage_names(folder), [], [], 0
+    named, rows, back = _stage_names(folder), [], []
+    stages, before = [], 0
     for line in lines:
         number = int(float(line["stage"]))
         name = named.get(int(float(line["iteration"])), "")
         if not stages or stages[-1][0] != number:
             stages.append([number, before])
         before = int(float(line["samples"]))
+        if line.get("eval/trials"):
+            tried, came = (int(float(line[f"eval/{k}"])) for k in ("trials", "recovered"))
+            back.append({"samples": before, "stage": number, "trials": tried, "recovered": came})
         if not line.get("eval/clips"):
             continue
         rows.append({
@@ -51,11 +56,13 @@ def read_curve(folder: Path) -> dict[str, Any]:
             "error_mm": round(float(line["eval/mpjpe_global_mm"]), 2),
             "help_n": round(float(line.get("env/help/limit_n") or 0.0), 2),
         })  # fmt: skip
-    names = {r["stage"]: r["name"] for r in rows if r["name"]}
+    # A stage that learns recovery alone evaluates no clips.
+    names = {r["stage"]: "recovery" for r in back}
+    names |= {r["stage"]: r["name"] for r in rows if r["name"]}
     told = [{"stage": names.get(n, f"stage {n}"), "from_samples": at} for n, at in stages]
-    for row in rows:
+    for row in (*rows, *back):
         row["name"] = names.get(row["stage"], f"stage {row['stage']}")
-    return {"evaluations": rows, "stages": told, "samples": before}
+    return {"evaluations": rows, "recoveries": back, "stages": told, "samples": before}
 
 
 def _stage_names(folder: Path) -> dict[int, str]:
@@ -84,6 +91,9 @@ def draw(name: str, curve: Mapping[str, Any], path: Path) -> None:
                 at = float(stage["from_samples"])
                 label, x, y = series[k]
                 series[k] = (label, [at, at, math.nan, *x], [0.0, top, math.nan, *y])
+        if key == "success" and curve["recoveries"]:
+            shares = [100.0 * r["recovered"] / r["trials"] for r in curve["recoveries"]]
+            series.append(("back from falls", [r["samples"] for r in curve["recoveries"]], shares))
         plots.append(line_plot(series, f"{name}: {title}", "samples", unit, zero=True))
     _stack(plots, path)
 

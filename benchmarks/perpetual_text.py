@@ -64,7 +64,7 @@ def side_by_side(runs: Mapping[str, Any]) -> str:
     """One row per run, and how far each was after the samples of the shortest."""
     least = min(p["about"]["samples"] for p in runs.values())
     head = ["run", "samples", "time", "hardware", "library Succ %", "g-MPJPE mm", "held-out Succ %",
-            "g-MPJPE mm", "noisy Succ %", f"all clips at {least:,} samples", "fallen 10 s", "far 10 s",
+            "g-MPJPE mm", "noisy Succ %", "video noise x1 Succ %", f"all clips at {least:,} samples", "fallen 10 s", "far 10 s",
             "both 10 s"]  # fmt: skip
     rows = [head]
     for name, p in runs.items():
@@ -76,6 +76,8 @@ def side_by_side(runs: Mapping[str, Any]) -> str:
             cells += [_percent(t["succ"]) if t else "-", _number(error)]
         t = p.get("noisy", {}).get("table")
         cells.append(_percent(t["succ"]) if t else "-")
+        rungs = [r for r in p.get("noise", {}).get("rungs", ()) if r["name"] == "all x1"]
+        cells.append(_percent(rungs[0]["succ"]) if rungs else "-")
         seen = at_samples(p["curves"], least, a["clips"]) if "curves" in p else None
         cells.append(
             "-" if seen is None
@@ -193,7 +195,8 @@ def _speed(part: Mapping[str, Any]) -> list[str]:
 
 
 def _curves(part: Mapping[str, Any]) -> list[str]:
-    rows = [("stage", "begins at samples", "evaluations", "last: clips", "succeed", "mm", "help N")]
+    rows = [("stage", "begins at samples", "evaluations", "last: clips", "succeed", "mm", "help N",
+             "trials", "back")]  # fmt: skip
     for stage in part["stages"]:
         own = [r for r in part["evaluations"] if r["name"] == stage["stage"]]
         last = own[-1] if own else None
@@ -202,7 +205,10 @@ def _curves(part: Mapping[str, Any]) -> list[str]:
             (*(str(last[k]) for k in ("clips", "succeeded")), f"{last['error_mm']:.0f}",
              f"{last['help_n']:.0f}")
         )  # fmt: skip
-        rows.append((stage["stage"], f"{stage['from_samples']:,}", str(len(own)), *figures))
+        tried = [r for r in part["recoveries"] if r["name"] == stage["stage"]]
+        back = tuple(str(tried[-1][k]) for k in ("trials", "recovered")) if tried else ("-", "-")
+        made = str(max(len(own), len(tried)))
+        rows.append((stage["stage"], f"{stage['from_samples']:,}", made, *figures, *back))
     return ["### Learning", "", f"![Learning curves]({part['image']})", "", _lines(rows)]
 
 

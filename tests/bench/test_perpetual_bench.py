@@ -263,6 +263,23 @@ def test_curves_by_stage(logged: Path) -> None:
         curves.read_curve(logged / "nowhere")
 
 
+def test_a_stage_of_recovery_has_trials_in_place_of_clips(logged: Path) -> None:
+    text_ = LOG.replace("mpjpe_global_mm\n", "mpjpe_global_mm,eval/trials,eval/recovered\n")
+    lines = [x + ",," if k else x for k, x in enumerate(text_.splitlines())]
+    lines[4] = "4,400,2,0.0,4.0,,,,96,24"
+    lines[5] = "5,500,3,0.0,5.0,4,4,40.0,96,48"
+    (logged / "log.csv").write_text("\n".join(lines[:6]) + "\n")
+    curve = curves.read_curve(logged)
+    assert [s["stage"] for s in curve["stages"]] == ["primitive 1", "recovery", "composer"]
+    told = [(r["name"], r["trials"], r["recovered"]) for r in curve["recoveries"]]
+    assert told == [("recovery", 96, 24), ("composer", 96, 48)]
+    said = "\n".join(text._curves(curve | {"image": "x.svg"}))
+    assert "| recovery | 200 | 1 | - | - | - | - | 96 | 24 |" in said
+    assert "| composer | 400 | 1 | 4 | 4 | 40 | 0 | 96 | 48 |" in said
+    curves.draw("toy", curve, logged / "curve.svg")
+    assert "back from falls" in (logged / "curve.svg").read_text()
+
+
 def test_runs_side_by_side(logged: Path, run: Path, composed: Path, tmp_path: Path) -> None:
     out = tmp_path / "p.json"
     script.main(["--runs", f"one={run}", f"two={composed}", "--parts", "curves", "-o", str(out)])
