@@ -29,17 +29,15 @@ from typing import Any
 
 import torch
 from perpetual_curves import draw, draw_runs, read_curve
+from perpetual_live import noise, noisy, speed
 from perpetual_measure import (
     Run,
     by_body,
     held_out,
     library_task,
-    noise,
-    noisy,
     owners,
     recovery,
     recovery_kinds,
-    speed,
     subjects,
     table,
 )

@@ -64,9 +64,9 @@ def side_by_side(runs: Mapping[str, Any]) -> str:
     """One row per run, and how far each was after the samples of the shortest."""
     least = min(p["about"]["samples"] for p in runs.values())
     head = ["run", "samples", "time", "hardware", "library Succ %", "g-MPJPE mm", "held-out Succ %",
-            "g-MPJPE mm", "noisy Succ %", "video noise x1 Succ %", f"all clips at {least:,} samples", "fallen 10 s", "far 10 s",
-            "both 10 s"]  # fmt: skip
-    rows = [head]
+            "g-MPJPE mm", "noisy Succ %", "video noise x1 Succ %", f"all clips at {least:,} samples",
+            "fallen 10 s", "far 10 s", "both 10 s"]  # fmt: skip
+    rows: list[Sequence[str]] = [head]
     for name, p in runs.items():
         a = p["about"]
         cells = [name, f"{a['samples']:,}", _clock(a["seconds"]), a["hardware"]]
@@ -106,7 +106,7 @@ def _table(part: Mapping[str, Any]) -> list[str]:
     if part.get("held_out_subjects"):
         out += ["", f"Held out: {', '.join(part['held_out_subjects'])}."]
     if part.get("bodies"):
-        rows = [("body", "kg", "m", "clips", "Succ %", "g-MPJPE mm")]
+        rows: list[Sequence[str]] = [("body", "kg", "m", "clips", "Succ %", "g-MPJPE mm")]
         for b in part["bodies"]:
             size = (f"{b['mass_kg']:g}", f"{b['height_m']:g}", str(b["clips"]))
             rows.append((str(b["body"]), *size, _percent(b["succ"]), _number(b["g_mpjpe"])))
@@ -115,7 +115,7 @@ def _table(part: Mapping[str, Any]) -> list[str]:
 
 
 def _recovery(part: Mapping[str, Any]) -> list[str]:
-    rows = [
+    rows: list[Sequence[str]] = [
         ("start", "trials", "Succ-5s", "Succ-10s", "median s", "slowest s", "paper 5 s", "paper 10 s")
     ]
     told = {r.start: r for r in PHC_RECOVERY if r.method == "PHC"}
@@ -143,8 +143,10 @@ def _recovery(part: Mapping[str, Any]) -> list[str]:
 
 
 def _owners(part: Mapping[str, Any]) -> list[str]:
-    rows = [("primitive", "clips it owns", "it does", "best primitive does", "composer does", "lost",
-             "composer - owner mm", "composer - best mm")]  # fmt: skip
+    rows: list[Sequence[str]] = [
+        ("primitive", "clips it owns", "it does", "best primitive does", "composer does", "lost",
+         "composer - owner mm", "composer - best mm")
+    ]  # fmt: skip
     for s in part["summary"]:
         rows.append((
             str(s["primitive"]), *(str(s[k]) for k in ("clips", "owner", "best", "composer")),
@@ -163,8 +165,10 @@ def _owners(part: Mapping[str, Any]) -> list[str]:
 
 
 def _noise(part: Mapping[str, Any]) -> list[str]:
-    rows = [("noise", "clips", "Succ % of what came in", "Succ % of the true motion", "error mm",
-             "off the true motion mm", "noise mm")]  # fmt: skip
+    rows: list[Sequence[str]] = [
+        ("noise", "clips", "Succ % of what came in", "Succ % of the true motion", "error mm",
+         "off the true motion mm", "noise mm")
+    ]  # fmt: skip
     for r in part["rungs"]:
         figures = (_number(r[k]) for k in ("mpjpe_mm", "off_mm", "noise_mm"))
         shares = (_percent(r["succ"]), _percent(r["succ_clean"]))
@@ -183,7 +187,7 @@ def _noisy(part: Mapping[str, Any]) -> list[str]:
 def _speed(part: Mapping[str, Any]) -> list[str]:
     one = part["one"]
     phases = (f"{one['phases_ms'][k]:.2f}" for k in ("policy", "physics", "observation"))
-    rows = [
+    rows: list[Sequence[str]] = [
         ("", "ms a control step", "slowest 5 %", "processor ms", "policy", "physics", "observation"),
         ("1 character, 1 thread", f"{one['ms']:.2f}", f"{one['ms_95']:.2f}", "", *phases),
     ]  # fmt: skip
@@ -195,8 +199,10 @@ def _speed(part: Mapping[str, Any]) -> list[str]:
 
 
 def _curves(part: Mapping[str, Any]) -> list[str]:
-    rows = [("stage", "begins at samples", "evaluations", "last: clips", "succeed", "mm", "help N",
-             "trials", "back")]  # fmt: skip
+    rows: list[Sequence[str]] = [
+        ("stage", "begins at samples", "evaluations", "last: clips", "succeed", "mm", "help N",
+         "trials", "back")
+    ]  # fmt: skip
     for stage in part["stages"]:
         own = [r for r in part["evaluations"] if r["name"] == stage["stage"]]
         last = own[-1] if own else None
