@@ -14,8 +14,9 @@ from poise.body import make_humanoid
 from poise.env.bodies import differing
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
-from poise.kin import Kinematics
+from poise.kin import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
+from poise.motion import ClipLibrary, read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, build, task
 from poise.recipes.perpetual_eval import evaluate_clips
@@ -228,6 +229,18 @@ def test_a_policy_for_shapes_also_takes_the_observation_of_one(imitation: Imitat
     several = imitation.env(1, threads=1)
     assert single.num_obs == several.num_obs
     single.close(), several.close()
+
+
+def test_real_clips_stand_where_they_stood(data_dir: Path) -> None:
+    names = ("walk", "kick")
+    clips = [read_clip(data_dir / f"deepmimic_txt/humanoid3d_{n}.txt") for n in names]
+    base = build(ClipLibrary.of(clips), CONFIG).humanoid
+    there = scaled_skeleton(base.skeleton, base.table, (1.0, 1.0, 1.0, 0.85, 1.15))
+    for clip in clips:
+        target = clips[0].replaced(skeleton=there)
+        _, report = retarget(clip, target, example=clips[0])
+        assert report.slide_mm_s[1] == pytest.approx(report.slide_mm_s[0], abs=1.0)
+        assert report.direction_deg < 2.5
 
 
 def test_bad_settings_and_bodies(imitation: Imitation) -> None:
