@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from poise.control import Drive, Wrench
+from poise.env.bodies import Bodies
 from poise.env.budget import HelpBudget
 from poise.env.frame import Frame, Pose, placed
 from poise.env.means import Means
@@ -80,6 +81,12 @@ class ImitationEnv:
         self.recoveries: Recoveries | None = None
         if task.recovery is not None:
             self.recoveries = Recoveries(task.recovery, backend, reference.humanoid, task.pd, seed)
+        self._bodies: Bodies | None = None
+        if len(reference.bodies) > 1:
+            if self.recoveries is not None:
+                # Falls are those of the first body, which all worlds still have.
+                _ = self.recoveries.falls
+            self._bodies = Bodies(backend, reference.bodies, reference.body)
         self._no_table = torch.zeros(n, 0, device=here)
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         self._terms = Terms(*terms, placed(task.style, here), self._frame_of, self._ends, here, fused)
@@ -120,6 +127,7 @@ class ImitationEnv:
         self.frame.copy_(frame)
         self.age.zero_()
         self.action.zero_()
+        self._dress(None, self.clip)
         start = self.reference.coordinates(self.clip, self.frame)
         if self.recoveries is not None:
             kinds = torch.zeros(self.num_envs, dtype=torch.long) if kind is None else kind
@@ -135,6 +143,7 @@ class ImitationEnv:
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
+        self._dress(ids, pick)
         start, ahead = self.reference.coordinates(pick, frame), frame + 1
         if self.recoveries is not None:
             rng = self._starts.rng
@@ -143,6 +152,11 @@ class ImitationEnv:
         self.backend.write(ids, *start)
         self._goal_rows[ids] = self.reference.rows(pick, ahead)
         self._goal[ids] = self.reference.gather_packed(pick, ahead)
+
+    def _dress(self, rows: Tensor | None, clip: Tensor) -> None:
+        """Worlds `rows` take the bodies of `clip`, before their states are written."""
+        if self._bodies is not None:
+            self._bodies.take(rows, clip)
 
     def _aim(self) -> None:
         """Looks up where the reference goes from here."""
@@ -301,6 +315,7 @@ class ImitationEnv:
             seen.age,
             torque,
             point,
+            self._bodies and self._bodies.sizes_of(place.body),
         )
 
     def _frame(self) -> Frame:
@@ -364,6 +379,7 @@ class ImitationEnv:
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continues from `state()`: exactly, or from the same positions and velocities where the state
         is that of another kind of backend (another number format), such as the GPU's."""
+        self._dress(None, state["clip"].to(self.device))
         if state["sim"].dtype == self.backend.state.qpos.dtype:
             self.backend.restore(state["sim"])
         else:

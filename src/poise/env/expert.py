@@ -69,9 +69,11 @@ class Plan:
 def make_plan(reference: Reference, config: ExpertConfig | None = None) -> Plan:
     """Solves all steps of all clips; a last frame, which no step leaves, repeats the one before."""
     config = config or ExpertConfig()
-    model, parts = reference.humanoid.model, []
+    parts: list[InverseDynamics] = []
     torque, force, turn, lift = [], [], [], []
-    for start, length in zip(reference.start.tolist(), reference.length.tolist(), strict=True):
+    of_clips = (reference.start.tolist(), reference.length.tolist(), reference.body.tolist())
+    for start, length, body in zip(*of_clips, strict=True):
+        model = reference.bodies[body].model
         rows = slice(start, start + length)
         qpos, qvel = reference.qpos[rows].numpy(), reference.qvel[rows].numpy()
         steps = step_midpoints(model, qpos, qvel, reference.rate_hz)
@@ -100,8 +102,10 @@ class Expert:
         if isinstance(self._residual, ExplicitResidual) and 0 not in self._residual.bodies:
             raise PoiseError("the expert needs a residual force on the root, body row 0")
         model = env.backend.model
-        self._kp = torch.tensor(model.actuator_gainprm[:, 0]).float()
-        self._most = torch.tensor(model.actuator_forcerange[:, 1]).float()
+        # The servos of each body, `(S, n)`.
+        models = [model, *(h.model for h in env.reference.bodies[1:])]
+        self._kp = torch.stack([torch.tensor(m.actuator_gainprm[:, 0]).float() for m in models])
+        self._most = torch.stack([torch.tensor(m.actuator_forcerange[:, 1]).float() for m in models])
         mass, inertia = float(model.body_subtreemass[1]), _turning_inertia(env.reference)
         c = self.config
         self._gains = (
@@ -126,8 +130,10 @@ class Expert:
         now, then = reference.qpos[rows, 7:].float(), reference.qpos[ahead, 7:].float()
         plan, lead = self.plan, self.config.lead
         path = torch.lerp(now + plan.lift[rows], then + plan.lift[ahead], lead)
-        target = path + plan.torque[rows] / self._kp
-        q, reach = env.backend.state.qpos[:, 7:].float(), self._most / self._kp
+        body = reference.body[env.clip]
+        kp = self._kp[body]
+        target = path + plan.torque[rows] / kp
+        q, reach = env.backend.state.qpos[:, 7:].float(), self._most[body] / kp
         target = torch.maximum(torch.minimum(target, q + reach), q - reach)
         pd = env.task.pd
         base = then if pd.mode == "additive" else pd.offset

@@ -73,7 +73,8 @@ class Frame:
     min_height `(N,)` m: lowest root height of the reference clip.
     age `(N,)`: control steps since the episode began. torque `(N, n)` N m: what servos and damping
     exert on each hinge at the end of the step, where a term asks for it (`uses_torque`). point: how far
-    the character is, in a task with recovery; `ahead` is a point there for those who are far.
+    the character is, in a task with recovery; `ahead` is a point there for those who are far. sizes
+    `(N, K)`: of each character's body, see `phc_obs.shape_of`; None where all have one.
     """
 
     sim: Pose
@@ -86,6 +87,7 @@ class Frame:
     age: Tensor | None = None
     torque: Tensor | None = None
     point: PointGoal | None = None
+    sizes: Tensor | None = None
 
 
 TermFunction = Callable[..., Tensor]

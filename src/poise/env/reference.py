@@ -26,12 +26,13 @@ class Place(NamedTuple):
     """What a packed pose says of its clip, float32 `(N)` each.
 
     phase: place in the clip, 0 to 1. low: the clip's lowest root height, m. end: 1 on the last frame
-    of a clip that does not go on, else 0.
+    of a clip that does not go on, else 0. body: which of the reference's bodies the clip is for.
     """
 
     phase: Tensor
     low: Tensor
     end: Tensor
+    body: Tensor
 
 
 class Reference:
@@ -40,6 +41,10 @@ class Reference:
     Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. A cyclic clip, whose last frame is
     its first one cycle later (`poise.kin.close_cycle`), goes on with its first frames, moved and turned
     to where the last frame stands.
+
+    Args:
+        bodies: S bodies of the same joints and hinges, of which `humanoid` is the first; None: it alone.
+        body: `(C,)`, the body that each clip is for; by default the first.
     """
 
     def __init__(
@@ -49,6 +54,8 @@ class Reference:
         rate_hz: float,
         names: Sequence[str],
         cyclic: Sequence[bool] | None = None,
+        bodies: Sequence[Humanoid] | None = None,
+        body: Sequence[int] | None = None,
     ):
         cyclic = [False] * len(motions) if cyclic is None else list(cyclic)
         if not motions or len(names) != len(motions) or len(cyclic) != len(motions):
@@ -61,6 +68,10 @@ class Reference:
                     f"the clip has {len(q)} frames at {rate_hz:g} Hz and needs at least 3", name
                 )
         self.humanoid, self.rate_hz, self.names = humanoid, rate_hz, tuple(names)
+        self.bodies = (humanoid,) if bodies is None else tuple(bodies)
+        self.body = torch.tensor([0] * len(motions) if body is None else list(body))
+        if self.bodies[0] is not humanoid or len(self.body) != len(motions):
+            raise PoiseError("a reference needs a body for each clip, and its own as the first")
         self.kinematics = Kinematics(humanoid.table)
         self._fast = Kinematics(humanoid.table, torch.float32)
         qpos = torch.tensor(np.concatenate(motions), dtype=torch.float64)
@@ -80,10 +91,11 @@ class Reference:
         clip = torch.arange(len(motions)).repeat_interleave(self.length)
         frame = torch.arange(len(qpos)) - self.start[clip]
         end = (frame == self.length[clip] - 1) & ~self.cyclic[clip]
-        self._place = torch.stack((self.phase(clip, frame), self.min_height[clip], end.float()), 1)
+        told = self.phase(clip, frame), self.min_height[clip], end.float(), self.body[clip].float()
+        self._place = torch.stack(told, 1)
         #: The row that follows each row.
         self._after = self.rows(clip, frame + 1)
-        self.pose = self._pose(qpos, qvel)
+        self.pose = self._poses(qpos, qvel, self.body[clip])
         # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
         steps = [cycle_step(q) for q in motions]
         self.cycle_turn = torch.stack([turn for turn, _ in steps])
@@ -100,8 +112,20 @@ class Reference:
         there._fast = Kinematics(self.humanoid.table, torch.float32, device)
         return there
 
-    def _pose(self, qpos: Tensor, qvel: Tensor) -> Pose:
-        body = self.kinematics(qpos, qvel)
+    def _poses(self, qpos: Tensor, qvel: Tensor, body: Tensor) -> Pose:
+        """The poses of frames, of which each is one of the body `body (F,)`."""
+        if len(self.bodies) == 1:
+            return self._pose(qpos, qvel)
+        rows = [(body == k).nonzero().squeeze(-1) for k in range(len(self.bodies))]
+        pairs = zip(rows, self.bodies, strict=True)
+        parts = [self._pose(qpos[own], qvel[own], humanoid) for own, humanoid in pairs]
+        back = torch.cat(rows).argsort()
+        return Pose(*(torch.cat([getattr(p, name) for p in parts])[back] for name in FIELDS))
+
+    def _pose(self, qpos: Tensor, qvel: Tensor, humanoid: Humanoid | None = None) -> Pose:
+        """Poses of one body, by default the first."""
+        kinematics = self.kinematics if humanoid is None else Kinematics(humanoid.table)
+        body, humanoid = kinematics(qpos, qvel), humanoid or self.humanoid
         quat32 = qpos[:, 3:7].float()
         return Pose(
             qpos.float(),
@@ -110,17 +134,10 @@ class Reference:
             body.quat.float(),
             body.linvel.float(),
             body.angvel.float(),
-            self._com(body.pos, body.quat),
+            _com(humanoid, body.pos, body.quat),
             self.local(qpos.float()),
             heading_quat(quat32),
         )
-
-    def _com(self, pos: Tensor, quat: Tensor) -> Tensor:
-        model = self.humanoid.model
-        mass = torch.tensor(model.body_mass[1:])
-        inertial = torch.tensor(model.body_ipos[1:])
-        centre = pos + quat_rotate(quat, inertial.expand_as(pos))
-        return ((centre * mass[:, None]).sum(-2) / mass.sum()).float()
 
     def local(self, qpos: Tensor) -> Tensor:
         """`(N, J, 4)` wxyz local turns of hinged bodies."""
@@ -260,6 +277,15 @@ def _carried(pose: Pose, turn: Tensor, move: Tensor) -> Pose:
         pose.local,
         quat_mul(turn, pose.heading),
     )
+
+
+def _com(humanoid: Humanoid, pos: Tensor, quat: Tensor) -> Tensor:
+    """The centre of mass `(F, 3)` of a body's parts."""
+    model = humanoid.model
+    mass = torch.tensor(model.body_mass[1:])
+    inertial = torch.tensor(model.body_ipos[1:])
+    centre = pos + quat_rotate(quat, inertial.expand_as(pos))
+    return ((centre * mass[:, None]).sum(-2) / mass.sum()).float()
 
 
 def _pack(pose: Pose) -> Tensor:

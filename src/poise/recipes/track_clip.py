@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,7 +15,9 @@ from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.ground import GroundFit, clip_flights, fit_ground
 from poise.motion import Clip, Skeleton, resample
-from poise.recipes.track_policy import Tracker
+
+if TYPE_CHECKING:
+    from poise.recipes.track_policy import Tracker
 
 #: Bones that differ by less (m) are the same; files round their numbers.
 SAME_M = 1e-4

@@ -27,6 +27,7 @@ from poise.learn import PolicyBundle, load_checkpoint, save_checkpoint
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes import perpetual_run
+from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import RECIPE, Perpetual
 from poise.recipes.session import FINAL, RUN_FILE, trained_policy
 
@@ -100,13 +101,17 @@ def policy_of_run(folder: Path) -> Tracker:
             folder,
             "Give the run of poise train perpetual, or imitate the clip with poise imitate",
         )
-    imitation = perpetual_run.reopen(path.parent)
-    policy, said = trained_policy(path.parent, imitation)
+    return tracker_of(path.parent, perpetual_run.reopen(path.parent))
+
+
+def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
+    """The latest policy of a run in `folder`, whose task is built already."""
+    policy, said = trained_policy(folder, imitation)
     inner: Mapping[str, Any] = said.get("metadata", {})
     about = {
         "clips": list(imitation.library.names),
         "stage": inner.get("stage") or inner.get("course", {}).get("stage", {}).get("kind", ""),
-        "finished": (path.parent / FINAL).exists(),
+        "finished": (folder / FINAL).exists(),
         "samples": int(said.get("samples", 0)),
         "seconds": float(said.get("seconds", 0.0)),
         "help_n": float(said["help_limit"]),

@@ -68,8 +68,11 @@ def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
 
 
 def shape(frame: Frame, sizes: Tensor) -> Tensor:
-    """Sizes of the body `(N, S)`, the same in all worlds; see `shape_of`."""
-    return sizes.expand(frame.phase.shape[0], -1)
+    """Sizes of each character's body `(N, K)`; see `shape_of`.
+
+    sizes: `(K,)` of all of them, where the reference has one body.
+    """
+    return sizes.expand(frame.phase.shape[0], -1) if frame.sizes is None else frame.sizes
 
 
 def shape_of(humanoid: Humanoid) -> Tensor:

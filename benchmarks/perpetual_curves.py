@@ -1,0 +1,133 @@
+"""Learning curves of perpetual runs from their own files: success, help and error over samples."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from poise.errors import PoiseError
+from poise.view.svg import line_plot
+
+#: What a curve shows: its key, its title, its axis.
+PANELS = (
+    ("success", "Success of the stage's clips, with the help of that moment", "% of clips"),
+    ("help", "Residual force that is left", "N"),
+    ("error", "Global error of the stage's clips", "mm"),
+)
+#: Height of one panel, px; `view.svg` draws all plots in this size.
+HIGH, WIDE = 300, 560
+
+
+def read_curve(folder: Path) -> dict[str, Any]:
+    """The evaluations in `log.csv`, one row each, and where each stage begins.
+
+    Rows: samples, seconds, stage, clips, succeeded, error_mm, help_n. "recoveries": samples, stage's
+    name, trials, recovered. "stages": name, samples before it.
+
+    Raises:
+        PoiseError: no log, or one without an evaluation.
+    """
+    path = folder / "log.csv"
+    if not path.exists():
+        raise PoiseError("there is no log of the training", path)
+    with path.open(newline="", encoding="utf-8") as file:
+        lines = [r for r in csv.DictReader(file) if None not in r.values()]
+    named, rows, back = _stage_names(folder), [], []
+    stages, before = [], 0
+    for line in lines:
+        number = int(float(line["stage"]))
+        name = named.get(int(float(line["iteration"])), "")
+        if not stages or stages[-1][0] != number:
+            stages.append([number, before])
+        before = int(float(line["samples"]))
+        if line.get("eval/trials"):
+            tried, came = (int(float(line[f"eval/{k}"])) for k in ("trials", "recovered"))
+            back.append({"samples": before, "stage": number, "trials": tried, "recovered": came})
+        if not line.get("eval/clips"):
+            continue
+        rows.append({
+            "samples": before, "seconds": round(float(line["time/seconds"]), 1), "stage": number,
+            "name": name, "clips": int(float(line["eval/clips"])),
+            "succeeded": int(float(line["eval/succeeded"])),
+            "error_mm": round(float(line["eval/mpjpe_global_mm"]), 2),
+            "help_n": round(float(line.get("env/help/limit_n") or 0.0), 2),
+        })  # fmt: skip
+    # A stage that learns recovery alone evaluates no clips.
+    names = {r["stage"]: "recovery" for r in back}
+    names |= {r["stage"]: r["name"] for r in rows if r["name"]}
+    told = [{"stage": names.get(n, f"stage {n}"), "from_samples": at} for n, at in stages]
+    for row in (*rows, *back):
+        row["name"] = names.get(row["stage"], f"stage {row['stage']}")
+    return {"evaluations": rows, "recoveries": back, "stages": told, "samples": before}
+
+
+def _stage_names(folder: Path) -> dict[int, str]:
+    """The stage's name at each iteration with an evaluation, by `success.csv`."""
+    path = folder / "success.csv"
+    if not path.exists():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))[1:]
+    return {int(r[0]): r[1] for r in rows if len(r) > 1 and r[0].isdigit() and r[1] != "final"}
+
+
+def draw(name: str, curve: Mapping[str, Any], path: Path) -> None:
+    """One image of three panels, one colour per stage, a bar where each begins."""
+    plots = []
+    for key, title, unit in PANELS:
+        series, top = [], 0.0
+        for stage in curve["stages"]:
+            own = [r for r in curve["evaluations"] if r["name"] == stage["stage"]]
+            values = [_value(r, key) for r in own]
+            top = max([top, *(v for v in values if math.isfinite(v))])
+            series.append((stage["stage"], [r["samples"] for r in own], values))
+        # A stage begins with an upright stroke at the samples before it.
+        for k, stage in enumerate(curve["stages"]):
+            if k:
+                at = float(stage["from_samples"])
+                label, x, y = series[k]
+                series[k] = (label, [at, at, math.nan, *x], [0.0, top, math.nan, *y])
+        if key == "success" and curve["recoveries"]:
+            shares = [100.0 * r["recovered"] / r["trials"] for r in curve["recoveries"]]
+            series.append(("back from falls", [r["samples"] for r in curve["recoveries"]], shares))
+        plots.append(line_plot(series, f"{name}: {title}", "samples", unit, zero=True))
+    _stack(plots, path)
+
+
+def draw_runs(curves: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """The same panels with one colour per run."""
+    plots = []
+    for key, title, unit in PANELS:
+        series = [
+            (name, [r["samples"] for r in c["evaluations"]], [_value(r, key) for r in c["evaluations"]])
+            for name, c in curves.items()
+        ]
+        plots.append(line_plot(series, title, "samples", unit, zero=True))
+    _stack(plots, path)
+
+
+def _value(row: Mapping[str, Any], key: str) -> float:
+    if key == "success":
+        return 100.0 * row["succeeded"] / row["clips"]
+    return float(row["help_n"] if key == "help" else row["error_mm"])
+
+
+def _stack(plots: Sequence[str], path: Path) -> None:
+    """Plots of one size below each other as one file."""
+    parts = [re.sub(r"<svg ", f'<svg y="{k * HIGH}" ', plot, count=1) for k, plot in enumerate(plots)]
+    high = HIGH * len(plots)
+    text = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {high}" width="{WIDE}" '
+        f'height="{high}">' + "".join(parts) + "</svg>"
+    )
+    path.write_text(text, encoding="utf-8")
+
+
+def at_samples(curve: Mapping[str, Any], samples: int, clips: int) -> dict[str, Any] | None:
+    """The latest evaluation of all `clips` at or before so many samples; None if there was none."""
+    rows = [r for r in curve["evaluations"] if r["samples"] <= samples and r["clips"] == clips]
+    return rows[-1] if rows else None
