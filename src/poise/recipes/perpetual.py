@@ -39,6 +39,7 @@ from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual_config import Perpetual, RecoveryPlan
 from poise.recipes.perpetual_progress import Recovers
+from poise.recipes.perpetual_shapes import shaped
 
 __all__ = ["RECIPE", "Perpetual", "RecoveryPlan", "build", "stage_task", "task"]
 
@@ -52,7 +53,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
     """The task of a stage that learns to recover as PHC's recovery "primitive" or as its "composer", or
     tracks alone (None). The observations are of the same size in all of them."""
     own = (ObsTerm("self_state", phc_obs.self_state),)
-    if config.shape:
+    if config.shape or config.shapes.count > 1:
         own += (ObsTerm("shape", phc_obs.shape, {"sizes": phc_obs.shape_of(humanoid)}),)
     goal = phc_obs.rotation_goal if config.goal == "rotations" else phc_obs.keypoint_goal
     limit, gamma = config.help_start, config.ppo.gamma
@@ -113,7 +114,8 @@ def build(library: ClipLibrary | Clip, config: Perpetual | None = None) -> Imita
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
-    return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
+    built = Imitation(library, humanoid, reference, report, config, task(config, humanoid))
+    return shaped(built, config.shapes, lambda body: task(config, body))
 
 
 #: Expected figures: see `benchmarks/perpetual.md`.

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
+from poise.recipes.perpetual_shapes import BodyShapes
 from poise.sim import SimConfig
 
 
@@ -45,7 +46,8 @@ class Perpetual:
     """Settings of one run.
 
     goal: what is told of the next frame, "rotations" and places or "keypoints", which are places alone.
-    shape: limb lengths and masses are observed, too. action: "absolute" as in the paper, or "additive"
+    shape: limb lengths and masses are observed, too. shapes: the bodies that are learned; more than one
+    are observed in any case. action: "absolute" as in the paper, or "additive"
     to the reference's angles. faithful: where the paper and its code disagree about Eq. 2 and about
     recovery.
     energy: weight of the energy penalty in the code's form, 0 for none; by default that of the code's
@@ -77,6 +79,7 @@ class Perpetual:
 
     goal: Literal["rotations", "keypoints"] = "rotations"
     shape: bool = False
+    shapes: BodyShapes = field(default_factory=BodyShapes)
     action: Literal["absolute", "additive"] = "absolute"
     faithful: Literal["paper", "code"] = "code"
     energy: float = 0.00005
