@@ -1,0 +1,102 @@
+"""A dance with keyframes a second apart, filled by `poise inbetween`, beside the recording.
+
+    python benchmarks/inbetween_demo.py CLIP [--skeleton FILE.asf] [--every 1.0] [--model FILE]
+        [--picture docs/inbetween.svg] [--from 60]
+
+Writes `inbetween_demo.json`: how exactly keyframes are met, and how much feet slide in the recording, in
+the filled clip, and between the same keyframes interpolated. Draws the filled poses over the recorded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from poise.cli.inbetween import model_of
+from poise.metrics.plausibility import foot_slide
+from poise.motion import Clip, read_clip
+from poise.motion.windows import foot_joints
+from poise.spatial import quat_conj, quat_mul, quat_to_rotvec, slerp
+from poise.synth.inbetween import Filling, fill_keyframes
+from poise.view.poses import PoseRow, pose_rows
+
+
+def interpolated(clip: Clip, keys: list[int]) -> Clip:
+    """Straight lines and shortest arcs between keyframes."""
+    root, rot = (torch.tensor(x) for x in (clip.root_pos, clip.rot))
+    for a, b in pairwise(keys):
+        t = (torch.arange(a, b, dtype=root.dtype) - a) / (b - a)
+        shape = (b - a, *rot.shape[1:])
+        root[a:b] = root[a] + t[:, None] * (root[b] - root[a])
+        rot[a:b] = slerp(rot[a].expand(shape), rot[b].expand(shape), t[:, None].expand(shape[:2]))
+    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy())
+
+
+def slides(clip: Clip, low: np.ndarray, ground: float) -> dict[str, float]:
+    """mm/s: of the joints of the feet while they are near the floor, and where the source's stand."""
+    feet = torch.tensor(clip.positions()[:, list(foot_joints(clip.skeleton))])
+    moved = torch.diff(feet[..., :2], dim=0).norm(dim=-1) * clip.fps * 1000
+    stands = torch.tensor(low[1:] & low[:-1])
+    return {
+        "own_contacts_mm_per_s": float(foot_slide(feet, clip.fps, height=0.05, ground=ground)),
+        "recorded_contacts_mm_per_s": float(moved[stands].mean()),
+    }
+
+
+def main() -> None:
+    """Fills, measures, draws."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("clip", type=Path)
+    parser.add_argument("--skeleton", type=Path)
+    parser.add_argument("--model", type=Path)
+    parser.add_argument("--every", type=float, default=1.0, help="seconds between keyframes")
+    parser.add_argument("--from", dest="begin", type=float, default=1.0, help="seconds, first shown")
+    parser.add_argument("--picture", type=Path, default=Path("docs/inbetween.svg"))
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    clip = read_clip(args.clip, skeleton=args.skeleton)
+    step = round(args.every * clip.fps)
+    keys = list(range(0, clip.frames, step))
+    begun = time.perf_counter()
+    filled = fill_keyframes(clip, keys, model_of(args.model), Filling())
+    seconds = time.perf_counter() - begun
+    made, plain = filled.clips[0], interpolated(clip, keys)
+    apart = np.abs(made.positions()[keys] - clip.positions()[keys]).max() * 1000
+    turn = quat_mul(torch.tensor(made.rot[keys]), quat_conj(torch.tensor(clip.rot[keys])))
+    degrees = float(torch.rad2deg(quat_to_rotvec(turn).norm(dim=-1)).max())
+    # Where the recorded feet stand: near their own lowest places and slow.
+    feet = clip.positions()[:, list(foot_joints(clip.skeleton))]
+    ground = np.quantile(feet[..., 2], 0.02, axis=0)
+    speed = np.linalg.norm(np.diff(feet, axis=0, append=feet[-1:]), axis=-1) * clip.fps
+    low = (feet[..., 2] < ground + 0.03) & (speed < 0.35)
+    found = {
+        "clip": args.clip.name, "fps": clip.fps, "frames": clip.frames, "keyframes": len(keys),
+        "seconds_between": args.every, "keyframe_mm": float(apart), "keyframe_degrees": degrees,
+        "seconds": seconds, "warnings": list(filled.warnings),
+        "slide": {n: slides(c, low, float(ground.min())) for n, c in
+                  (("recorded", clip), ("filled", made), ("interpolated", plain))},
+        "mean_joint_error_mm": {
+            n: float(np.linalg.norm(c.positions() - clip.positions(), axis=-1).mean() * 1000)
+            for n, c in (("filled", made), ("interpolated", plain))
+        },
+    }  # fmt: skip
+    args.out.write_text(json.dumps(found, indent=2) + "\n")
+    print(json.dumps(found, indent=2))
+    first = keys[min(len(keys) - 3, round(args.begin / args.every))]
+    frames = [first + round(k * step / 6) for k in range(13)]
+    ghost = clip.positions()
+    rows = [PoseRow("interpolated, over the recording", plain.positions(), ghost),
+            PoseRow("poise inbetween, over the recording", made.positions(), ghost)]  # fmt: skip
+    pose_rows(f"{args.clip.name}: keyframes {args.every:g} s apart", rows, clip.skeleton.parents, frames,
+              clip.fps, keys, path=args.picture)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
