@@ -28,8 +28,8 @@ from poise.learn.model import save_model
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.motion.windows import pack_frames
 from poise.recipes.inbetween import Inbetween, Task, prepare, train
-from poise.recipes.library_clips import LibraryConfig
-from poise.recipes.perpetual_data import library_of
+from poise.recipes.library.clips import LibraryConfig
+from poise.recipes.library.folder import library_of
 from poise.synth.baselines import Baseline
 
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, uneven ground of 03, boxing and

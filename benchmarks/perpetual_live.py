@@ -18,11 +18,11 @@ from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
 from poise.motion.io.raw import Options as Stated
 from poise.motion.noise import robustness_levels
-from poise.recipes.library_files import motion_files_of
+from poise.recipes.library.files import motion_files_of
 from poise.recipes.track import TrackConfig, side_by_side, track
-from poise.recipes.track_crowd import crowd_env
-from poise.recipes.track_noise import robustness
-from poise.recipes.track_points import points_of
+from poise.recipes.track.crowd import crowd_env
+from poise.recipes.track.noise import robustness
+from poise.recipes.track.points import points_of
 
 
 def noise(

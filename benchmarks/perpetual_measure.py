@@ -25,16 +25,16 @@ from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary
 from poise.nets import Composer
-from poise.recipes import perpetual_run
 from poise.recipes.imitation import Imitation
-from poise.recipes.library_clips import LibraryConfig
-from poise.recipes.library_files import matches, subject_of
-from poise.recipes.perpetual_data import library_of
-from poise.recipes.perpetual_eval import ClipResults, evaluate_clips
+from poise.recipes.library.clips import LibraryConfig
+from poise.recipes.library.files import matches, subject_of
+from poise.recipes.library.folder import library_of
+from poise.recipes.perpetual import run as perpetual_run
+from poise.recipes.perpetual.eval import ClipResults, evaluate_clips
 from poise.recipes.session import RUN_FILE
 from poise.recipes.track import imitation_of
-from poise.recipes.track_clip import place
-from poise.recipes.track_policy import Tracker, tracker_of
+from poise.recipes.track.clip import place
+from poise.recipes.track.policy import Tracker, tracker_of
 from poise.sim import make_backend
 
 Tell = Callable[[str], None]

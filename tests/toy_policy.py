@@ -7,8 +7,8 @@ from pathlib import Path
 import poise
 from poise.learn import PPOConfig, Until
 from poise.motion import Clip, ClipLibrary, read_clip, trim
-from poise.recipes import perpetual_run
 from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual import run as perpetual_run
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 PPO = PPOConfig(

@@ -18,10 +18,10 @@ from poise.errors import PoiseError
 from poise.learn import ConvergenceConfig, Until
 from poise.motion import ClipLibrary, write_clip
 from poise.nets import Composer
-from poise.recipes import perpetual_run
 from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual_eval import evaluate_clips
-from poise.recipes.perpetual_shapes import BodyShapes, shaped
+from poise.recipes.perpetual import run as perpetual_run
+from poise.recipes.perpetual.eval import evaluate_clips
+from poise.recipes.perpetual.shapes import BodyShapes, shaped
 from toy_policy import PPO, toy_run, walk
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

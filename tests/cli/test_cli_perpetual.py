@@ -13,7 +13,7 @@ from poise.cli.main import main
 from poise.learn import CloneConfig, PPOConfig
 from poise.recipes import perpetual
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
-from poise.recipes.perpetual_run import reopen
+from poise.recipes.perpetual.run import reopen
 
 MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
 

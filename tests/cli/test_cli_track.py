@@ -12,7 +12,7 @@ from tiny_clips import deepmimic, put
 
 from poise.cli.main import main
 from poise.motion import read_clip, trim, write_clip
-from poise.recipes import track_policy
+from poise.recipes.track import policy as track_policy
 from toy_policy import WALK, toy_run
 
 

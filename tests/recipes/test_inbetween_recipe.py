@@ -14,7 +14,7 @@ from poise.errors import PoiseError
 from poise.learn.model import load_model, save_model
 from poise.motion import read_clip, write_bvh
 from poise.recipes.inbetween import FRAMES, Inbetween, begin, prepare, small, steps_in, train
-from poise.recipes.inbetween_data import library_bank, motion_files
+from poise.recipes.inbetween.data import library_bank, motion_files
 from toy_human import swing
 
 
@@ -54,7 +54,7 @@ def test_a_library_is_read_once(library: Path, tmp_path: Path, monkeypatch: pyte
     cache = tmp_path / "bank.safetensors"
     first, _ = library_bank(library, cache)
     reads: list[Path] = []
-    monkeypatch.setattr("poise.recipes.inbetween_data.read_clip", lambda p: reads.append(p))
+    monkeypatch.setattr("poise.recipes.inbetween.data.read_clip", lambda p: reads.append(p))
     again, _ = library_bank(library, cache)
     assert reads == [] and again.clips == first.clips and bool((again.rot == first.rot).all())
     assert again.facing == first.facing and again.feet == first.feet

@@ -12,10 +12,10 @@ from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.kin import fit_humanoid
 from poise.motion import Clip, shifted, write_clip
-from poise.recipes import perpetual_data
-from poise.recipes.library_files import content_key, is_motion, motion_files_of, subject_of
-from poise.recipes.library_report import LibraryReport
-from poise.recipes.perpetual_data import LibraryConfig, library_of, split
+from poise.recipes.library import folder as perpetual_data
+from poise.recipes.library.files import content_key, is_motion, motion_files_of, subject_of
+from poise.recipes.library.folder import LibraryConfig, library_of, split
+from poise.recipes.library.report import LibraryReport
 from toy_human import human, swing
 
 

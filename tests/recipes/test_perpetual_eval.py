@@ -14,11 +14,11 @@ from poise.eval import run_episodes, score_rollouts
 from poise.learn import PolicyBundle, compose, first_column, next_column
 from poise.learn.progressive import primitive
 from poise.metrics import mpjpe_global
-from poise.recipes import perpetual_eval
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
-from poise.recipes.perpetual_eval import ClipResults, History, evaluate_clips
-from poise.recipes.perpetual_next import Owners
+from poise.recipes.perpetual import eval as perpetual_eval
+from poise.recipes.perpetual.eval import ClipResults, History, evaluate_clips
+from poise.recipes.perpetual.next import Owners
 
 
 @pytest.fixture(scope="module")

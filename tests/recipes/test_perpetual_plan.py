@@ -8,10 +8,10 @@ from toy_library import tiny
 from poise.errors import PoiseError
 from poise.learn import CloneConfig
 from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual_clone import MOST, clone_for
-from poise.recipes.perpetual_config import RecoveryPlan
-from poise.recipes.perpetual_plan import ends, first_stage, following, is_over, lasts, most_help
-from poise.recipes.perpetual_progress import Stage
+from poise.recipes.perpetual.clone import MOST, clone_for
+from poise.recipes.perpetual.config import RecoveryPlan
+from poise.recipes.perpetual.plan import ends, first_stage, following, is_over, lasts, most_help
+from poise.recipes.perpetual.progress import Stage
 
 
 def path(config: Perpetual, fails: bool = True) -> list[str]:

@@ -18,16 +18,16 @@ from poise.learn.checkpoint import save_checkpoint
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary
 from poise.nets import Composer
-from poise.recipes import perpetual_recovery
 from poise.recipes.imitation import Imitation
+from poise.recipes.library.folder import library_of
 from poise.recipes.perpetual import Perpetual, build
-from poise.recipes.perpetual_data import library_of
-from poise.recipes.perpetual_eval import ClipResults
-from poise.recipes.perpetual_ledger import RECOVERY_WORTH, Ledger
-from poise.recipes.perpetual_next import Owners, staged
-from poise.recipes.perpetual_progress import Progress, Stage
-from poise.recipes.perpetual_recovery import back, check_falls, standing, try_recovery, walking_clips
-from poise.recipes.perpetual_run import begin, from_json, reopen, to_json, train
+from poise.recipes.perpetual import recovery as perpetual_recovery
+from poise.recipes.perpetual.eval import ClipResults
+from poise.recipes.perpetual.ledger import RECOVERY_WORTH, Ledger
+from poise.recipes.perpetual.next import Owners, staged
+from poise.recipes.perpetual.progress import Progress, Stage
+from poise.recipes.perpetual.recovery import back, check_falls, standing, try_recovery, walking_clips
+from poise.recipes.perpetual.run import begin, from_json, reopen, to_json, train
 from poise.recipes.session import FINAL, RUN_FILE
 from toy_human import swing
 

@@ -14,11 +14,12 @@ from toy_library import library, tiny
 from poise.errors import PoiseError
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary
-from poise.recipes import perpetual_next, perpetual_stages
 from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual_progress import Progress, Stage
-from poise.recipes.perpetual_run import begin, from_json, resume, to_json, train
-from poise.recipes.perpetual_stages import Course
+from poise.recipes.perpetual import next as perpetual_next
+from poise.recipes.perpetual import stages as perpetual_stages
+from poise.recipes.perpetual.progress import Progress, Stage
+from poise.recipes.perpetual.run import begin, from_json, resume, to_json, train
+from poise.recipes.perpetual.stages import Course
 from poise.recipes.session import FINAL
 
 ITERATIONS = 16

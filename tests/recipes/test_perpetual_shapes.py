@@ -19,15 +19,15 @@ from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual_eval import evaluate_clips
-from poise.recipes.perpetual_shapes import (
+from poise.recipes.perpetual.eval import evaluate_clips
+from poise.recipes.perpetual.shapes import (
     GROUPS,
     BodyShapes,
     scaled_skeleton,
     scaled_table,
     shaped,
 )
-from poise.recipes.perpetual_stages import Course
+from poise.recipes.perpetual.stages import Course
 from poise.sim import CpuBackend
 
 SHAPES = BodyShapes(count=3, seed=2)

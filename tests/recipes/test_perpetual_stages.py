@@ -14,12 +14,13 @@ from toy_library import Script, Scripted, library, tiny
 from poise.learn import LATEST, IterationStats, Trainer, Until, load_policy
 from poise.learn.progressive import primitive
 from poise.nets import Composer
-from poise.recipes import perpetual_judge, perpetual_result
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual_progress import Progress, share_of
-from poise.recipes.perpetual_run import PerpetualResult, begin, train
-from poise.recipes.perpetual_stages import Course
+from poise.recipes.perpetual import judge as perpetual_judge
+from poise.recipes.perpetual import result as perpetual_result
+from poise.recipes.perpetual.progress import Progress, share_of
+from poise.recipes.perpetual.run import PerpetualResult, begin, train
+from poise.recipes.perpetual.stages import Course
 from poise.recipes.session import FINAL
 from poise.sim import UnstableError
 

@@ -13,6 +13,7 @@ import torch
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
 from poise.eval import Recording, run_episodes, score_rollouts
+from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, read_clip
 from poise.motion.io.raw import Options
 from poise.motion.keypoints import Keypoints
@@ -20,9 +21,9 @@ from poise.motion.noise import Jitter
 from poise.motion.points.fit import JOINT_PLACES
 from poise.recipes.session import Evaluation
 from poise.recipes.track import Keeper, TrackConfig, check_fits, imitation_of, track, write
-from poise.recipes.track_clip import home, place, within_turns
-from poise.recipes.track_points import points_of
-from poise.recipes.track_policy import Tracker, policy_of_run
+from poise.recipes.track.clip import home, place
+from poise.recipes.track.points import points_of
+from poise.recipes.track.policy import Tracker, policy_of_run
 from toy_human import swing
 from toy_policy import toy_run, walk
 

@@ -11,9 +11,9 @@ import torch
 from poise.errors import PoiseError
 from poise.motion import read_clip
 from poise.recipes.track import TrackConfig, imitation_of, side_by_side, track, write
-from poise.recipes.track_clip import place
-from poise.recipes.track_crowd import APART_M, Crowd, crowd_model, places
-from poise.recipes.track_policy import Tracker, policy_of_run
+from poise.recipes.track.clip import place
+from poise.recipes.track.crowd import APART_M, Crowd, crowd_model, places
+from poise.recipes.track.policy import Tracker, policy_of_run
 from poise.sim import CpuBackend
 from toy_human import swing
 from toy_policy import toy_run, walk

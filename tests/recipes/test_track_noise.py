@@ -11,8 +11,8 @@ import pytest
 from poise.errors import PoiseError
 from poise.motion.noise import VIDEO, Drift, FrameLoss, Jitter, Level, robustness_levels
 from poise.recipes.track import TrackConfig, track
-from poise.recipes.track_noise import KINDS, Robustness, Rung, noise_of, robustness, write_robustness
-from poise.recipes.track_policy import Tracker, policy_of_run
+from poise.recipes.track.noise import KINDS, Robustness, Rung, noise_of, robustness, write_robustness
+from poise.recipes.track.policy import Tracker, policy_of_run
 from toy_policy import toy_run, walk
 
 

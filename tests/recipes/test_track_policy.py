@@ -13,8 +13,9 @@ import torch
 
 from poise.errors import PoiseError
 from poise.learn import load_checkpoint, save_checkpoint
-from poise.recipes import ResidualForce, session, track_policy
-from poise.recipes.track_policy import (
+from poise.recipes import ResidualForce, session
+from poise.recipes.track import policy as track_policy
+from poise.recipes.track.policy import (
     KIND,
     Tracker,
     export_policy,
@@ -121,7 +122,7 @@ def test_a_run_that_knows_one_clip_only(tmp_path: Path) -> None:
 
 def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
     from poise.motion import ClipLibrary
-    from poise.recipes import perpetual_run
+    from poise.recipes.perpetual import run as perpetual_run
 
     config = replace(tracker.config, seed=3)
     perpetual_run.begin(tmp_path, ClipLibrary.of([walk(0, 20), walk(20, 40, "b")]), config)
@@ -133,7 +134,7 @@ def test_a_program_that_only_tracks_starts_without_heavy_packages(file: Path) ->
     """They would take longer to import than the policy takes to open."""
     code = (
         "import sys; from pathlib import Path; import poise.recipes.track; "
-        "from poise.recipes.track_policy import open_tracker; open_tracker(Path(sys.argv[1])); "
+        "from poise.recipes.track.policy import open_tracker; open_tracker(Path(sys.argv[1])); "
         "print([m for m in ('sympy', 'scipy.optimize', 'scipy.spatial') if m in sys.modules])"
     )
     command = [sys.executable, "-c", code, str(file)]

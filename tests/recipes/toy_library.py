@@ -11,7 +11,7 @@ from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle,
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
-from poise.recipes.perpetual_eval import ClipResults
+from poise.recipes.perpetual.eval import ClipResults
 from toy_human import swing
 
 #: kind of policy, columns, share of the help, clip -> does it succeed?

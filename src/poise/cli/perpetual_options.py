@@ -13,8 +13,8 @@ from poise.cli.options import Body, Training
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
+    from poise.recipes.library.folder import LibraryConfig
     from poise.recipes.perpetual import Perpetual
-    from poise.recipes.perpetual_data import LibraryConfig
 
 Goal = Literal["rotations", "keypoints"]
 Termination = Literal["relaxed", "all", "code"]
@@ -47,7 +47,7 @@ class Primitives:
 
     def reading(self) -> LibraryConfig:
         """How the files of the library are read."""
-        from poise.recipes.perpetual_data import LibraryConfig
+        from poise.recipes.library.folder import LibraryConfig
 
         rates = []
         for pattern, text in _pairs("library-fps", self.library_fps, "cmu=120"):

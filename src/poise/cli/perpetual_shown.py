@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from poise.eval import RecoveryCard
     from poise.learn import Until
     from poise.recipes.imitation import Imitation
-    from poise.recipes.perpetual_progress import Progress
-    from poise.recipes.perpetual_run import PerpetualResult
+    from poise.recipes.perpetual.progress import Progress
+    from poise.recipes.perpetual.run import PerpetualResult
 
 #: Clips that are named in the end.
 NAMED = 10

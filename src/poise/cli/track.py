@@ -64,8 +64,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
     from poise.recipes.track import TrackConfig, track, write
-    from poise.recipes.track_noise import noise_of
-    from poise.recipes.track_policy import open_tracker, save_tracker
+    from poise.recipes.track.noise import noise_of
+    from poise.recipes.track.policy import open_tracker, save_tracker
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
@@ -111,7 +111,7 @@ def outcome(tracked: Tracked, reset: bool) -> str:
 def read(path: Path, reading: Reading) -> Clip | Keypoints:
     """The motion in a file; keypoints stay keypoints."""
     from poise.motion.io.raw import Options as Stated
-    from poise.recipes.track_points import points_of
+    from poise.recipes.track.points import points_of
 
     clip = reading.read(path)
     if reading.ground is not None or reading.swap_sides:

@@ -36,7 +36,7 @@ def run(
     training.check()
     config = settings(primitives, training, body)
     from poise.learn import Until
-    from poise.recipes.perpetual_run import train
+    from poise.recipes.perpetual.run import train
     from poise.recipes.session import RUN_FILE
 
     held = (out / RUN_FILE).exists()
@@ -69,7 +69,7 @@ def begin(
 
     held: the run folder holds a run already, which then is all that is read.
     """
-    from poise.recipes import perpetual_run
+    from poise.recipes.perpetual import run as perpetual_run
 
     assert network.library is not None
     hold_out, never = ((p,) if p else () for p in (network.hold_out, network.never))

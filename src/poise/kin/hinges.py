@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body import Humanoid
 from poise.kin.branches import euler_path
 from poise.spatial import euler_to_quat, quat_conj, quat_mul, quat_to_euler
 
@@ -68,4 +69,13 @@ def through_lock(angles: Tensor, order: str) -> Tensor:
     out = angles.clone()
     out[:, 0] = torch.where(locked, first, angles[:, 0])
     out[:, 2] = torch.where(locked, held, angles[:, 2])
+    return out
+
+
+def within_turns(qpos: np.ndarray, humanoid: Humanoid) -> np.ndarray:
+    """`qpos (T, 7 + n)` with each hinge shifted by whole turns as near to its range as can be."""
+    middle = humanoid.model.jnt_range[1:].mean(-1)
+    turns = np.round((qpos[:, 7:].mean(0) - middle) / (2 * np.pi))
+    out = qpos.copy()
+    out[:, 7:] -= 2 * np.pi * turns
     return out

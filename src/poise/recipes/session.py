@@ -109,7 +109,7 @@ def reopen(folder: Path) -> Imitation:
         )
     tensors, meta = load_checkpoint(path)
     if meta.get("recipe") == "perpetual":
-        from poise.recipes import perpetual_run
+        from poise.recipes.perpetual import run as perpetual_run
 
         return perpetual_run.reopen(folder)
     config = _from_json(meta["config"])

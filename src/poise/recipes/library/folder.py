@@ -17,8 +17,8 @@ from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.motion.pack import pack_clips, unpack_clips
-from poise.recipes.library_clips import LibraryConfig, place, read_all, shape_of, target_of
-from poise.recipes.library_files import (
+from poise.recipes.library.clips import LibraryConfig, place, read_all, shape_of, target_of
+from poise.recipes.library.files import (
     MotionFile,
     check_patterns,
     content_key,
@@ -26,7 +26,7 @@ from poise.recipes.library_files import (
     motion_files_of,
     subject_of,
 )
-from poise.recipes.library_report import ClipNote, LibraryReport
+from poise.recipes.library.report import ClipNote, LibraryReport
 
 __all__ = ["ClipNote", "LibraryConfig", "LibraryReport", "Split", "library_of", "split"]
 

@@ -27,9 +27,9 @@ from poise.env import Reference, TaskConfig
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
 from poise.kin import clean_clip, clip_to_qpos, fit_ground, retarget
+from poise.kin.hinges import within_turns
 from poise.motion import Clip, ClipLibrary, Skeleton, resample
 from poise.recipes.imitation import Imitation
-from poise.recipes.track_clip import within_turns
 
 #: Kinds of parts that are scaled together.
 GROUPS: tuple[tuple[str, ...], ...] = (

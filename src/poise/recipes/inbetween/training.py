@@ -41,7 +41,7 @@ from poise.motion.windows import FrameBank, step_contacts
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
-from poise.recipes.inbetween_data import library_bank
+from poise.recipes.inbetween.data import library_bank
 from poise.spatial import normalize
 
 RUN_FILE = "run.safetensors"

@@ -7,7 +7,7 @@ from typing import Literal
 
 from poise.eval import RecoveryCard
 from poise.learn import IterationStats, Until
-from poise.recipes.perpetual_eval import ClipResults
+from poise.recipes.perpetual.eval import ClipResults
 
 Kind = Literal["primitive", "single", "joint", "recovery", "composer"]
 #: As what a stage learns recovery, see `Recovery.phc`.

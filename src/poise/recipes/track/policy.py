@@ -26,9 +26,9 @@ from poise.errors import PoiseError
 from poise.learn import PolicyBundle, load_checkpoint, save_checkpoint
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
-from poise.recipes import perpetual_run
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import RECIPE, Perpetual
+from poise.recipes.perpetual import run as perpetual_run
 from poise.recipes.session import FINAL, RUN_FILE, trained_policy
 
 #: What a policy file calls itself, and the version of what stands in it.

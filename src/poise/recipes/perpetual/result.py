@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from poise import __version__
 from poise.eval import RecoveryCard
 from poise.learn.checkpoint import write_atomic
-from poise.recipes.perpetual_eval import FINAL_STAGE, ClipResults, evaluate_clips
-from poise.recipes.perpetual_next import staged
-from poise.recipes.perpetual_progress import Progress
-from poise.recipes.perpetual_recovery import try_recovery
-from poise.recipes.perpetual_stages import Course
+from poise.recipes.perpetual.eval import FINAL_STAGE, ClipResults, evaluate_clips
+from poise.recipes.perpetual.next import staged
+from poise.recipes.perpetual.progress import Progress
+from poise.recipes.perpetual.recovery import try_recovery
+from poise.recipes.perpetual.stages import Course
 from poise.recipes.session import FINAL
 
 RESULT = "result.json"

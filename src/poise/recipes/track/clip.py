@@ -14,10 +14,11 @@ from poise.kin import FitReport, Kinematics, RetargetConfig, RetargetReport, ret
 from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.ground import GroundFit, clip_flights, fit_ground
+from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, resample
 
 if TYPE_CHECKING:
-    from poise.recipes.track_policy import Tracker
+    from poise.recipes.track.policy import Tracker
 
 #: Bones that differ by less (m) are the same; files round their numbers.
 SAME_M = 1e-4
@@ -91,15 +92,6 @@ def same_skeleton(a: Skeleton, b: Skeleton) -> bool:
         return False
     # The root's offset is no bone.
     return bool(np.allclose(a.offsets[1:], b.offsets[1:], rtol=0.0, atol=SAME_M))
-
-
-def within_turns(qpos: np.ndarray, humanoid: Humanoid) -> np.ndarray:
-    """`qpos (T, 7 + n)` with each hinge shifted by whole turns as near to its range as can be."""
-    middle = humanoid.model.jnt_range[1:].mean(-1)
-    turns = np.round((qpos[:, 7:].mean(0) - middle) / (2 * np.pi))
-    out = qpos.copy()
-    out[:, 7:] -= 2 * np.pi * turns
-    return out
 
 
 def _report(

@@ -26,8 +26,8 @@ from poise.motion.io.trc import trc_points
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing
 from poise.motion.points import FitConfig, fit_clip
-from poise.recipes.track_clip import Placed
-from poise.recipes.track_policy import Tracker
+from poise.recipes.track.clip import Placed
+from poise.recipes.track.policy import Tracker
 
 #: How the points of a format are read, by the name that its clips bear.
 _POINTS: dict[str, Callable[[Path, Options], RawPoints]] = {

@@ -11,9 +11,9 @@ from torch import Tensor
 from poise.eval import RecoveryCard
 from poise.learn import Convergence, Decision, HardNegatives, PolicyBundle
 from poise.learn.state import State, prefixed, take, under
-from poise.recipes.perpetual_config import Perpetual
-from poise.recipes.perpetual_eval import ClipResults
-from poise.recipes.perpetual_recovery import back
+from poise.recipes.perpetual.config import Perpetual
+from poise.recipes.perpetual.eval import ClipResults
+from poise.recipes.perpetual.recovery import back
 
 #: Help that is less by this share of its limit is a gain of a stage.
 LESS_HELP = 0.01

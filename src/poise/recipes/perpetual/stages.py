@@ -31,15 +31,15 @@ from poise.learn.checkpoint import remove_partial
 from poise.learn.state import make_generator, prefixed, under
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual_eval import History
-from poise.recipes.perpetual_judge import Judge, Judged
-from poise.recipes.perpetual_ledger import Ledger
-from poise.recipes.perpetual_next import begin_first, begin_stage, critic_of, make_trainer, members_of
-from poise.recipes.perpetual_plan import ends, following, is_over, lasts, most_help, primitives
-from poise.recipes.perpetual_progress import Progress, Stage, share_of
-from poise.recipes.perpetual_recovery import check_falls
-from poise.recipes.perpetual_trouble import Troubles
+from poise.recipes.perpetual.eval import History
+from poise.recipes.perpetual.judge import Judge, Judged
+from poise.recipes.perpetual.ledger import Ledger
+from poise.recipes.perpetual.next import begin_first, begin_stage, critic_of, make_trainer, members_of
+from poise.recipes.perpetual.plan import ends, following, is_over, lasts, most_help, primitives
+from poise.recipes.perpetual.progress import Progress, Stage, share_of
+from poise.recipes.perpetual.recovery import check_falls
+from poise.recipes.perpetual.task import Perpetual
+from poise.recipes.perpetual.trouble import Troubles
 
 
 class Course:

@@ -8,12 +8,12 @@ from poise.eval import RecoveryCard
 from poise.eval.recovery import KINDS
 from poise.learn import Decision, PolicyBundle
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual_config import Perpetual
-from poise.recipes.perpetual_eval import ClipResults, History, evaluate_clips
-from poise.recipes.perpetual_ledger import Ledger
-from poise.recipes.perpetual_next import staged
-from poise.recipes.perpetual_progress import Stage
-from poise.recipes.perpetual_recovery import back, try_recovery
+from poise.recipes.perpetual.config import Perpetual
+from poise.recipes.perpetual.eval import ClipResults, History, evaluate_clips
+from poise.recipes.perpetual.ledger import Ledger
+from poise.recipes.perpetual.next import staged
+from poise.recipes.perpetual.progress import Stage
+from poise.recipes.perpetual.recovery import back, try_recovery
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from poise.motion import Clip
 from poise.motion.io import read_clip
 from poise.motion.io.formats import READERS
 from poise.motion.windows import LAFAN1_FACING, FrameBank, pack_frames, without_still_root
-from poise.recipes.perpetual_data import library_of
+from poise.recipes.library.folder import library_of
 
 
 def library_bank(

@@ -27,11 +27,11 @@ from poise.learn.state import State, make_generator
 from poise.nets import Composer
 from poise.recipes.expert import CLONE_WORLDS, Beginning, clone_expert, finetuning
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, stage_task
-from poise.recipes.perpetual_clone import clone_for
-from poise.recipes.perpetual_plan import first_stage
-from poise.recipes.perpetual_progress import Stage
-from poise.recipes.perpetual_recovery import walking_clips
+from poise.recipes.perpetual.clone import clone_for
+from poise.recipes.perpetual.plan import first_stage
+from poise.recipes.perpetual.progress import Stage
+from poise.recipes.perpetual.recovery import walking_clips
+from poise.recipes.perpetual.task import Perpetual, stage_task
 from poise.sim import UnstableError
 
 

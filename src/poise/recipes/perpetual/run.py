@@ -25,12 +25,12 @@ from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import RECIPE, Perpetual, build, task
-from poise.recipes.perpetual_config import from_json, to_json
-from poise.recipes.perpetual_data import LibraryConfig, library_of, split
-from poise.recipes.perpetual_progress import Progress, Stage
-from poise.recipes.perpetual_result import RESULT, PerpetualResult, finish
-from poise.recipes.perpetual_stages import Course
+from poise.recipes.library.folder import LibraryConfig, library_of, split
+from poise.recipes.perpetual.config import from_json, to_json
+from poise.recipes.perpetual.progress import Progress, Stage
+from poise.recipes.perpetual.result import RESULT, PerpetualResult, finish
+from poise.recipes.perpetual.stages import Course
+from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
 from poise.recipes.session import FINAL, RUN_FILE
 
 

@@ -18,8 +18,8 @@ from poise.eval import RecoveryCard, recovery_card, trial_task
 from poise.eval.episodes import Acts
 from poise.learn import PolicyBundle
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual_config import Perpetual
-from poise.recipes.perpetual_eval import bare_env
+from poise.recipes.perpetual.config import Perpetual
+from poise.recipes.perpetual.eval import bare_env
 from poise.sim import make_backend
 
 #: Of those of who stands, between which the root's height and above which the body's top stay in a clip

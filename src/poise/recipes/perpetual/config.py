@@ -11,7 +11,7 @@ from typing import Any, Literal
 from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
-from poise.recipes.perpetual_shapes import BodyShapes
+from poise.recipes.perpetual.shapes import BodyShapes
 from poise.sim import SimConfig
 
 

@@ -16,8 +16,8 @@ A network with recovery is the same one as before, which goes on learning.
 from __future__ import annotations
 
 from poise.learn import Decision
-from poise.recipes.perpetual_config import Perpetual
-from poise.recipes.perpetual_progress import Stage
+from poise.recipes.perpetual.config import Perpetual
+from poise.recipes.perpetual.progress import Stage
 
 #: Networks that learn all clips in one stage.
 WHOLE = ("single", "joint")

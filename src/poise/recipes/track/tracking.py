@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,20 +14,18 @@ from poise.errors import PoiseError
 from poise.eval import run_episodes, score_rollouts
 from poise.eval.episodes import Acts
 from poise.eval.judged import judge
-from poise.kin import hold_feet
 from poise.metrics import mpjpe_global, success_rule
 from poise.motion import Clip, ClipLibrary
-from poise.motion.io import home_suffix, write_clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Noise, perturb_clip, perturb_points
-from poise.recipes.deliver import Delivery, deliver, simulated_clip
+from poise.recipes.deliver import simulated_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
 from poise.recipes.session import Evaluation
-from poise.recipes.track_clip import Placed, home, place
-from poise.recipes.track_crowd import crowd_env, places
-from poise.recipes.track_points import fitted, follow
-from poise.recipes.track_policy import Tracker
+from poise.recipes.track.clip import Placed, place
+from poise.recipes.track.crowd import crowd_env, places
+from poise.recipes.track.points import fitted, follow
+from poise.recipes.track.policy import Tracker
 
 #: Characters in one world.
 MOST = 64
@@ -251,39 +248,6 @@ class Keeper:
             # Starting anew is for all worlds at once; the others go on from where they were.
             env.backend.restore(before[others], others)
         return torch.where(failed[:, None], fresh, obs)
-
-
-def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
-    """Writes the motion, `score.json` and `report.html` into `out`, see `deliver`.
-
-    The motion is on the skeleton that came in; where that is not the body's, the motion on the body's
-    skeleton lies beside it as `body.bvh`.
-
-    Args:
-        motion: the file of the motion, in place of one in `out`. hold: see `deliver`.
-    """
-    t, placed, count = tracked, tracked.placed, len(tracked.evaluation.recordings)
-    if count > 1 and motion is not None:
-        raise PoiseError(f"{count} characters make {count} files", motion, "Give a folder as -o")
-    other = placed.moved is not None
-    inner = out / "body.bvh" if other and count == 1 else motion
-    done = deliver(t.imitation, t.evaluation, out, {}, inner, hold)
-    if not other:
-        return done
-    paths: dict[str, Path] = {}
-    for k, (name, path) in enumerate(done.paths.items()):
-        if k >= count:
-            paths[name] = path
-            continue
-        made = t.motion(k)
-        if hold:
-            made = hold_feet(made, t.imitation.humanoid.table)[0]
-        back = home(made, placed, t.tracker).replaced(name=made.name)
-        body = name.replace("simulated", "body", 1)
-        paths[body] = path.rename(out / f"{body}{path.suffix}")
-        paths[name] = motion or out / f"{name}{home_suffix(back)}"
-        write_clip(back, paths[name])
-    return replace(done, paths=paths)
 
 
 def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoints | None]:

@@ -19,8 +19,8 @@ from poise.kin.flight import rate_sentence
 from poise.kin.ground import fit_heights
 from poise.kin.retarget import retarget
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
-from poise.recipes.library_files import MotionFile, check_patterns, matches
-from poise.recipes.library_report import ClipNote
+from poise.recipes.library.files import MotionFile, check_patterns, matches
+from poise.recipes.library.report import ClipNote
 
 _T = TypeVar("_T")
 #: Words in a file's name or folder that tell what no floor bears.

@@ -31,8 +31,8 @@ from poise.motion.noise import (
     robustness_levels,
     scaled,
 )
-from poise.recipes.track import TrackConfig, track
-from poise.recipes.track_policy import Tracker
+from poise.recipes.track.policy import Tracker
+from poise.recipes.track.tracking import TrackConfig, track
 from poise.view.svg import line_plot
 
 #: What noise may be called; "video" and "triangulated" are everything that goes wrong with one camera,

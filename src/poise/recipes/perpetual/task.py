@@ -7,13 +7,13 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | Sec. 3.1 s^p, s^g-rot, s^g-kp, beta               | `env.terms.phc_obs`                         |
 | Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.terms.phc_reward`, `learn.Amp`         |
 | Sec. 3.1 relaxed early termination                | `env.terms.done`, `all_but_feet`            |
-| Sec. 3.2 progressive primitives, hard negatives   | `recipes.perpetual_plan`, `perpetual_stages`|
+| Sec. 3.2 progressive primitives, hard negatives   | `recipes.perpetual.plan`, `perpetual_stages`|
 | Alg. 1, line 3: until success no longer improves  | `learn.converge`, `learn.mining`            |
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
 | fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_recovery`    |
-| P^(F) on Q^loco; interleaved recovery             | `recipes.perpetual_recovery`                |
+| P^(F) on Q^loco; interleaved recovery             | `recipes.perpetual.recovery`                |
 | Eqs. 5, 6 multiplicative composer                 | `learn.compose`, `nets.Composer`            |
-| Sec. 4, success: mean distance within 0.5 m       | `recipes.perpetual_eval`                    |
+| Sec. 4, success: mean distance within 0.5 m       | `recipes.perpetual.eval`                    |
 | the authors' later single network                 | `Perpetual.single`                          |
 
 What is ours: the first primitive begins as a clone of a scripted expert, a residual force helps at first
@@ -37,9 +37,9 @@ from poise.kin import fit_humanoid
 from poise.kin.own_body import on_own_body
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual_config import Perpetual, RecoveryPlan
-from poise.recipes.perpetual_progress import Recovers
-from poise.recipes.perpetual_shapes import shaped
+from poise.recipes.perpetual.config import Perpetual, RecoveryPlan
+from poise.recipes.perpetual.progress import Recovers
+from poise.recipes.perpetual.shapes import shaped
 
 __all__ = ["RECIPE", "Perpetual", "RecoveryPlan", "build", "stage_task", "task"]
 
