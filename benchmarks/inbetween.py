@@ -56,10 +56,11 @@ _ENOUGH = 128
 
 
 def settings(protocol: Protocol, net: str, seed: int, args: argparse.Namespace) -> Inbetween:
-    """One training: RTN transitions of 30 as published, or of all lengths with --rtn-longest."""
+    """One training, on mirrored clips too: RTN transitions of 30 as published, or of all lengths with
+    --rtn-longest."""
     config = Inbetween(
         net=net, name=protocol.name, final=protocol.final, validation=protocol.validation, seed=seed,
-        between=BetweenConfig(refine=args.refine),
+        mirror=True, between=BetweenConfig(refine=args.refine),
     )  # fmt: skip
     rtn = dataclasses.replace(config.rtn, longest=args.rtn_longest)
     return dataclasses.replace(config, rtn=rtn)

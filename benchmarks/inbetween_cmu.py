@@ -22,14 +22,10 @@ from pathlib import Path
 import torch
 
 from poise.eval.inbetween import evaluate
-from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import save_model
-from poise.motion.pack import pack_clips, unpack_clips
-from poise.motion.windows import pack_frames
-from poise.recipes.inbetween import Inbetween, Task, prepare, train
-from poise.recipes.library.clips import LibraryConfig
-from poise.recipes.library.folder import library_of
+from poise.recipes.inbetween import Inbetween, begin, train
+from poise.recipes.library import LibraryConfig
 from poise.synth.baselines import Baseline
 
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, uneven ground of 03, boxing and
@@ -39,23 +35,18 @@ SIXTY = (("(^|-)90_", 60.0), ("salsa", 60.0))
 LENGTHS = (5, 15, 30, 45)
 
 
-def task_of(args: argparse.Namespace) -> Task:
-    """The library on one skeleton, packed; read once."""
-    cache = args.work / "clips.safetensors"
-    if cache.exists():
-        tensors, meta = load_checkpoint(cache)
-        clips, notes = unpack_clips(tensors, meta["clips"]), tuple(meta["notes"])
-    else:
-        stated = tuple((a, b) for a, b in (pair.split("=", 1) for pair in args.skeleton))
-        config = LibraryConfig(rates=SIXTY, skeletons=stated, leave_out=tuple(args.never))
-        made, report = library_of(args.library, args.onto, 30.0, config=config, tell=print)
-        clips, notes = list(made.clips), tuple(report.sentences())
-        tensors, packed = pack_clips(clips)
-        save_checkpoint(cache, tensors, {"clips": packed, "notes": list(notes)})
-    config = Inbetween(name="CMU", validation=HELD_OUT, mirror=True, seed=args.seed)
-    training = dataclasses.replace(config.between_training, batch=args.batch)
-    config = dataclasses.replace(config, between_training=training)
-    return prepare(pack_frames(clips), config, notes)
+def config_of(args: argparse.Namespace) -> Inbetween:
+    """What is trained on what."""
+    stated = tuple((a, b) for a, b in (pair.split("=", 1) for pair in args.skeleton))
+    reading = LibraryConfig(rates=SIXTY, skeletons=stated, leave_out=tuple(args.never))
+    return Inbetween(
+        name="CMU",
+        validation=HELD_OUT,
+        mirror=True,
+        seed=args.seed,
+        onto=str(args.onto),
+        reading=reading,
+    )
 
 
 def shown(stats: BlockStats) -> None:
@@ -73,17 +64,16 @@ def main() -> None:
     parser.add_argument("--skeleton", nargs="*", default=[], help="REGEX=FILE.asf of AMC files")
     parser.add_argument("--never", nargs="*", default=[], help="REGEX of clips to leave out")
     parser.add_argument("--steps", type=int, default=6000)
-    parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--work", type=Path, default=Path("runs/inbetween-cmu"))
     parser.add_argument("--out", type=Path, default=Path("src/poise/data/inbetween/model.safetensors"))
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    task = task_of(args)
+    task, steps = begin(args.work, args.library, config_of(args), 0.0, args.steps, print)
     print(f"{len(task.bank.clips)} clips, {task.data.frames} frames with mirrored ones", flush=True)
     model, _, stopped = train(
-        task, args.work, args.steps, on_block=shown, tensorboard=False, validate_every=1000
+        task, args.work, steps, on_block=shown, tensorboard=False, validate_every=1000
     )
     if stopped:
         return

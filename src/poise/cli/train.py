@@ -10,6 +10,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import say
+from poise.cli.library_options import Library
 from poise.cli.options import Body, Reading, Training
 from poise.cli.perpetual_options import Primitives
 from poise.cli.train_inbetween import Network
@@ -44,6 +45,7 @@ class Options:
     ] = ()
     """Motion files."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    library: OmitArgPrefixes[Library] = field(default_factory=Library)
     network: OmitArgPrefixes[Network] = field(default_factory=Network)
     primitives: OmitArgPrefixes[Primitives] = field(default_factory=Primitives)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
@@ -83,18 +85,18 @@ def _perpetual(o: Options, argv: Sequence[str]) -> int:
     from poise.cli.train_perpetual import run as train
 
     _only_a_folder(o)
-    plain = Reading()
-    for name, instead in _OF_A_CLIP:
-        if getattr(o.reading, name) != getattr(plain, name):
-            raise PoiseError(f"--{name.replace('_', '-')} is about a single clip", hint=instead)
     again = command_line("train", argv)
-    return train(o.network, o.primitives, o.out, o.training, o.body, again)
+    return train(o.library, o.primitives, o.out, o.training, o.body, again)
 
 
 def _only_a_folder(o: Options) -> None:
     if o.clips:
         hint = f"Write poise train {o.recipe} --library DIR -o RUNDIR"
         raise PoiseError(f"the recipe {o.recipe} learns from a folder, not from single clips", hint=hint)
+    plain = Reading()
+    for name, instead in _OF_A_CLIP:
+        if getattr(o.reading, name) != getattr(plain, name):
+            raise PoiseError(f"--{name.replace('_', '-')} is about a single clip", hint=instead)
 
 
 def _inbetween(o: Options, argv: Sequence[str]) -> int:
@@ -104,4 +106,6 @@ def _inbetween(o: Options, argv: Sequence[str]) -> int:
     _only_a_folder(o)
     o.training.check()
     t, again = o.training, command_line("train", argv)
-    return train(o.network, o.out, t.minutes, t.seed, t.iterations, t.threads, t.resume, again)
+    return train(
+        o.library, o.network, o.out, t.minutes, t.seed, t.iterations, t.threads, t.resume, again
+    )

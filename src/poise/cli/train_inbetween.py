@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.progress import BarColumn, Progress, TextColumn
-from tyro.conf import arg
 
 from poise.cli.console import err, notes, say, tell
+from poise.cli.library_options import Library
 from poise.cli.output import claimed
 from poise.cli.progress import EVERY_S, clock
 from poise.errors import PoiseError
@@ -23,46 +23,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Network:
-    """What only the recipe inbetween knows, and the folder that others learn from, too."""
+    """What only the recipe inbetween knows."""
 
-    library: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """inbetween, perpetual: the folder of clips to learn from."""
     net: Literal["transformer", "rtn"] = "transformer"
     """inbetween: the network; rtn is that of Harvey et al. 2020."""
-    hold_out: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """Clips whose names match are not learned from; inbetween keeps them for validation figures."""
-    never: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """Clips whose names match are not used at all."""
+    mirror: bool = False
+    """inbetween: learn from every clip in a mirror, too."""
 
 
-def run(network: Network, out: Path, minutes: float, seed: int, steps: int | None, threads: int,
-        resume: bool, again: str) -> int:  # fmt: skip
+def run(library: Library, network: Network, out: Path, minutes: float, seed: int, steps: int | None,
+        threads: int, resume: bool, again: str) -> int:  # fmt: skip
     """Trains until the last step or Ctrl-C."""
     import os
-    import re
 
     import torch
 
     from poise.recipes.inbetween import RUN_FILE, Inbetween, begin, train
 
-    if network.library is None:
-        hint = "Write poise train inbetween --library DIR -o RUNDIR"
-        raise PoiseError("the recipe inbetween needs --library", hint=hint)
-    for name, text in (("hold-out", network.hold_out), ("never", network.never)):
-        try:
-            re.compile(text or "")
-        except re.error as problem:
-            raise PoiseError(f"--{name} is no regular expression ({problem})") from None
+    folder = library.folder("inbetween")
     if (out / RUN_FILE).exists() and not resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     torch.set_num_threads(threads or cores)
     config = Inbetween(
-        net=network.net, name=network.library.name, seed=seed, validation=network.hold_out,
-        final=network.never or r"(?!)",
+        net=network.net, name=folder.name, seed=seed, validation=library.hold_out,
+        final=library.never or r"(?!)", mirror=network.mirror,
+        onto=None if library.onto is None else str(library.onto.resolve()),
+        reading=library.reading() if library.library_fps or library.library_skeleton else None,
     )  # fmt: skip
     with claimed(out):
-        task, steps = begin(out, network.library, config, minutes, steps, tell)
+        task, steps = begin(out, folder, config, minutes, steps, tell)
     used = len(task.data.first) - 1
     say(f"{used} clips, {task.data.frames:,} frames to learn from; {steps:,} steps")
     notes(task.notes)

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from poise.cli import progress
 from poise.cli.beginning import beginning
 from poise.cli.console import launched, notes, say, tell
+from poise.cli.library_options import Library
 from poise.cli.options import Body, Training
 from poise.cli.output import claimed
 from poise.cli.perpetual_options import Primitives, settings
 from poise.cli.perpetual_shown import report, showing
 from poise.cli.progress import clock
-from poise.cli.train_inbetween import Network
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -24,12 +24,10 @@ if TYPE_CHECKING:
 
 
 def run(
-    network: Network, primitives: Primitives, out: Path, training: Training, body: Body, again: str
+    library: Library, primitives: Primitives, out: Path, training: Training, body: Body, again: str
 ) -> int:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
-    if network.library is None:
-        hint = "Write poise train perpetual --library DIR -o RUNDIR"
-        raise PoiseError("the recipe perpetual needs --library", hint=hint)
+    library.folder("perpetual")
     if launched() and int(os.environ["WORLD_SIZE"]) > 1:
         hint = "Start it without torchrun; --threads and --device take all of one machine"
         raise PoiseError("the recipe perpetual trains in one process", hint=hint)
@@ -42,7 +40,7 @@ def run(
     held = (out / RUN_FILE).exists()
     if held and not training.resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
-    imitation = begin(network, primitives, out, config, training, held)
+    imitation = begin(library, primitives, out, config, training, held)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result = training, None
     with contextlib.suppress(KeyboardInterrupt), showing(until) as show:
@@ -58,7 +56,7 @@ def run(
 
 
 def begin(
-    network: Network,
+    library: Library,
     primitives: Primitives,
     out: Path,
     config: Perpetual,
@@ -71,17 +69,17 @@ def begin(
     """
     from poise.recipes.perpetual import run as perpetual_run
 
-    assert network.library is not None
-    hold_out, never = ((p,) if p else () for p in (network.hold_out, network.never))
-    source = ", without ".join((str(network.library.resolve()), *hold_out, *never))
-    source = ", ".join((source, *primitives.source()))
+    folder = library.folder("perpetual")
+    hold_out, never = ((p,) if p else () for p in (library.hold_out, library.never))
+    source = ", without ".join((str(folder.resolve()), *hold_out, *never))
+    source = ", ".join((source, *library.source()))
     if held:
         with progress.working("opening the run"):
             return perpetual_run.resume(out, config, source, training.device)
     if training.resume:
         tell(f"There was no run in {out}; a new one starts.")
-    where = (primitives.onto, primitives.reading())
-    clips, said = perpetual_run.clips_of(network.library, config.body, hold_out, never, tell, *where)
+    where = (library.onto, library.reading())
+    clips, said = perpetual_run.clips_of(folder, config.body, hold_out, never, tell, *where)
     say(f"{len(clips)} clips, {clock(clips.seconds)}")
     notes(said)
     with claimed(out), progress.working("making the body"):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from poise.motion import Clip
 from poise.motion.io import read_clip
 from poise.motion.io.formats import READERS
 from poise.motion.windows import LAFAN1_FACING, FrameBank, pack_frames, without_still_root
-from poise.recipes.library.folder import library_of
+from poise.recipes.library import LibraryConfig, library_of
 
 
 def library_bank(
@@ -24,30 +26,34 @@ def library_bank(
     fps: float = 30.0,
     tell: Callable[[str], None] = lambda _: None,
     onto: str | None = None,
+    reading: LibraryConfig | None = None,
 ) -> tuple[FrameBank, tuple[str, ...]]:
     """All motion files under a folder (or one file) that share the most common skeleton.
 
     Files that cannot be read and clips of other skeletons are left out, each with a sentence in the
-    notes. With `onto`, a motion file, all clips are retargeted onto its skeleton instead. The bank is
-    written to `cache` and taken from there while the files stay as they are.
+    notes. With `onto`, a motion file, or with `reading`, all clips are brought onto one skeleton, see
+    `library_of`. The bank is written to `cache` and taken from there while the files stay as they are.
 
     Raises:
         PoiseError: no file could be used.
     """
     files = motion_files(library)
+    how = None
+    if onto is not None or reading is not None:
+        how = json.loads(json.dumps([onto, reading and asdict(reading)]))
     key = [[str(f.relative_to(library.parent)), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
     if cache.exists():
         tensors, meta = load_checkpoint(cache)
-        if (meta.get("key"), meta.get("fps"), meta.get("onto")) == (key, fps, onto):
+        if (meta.get("key"), meta.get("fps"), meta.get("how")) == (key, fps, how):
             return _bank(tensors, meta), tuple(meta["notes"])
-    if onto is None:
+    if how is None:
         common, notes = of_one_skeleton(*read_all(files, tell))
     else:
-        made, report = library_of(library, Path(onto), fps, tell=tell)
+        made, report = library_of(library, onto, fps, config=reading, tell=tell)
         common, notes = list(made.clips), tuple(report.sentences())
     bank = pack_frames(common, fps, LAFAN1_FACING if _is_lafan1(common[0]) else None)
     tensors, meta = _packed(bank)
-    save_checkpoint(cache, tensors, {**meta, "key": key, "notes": list(notes), "fps": fps, "onto": onto})
+    save_checkpoint(cache, tensors, {**meta, "key": key, "notes": list(notes), "fps": fps, "how": how})
     return bank, notes
 
 

@@ -42,6 +42,7 @@ from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
 from poise.recipes.inbetween.data import library_bank
+from poise.recipes.library import LibraryConfig
 from poise.spatial import normalize
 
 RUN_FILE = "run.safetensors"
@@ -56,8 +57,9 @@ class Inbetween:
     apart (see `eval.inbetween.Protocol`); final clips are never read by training or choices.
     contacts: whose labels the network learns. ema: of the averaged weights that are used.
     mirror: whether it learns from every clip in a mirror, too.
-    onto: a motion file on whose skeleton all clips are brought by `perpetual_data.library_of`, which
-    also cuts what cannot be done alone on a floor; by default clips of the most common one are taken.
+    onto: a motion file on whose skeleton all clips are brought by `library_of`, which also cuts what
+    nobody can do alone on a floor. reading: how it reads them; given alone, all come onto the skeleton
+    that most seconds are on. By default clips of the most common skeleton are taken as they are.
     """
 
     net: Literal["transformer", "rtn"] = "transformer"
@@ -70,6 +72,7 @@ class Inbetween:
     ema: float = 0.999
     mirror: bool = False
     onto: str | None = None
+    reading: LibraryConfig | None = None
     between: BetweenConfig = field(default_factory=BetweenConfig)
     between_training: BetweenTraining = field(default_factory=BetweenTraining)
     rtn: RTNConfig = field(default_factory=RTNConfig)
@@ -181,7 +184,8 @@ def begin(
             hint = "Resume it as it is or choose another folder"
             raise PoiseError("the folder holds a run with other settings", folder, hint)
         steps = int(meta["steps"])
-    bank, notes = library_bank(library, folder / FRAMES, config.fps, tell, config.onto)
+    how = (config.onto, config.reading)
+    bank, notes = library_bank(library, folder / FRAMES, config.fps, tell, *how)
     task = prepare(bank, config, notes)
     steps = steps or steps_in(task, minutes)
     if not run.exists():
