@@ -57,6 +57,24 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an untrained in-betweening network for the embedded walk."""
+    from poise.learn.model import MODEL, InbetweenModel, make_net, save_model
+    from poise.motion import read_clip
+    from poise.motion.windows import pack_frames
+    from poise.nets.transition import Layout
+    from toy_windows import SMALL
+
+    bank = pack_frames([read_clip(WALK)])
+    made = make_net("transformer", Layout(bank.parents, bank.feet, bank.facing), SMALL, 0)
+    made.calibrate(*(x[None].float() for x in (bank.root, bank.rot)), bank.offsets.float())
+    folder = tmp_path_factory.mktemp("net")
+    model = InbetweenModel("transformer", made, bank.names, bank.offsets[0].float(), 30.0, 60)
+    save_model(folder / MODEL, model)
+    return folder
+
+
 @pytest.mark.parametrize(("page", "index"), SNIPPETS, ids=lambda x: getattr(x, "name", str(x)))
 def test_python_snippets_run(
     page: Path,
@@ -72,6 +90,8 @@ def test_python_snippets_run(
         shutil.copy(_example_clip(request), tmp_path / name)
     if "policy.safetensors" in code:
         shutil.copytree(request.getfixturevalue("policy"), tmp_path, dirs_exist_ok=True)
+    if 'Path("net")' in code:
+        shutil.copytree(request.getfixturevalue("net"), tmp_path / "net")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
     if "deliver(" in code:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.console import notes, say, tell
 from poise.cli.options import Reading
 from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.motion import Clip
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class Options:
     out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
     """The motion file to write; its suffix names the format (.bvh)."""
     model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """A trained network: a run folder of poise train inbetween, or a model file."""
+    """A trained network: a run folder of poise train inbetween, or a model file; by default the one that
+    comes with Poise."""
     samples: Annotated[int, arg(metavar="N")] = 1
     """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others are variants."""
     foot_lock: bool = True
@@ -34,6 +38,8 @@ class Options:
     """Iterations of test-time adaptation for each gap."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the variants."""
+    picture: Annotated[Path | None, arg(metavar="FILE.svg", help_behavior_hint="")] = None
+    """Also draw the poses, keyframes black, over the clip that came in."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
@@ -62,8 +68,24 @@ def run(options: Options, argv: Sequence[str]) -> int:
         path = o.out if o.samples == 1 else o.out.with_name(f"{o.out.stem}-{k}{o.out.suffix}")
         write_clip(made, path)
         say(f"{path}: {made.frames} frames at {made.fps:.5g} fps, keyframes {o.keyframes}")
+    if o.picture is not None:
+        draw(clip, filled.clips, keys, o.picture)
     notes(clip.skeleton.source.notes)
     return 0
+
+
+def draw(clip: Clip, made: Sequence[Clip], keys: Sequence[int], path: Path) -> None:
+    """Up to four of the clips made, at 13 moments from the first keyframe to the last."""
+    import numpy as np
+
+    from poise.view import PoseRow, pose_rows
+
+    frames = np.unique(np.linspace(keys[0], keys[-1], 13).round().astype(int)).tolist()
+    ghost = clip.positions()
+    rows = [PoseRow(c.name, c.positions(), ghost) for c in made[:4]]
+    title = f"{clip.name}: {len(keys)} keyframes"
+    pose_rows(title, rows, clip.skeleton.parents, frames, clip.fps, keys, path=path)
+    say(str(path))
 
 
 def frames_of(text: str) -> tuple[int, ...]:
