@@ -11,6 +11,7 @@ import pytest
 
 from poise.errors import PoiseError
 from poise.view import PoseRow, pose_rows
+from poise.view.poses import _busiest
 from toy_human import swing
 
 
@@ -47,3 +48,11 @@ def test_poses_that_do_not_fit_are_refused() -> None:
     with pytest.raises(PoiseError, match="joints"):
         pose_rows("t", [PoseRow("other", pos[:, :5])], swing(1.0).skeleton.parents, [0, 1], 30.0)
     assert np.isfinite(pos).all()
+
+
+def test_a_walk_is_seen_from_beside_and_goes_to_the_right() -> None:
+    # Its arms swing a little across, so that the line is not quite that of the path.
+    pos = swing(2.0, speed=1.0).positions()
+    assert abs(_busiest(pos)) < 0.3
+    back = pos * [-1.0, -1.0, 1.0]
+    assert abs(abs(_busiest(back)) - np.pi) < 0.3

@@ -42,7 +42,7 @@ def pose_rows(
     frames: Sequence[int],
     fps: float,
     keys: Sequence[int] = (),
-    side: float = 0.0,
+    side: float | None = None,
     path: Path | str | None = None,
 ) -> str:
     """Rows of figures seen from the side, Z up; figures of `keys` are drawn in the ink's colour.
@@ -51,7 +51,8 @@ def pose_rows(
     at one moment is seen apart.
 
     Args:
-        frames: the moments shown. side: rad, azimuth of the direction that points right.
+        frames: the moments shown. side: rad, azimuth of the direction that points right; by default the
+            one along which the first row's joints move most about its root, as seen from beside a walk.
         path: also writes the SVG there.
 
     Raises:
@@ -63,6 +64,8 @@ def pose_rows(
                 raise PoiseError(
                     f"'{row.name}' has not the {len(parents)} joints or {max(frames)} frames"
                 )
+    if side is None:
+        side = _busiest(rows[0].pos if rows[0].ghost is None else rows[0].ghost)
     right = np.array([np.cos(side), np.sin(side), 0.0])
     width = 2 * _LEFT + _STEP * (len(frames) - 1)
     height = _TOP + len(rows) * (_SIZE + _GAP) + 14
@@ -98,3 +101,14 @@ def pose_rows(
                 seconds = f"{(frame - frames[0]) / fps:.2g} s"
                 out.append(f'<text x="{x:g}" y="{floor + 18:g}" text-anchor="middle">{seconds}</text>')
     return _write("".join([*out, "</svg>"]), path)
+
+
+def _busiest(pos: np.ndarray) -> float:
+    """Azimuth, rad, of the level line along which joints `(T, J, 3)` move most about the root."""
+    about = (pos - pos[:, :1])[..., :2]
+    moved = (about - about.mean(0)).reshape(-1, 2)
+    line = np.linalg.eigh(moved.T @ moved)[1][:, -1]
+    # Forward motion goes to the right.
+    path = pos[-1, 0, :2] - pos[0, 0, :2]
+    line = -line if line @ path < 0 else line
+    return float(np.arctan2(line[1], line[0]))
