@@ -60,7 +60,7 @@ def settings(protocol: Protocol, net: str, seed: int, args: argparse.Namespace) 
     --rtn-longest."""
     config = Inbetween(
         net=net, name=protocol.name, final=protocol.final, validation=protocol.validation, seed=seed,
-        mirror=True, between=BetweenConfig(refine=args.refine),
+        mirror=True, stretch=1.3, between=BetweenConfig(refine=args.refine),
     )  # fmt: skip
     rtn = dataclasses.replace(config.rtn, longest=args.rtn_longest)
     return dataclasses.replace(config, rtn=rtn)

@@ -167,3 +167,30 @@ def test_models_come_back_and_halves_are_close(kind: str, tmp_path: Path) -> Non
         assert a.dtype == torch.float32 and torch.allclose(a, b, atol=1e-3)
     with pytest.raises(PoiseError, match="no in-betweening model"):
         load_model(tmp_path / "absent")
+
+
+def test_windows_are_drawn_faster_and_slower_within_their_clip() -> None:
+    of = bank()
+    frames = data(of)
+    sampler = Sampler(frames, stretch=1.5)
+    plain = Sampler(frames)
+    start = torch.tensor([5, 100])
+    same = sampler.at(start, 20, torch.ones(2))
+    for a, b in zip(same, plain.at(start, 20), strict=True):
+        assert torch.allclose(a, b, atol=1e-6)
+    # Twice as fast: every second frame. Half as fast: every frame, and one between.
+    fast, slow = (
+        sampler.at(start, 20, torch.full((2,), 2.0)),
+        sampler.at(start, 39, torch.full((2,), 0.5)),
+    )
+    long = plain.at(start, 39)
+    assert torch.allclose(fast.root, long.root[:, ::2], atol=1e-5)
+    assert torch.allclose(slow.root[:, ::2], plain.at(start, 20).root, atol=1e-5)
+    # No frame is taken from the next clip, however fast: the speed is what the clip has frames for.
+    last = int(of.first[1]) - 12
+    window = sampler.at(torch.tensor([last]), 10, torch.tensor([3.0]))
+    assert torch.allclose(window.root[0, -1], frames.root[int(of.first[1]) - 1], atol=1e-5)
+    drawn = sampler.draw(16, 30, torch.Generator().manual_seed(0))
+    assert drawn.root.shape == (16, 30, 3) and bool(drawn.rot.norm(dim=-1).sub(1).abs().max() < 1e-5)
+    with pytest.raises(PoiseError, match="stretch"):
+        Sampler(frames, 0.5)

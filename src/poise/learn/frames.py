@@ -10,6 +10,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.nets.transition import Layout
+from poise.spatial import normalize
 
 
 class Windows(NamedTuple):
@@ -48,10 +49,16 @@ class Sampler:
 
     Frames are ordered once by how many follow them in their clip, so that those with room for a window
     of any length are the first so many.
+
+    Args:
+        stretch: windows are drawn up to so many times faster and slower than recorded, evenly on a
+            logarithmic scale, as far as the clip reaches; 1 leaves them.
     """
 
-    def __init__(self, data: FrameData):
-        self.data = data
+    def __init__(self, data: FrameData, stretch: float = 1.0):
+        if not 1.0 <= stretch <= 4.0:
+            raise PoiseError(f"stretch must lie in 1 to 4, got {stretch:g}")
+        self.data, self.stretch = data, stretch
         sizes = data.first[1:] - data.first[:-1]
         clip = torch.repeat_interleave(torch.arange(len(sizes)), sizes)
         room = data.first[1:][clip] - torch.arange(data.frames)
@@ -75,9 +82,28 @@ class Sampler:
                 hint="Give longer clips or train shorter transitions",
             )
         start = self.order[torch.randint(most, (count,), generator=generator)]
-        return self.at(start, window)
+        if self.stretch == 1.0:
+            return self.at(start, window)
+        way = 2 * torch.rand(count, generator=generator) - 1
+        return self.at(start, window, self.stretch**way)
 
-    def at(self, start: Tensor, window: int) -> Windows:
-        """The windows that begin at frames `start (N)`."""
-        d, rows = self.data, start[:, None] + torch.arange(window)
-        return Windows(d.root[rows], d.rot[rows], d.contact[rows], d.offsets[self.clip[start]])
+    def at(self, start: Tensor, window: int, speed: Tensor | None = None) -> Windows:
+        """The windows that begin at frames `start (N)`, at `speed (N)` times that of the recording, or
+        as fast as the clip has frames for."""
+        d, clip = self.data, self.clip[start]
+        if speed is None:
+            rows = start[:, None] + torch.arange(window)
+            return Windows(d.root[rows], d.rot[rows], d.contact[rows], d.offsets[clip])
+        left = (d.first[1:][clip] - 1 - start).float()
+        speed = torch.minimum(speed, left / max(1, window - 1))
+        way = speed[:, None] * torch.arange(window)
+        # The last frame may be missed by a rounding.
+        whole = torch.minimum(way.floor(), (left[:, None] - 1).clamp_min(0))
+        rows = start[:, None] + whole.long()
+        after = torch.minimum(rows + 1, d.first[1:][clip][:, None] - 1)
+        share = (way - whole)[..., None]
+        root = torch.lerp(d.root[rows], d.root[after], share)
+        # Neighbouring frames are so alike that a chord is as good as the arc; their signs agree.
+        rot = normalize(torch.lerp(d.rot[rows], d.rot[after], share[..., None]))
+        contact = torch.where(share < 0.5, d.contact[rows], d.contact[after])
+        return Windows(root, rot, contact, d.offsets[clip])

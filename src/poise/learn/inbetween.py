@@ -77,6 +77,7 @@ class InbetweenTrainer:
         data: the training set. seed: of the windows that are drawn.
         steps: of the whole training. block: steps between two reports.
         ema: how much of the averaged weights stays at each step; early steps count less.
+        stretch: of the windows' speed, see `Sampler`.
         metadata: JSON data that every checkpoint carries.
     """
 
@@ -90,10 +91,11 @@ class InbetweenTrainer:
         block: int = 50,
         ema: float = 0.999,
         metadata: Mapping[str, Any] | None = None,
+        stretch: float = 1.0,
     ):
         if min(steps, batch, block) < 1 or not 0 <= ema < 1:
             raise PoiseError(f"steps, batch and block must be at least 1 and ema in [0, 1), got {ema}")
-        self.objective, self.sampler = objective, Sampler(data)
+        self.objective, self.sampler = objective, Sampler(data, stretch)
         self.steps, self.batch, self.block, self.ema = steps, batch, block, ema
         self.metadata, self.seed = dict(metadata or {}), seed
         self.generator = make_generator(seed, "in-between windows")

@@ -56,7 +56,8 @@ class Inbetween:
     net: transformer or rtn. final, validation: regular expressions in the names of clips that are kept
     apart (see `eval.inbetween.Protocol`); final clips are never read by training or choices.
     contacts: whose labels the network learns. ema: of the averaged weights that are used.
-    mirror: whether it learns from every clip in a mirror, too.
+    mirror: whether it learns from every clip in a mirror, too. stretch: windows are drawn up to so many
+    times faster and slower than recorded.
     onto: a motion file on whose skeleton all clips are brought by `library_of`, which also cuts what
     nobody can do alone on a floor. reading: how it reads them; given alone, all come onto the skeleton
     that most seconds are on. By default clips of the most common skeleton are taken as they are.
@@ -71,6 +72,7 @@ class Inbetween:
     seed: int = 0
     ema: float = 0.999
     mirror: bool = False
+    stretch: float = 1.0
     onto: str | None = None
     reading: LibraryConfig | None = None
     between: BetweenConfig = field(default_factory=BetweenConfig)
@@ -205,7 +207,14 @@ def train(
     c = task.config
     meta = {"config": json.loads(json.dumps(dataclasses.asdict(c))), "clips": len(task.bank.clips)}
     trainer = InbetweenTrainer(
-        objective(task, steps), task.data, c.seed, steps, c.batch, ema=c.ema, metadata=meta
+        objective(task, steps),
+        task.data,
+        c.seed,
+        steps,
+        c.batch,
+        ema=c.ema,
+        metadata=meta,
+        stretch=c.stretch,
     )
     check = None if task.validation is None else validation(task)
     stats, stopped = train_inbetween(
