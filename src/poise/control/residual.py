@@ -72,8 +72,9 @@ class Residual(Protocol):
 
 def _of_worlds(scale: Tensor | float) -> Tensor | float:
     """A scale that multiplies vectors `(N, M, 3)`."""
-    each = isinstance(scale, Tensor) and scale.dim() == 1
-    return scale.reshape(-1, 1, 1) if each else scale
+    if isinstance(scale, Tensor) and scale.dim() == 1:
+        return scale.reshape(-1, 1, 1)
+    return scale
 
 
 def _check_limits(limit_n: float, limit_nm: float) -> None:
