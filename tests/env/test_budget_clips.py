@@ -204,3 +204,10 @@ def test_states_of_other_kinds():
         budget.set(torch.ones(3))
     with pytest.raises(PoiseError, match="at least 1 group"):
         HelpBudget(groups=0)
+    with pytest.raises(PoiseError, match="not told"):
+        budget.count(1, 0)
+
+
+def test_another_way_to_share_is_refused(task: Imitation):
+    with pytest.raises(PoiseError, match="by 'all' or by 'clip', got 'world'"):
+        replace(task.task, help_by="world")  # type: ignore[arg-type]

@@ -46,8 +46,9 @@ class HelpBudget:
         self.scale = torch.ones(() if groups == 1 else (groups,), device=device)
         # The same on the CPU, where decisions are made.
         self._scales, self._used = np.ones(groups, np.float32), np.ones(groups, bool)
-        # Ended and failed episodes of each group, where the worlds are.
-        self._counts = torch.zeros(2, groups, dtype=torch.float64, device=device)
+        # Ended and failed episodes of each group; of several where the worlds are, to wait for no GPU.
+        where = "cpu" if groups == 1 else device
+        self._counts = torch.zeros(2, groups, dtype=torch.float64, device=where)
 
     def set(self, scale: float | Tensor | np.ndarray) -> None:
         """Takes a scale into use, in [0, 1]: one for all groups, or `(G,)`.
@@ -100,11 +101,16 @@ class HelpBudget:
         return 1.0 - failed / ended if ended else float("nan")
 
     def count(self, ended: int, failed: int) -> None:
-        """One control step of all worlds of a single group, in which episodes ended, some by failure."""
+        """One control step of all worlds of a single group, in which episodes ended, some by failure.
+
+        Raises:
+            PoiseError: there are several groups, whose episodes are not told apart here.
+        """
+        if self.groups > 1:
+            raise PoiseError("whose episodes ended is not told", hint="Use HelpBudget.count_worlds")
         if self.schedule is None:
             return
-        self._counts[0, 0] += ended
-        self._counts[1, 0] += failed
+        self._counts.numpy()[:, 0] += ended, failed
         self._tick(self.schedule)
 
     def count_worlds(self, group: Tensor, failed: Tensor) -> None:

@@ -62,6 +62,8 @@ class TaskConfig:
     recovery: Recovery | None = None
 
     def __post_init__(self) -> None:
+        if self.help_by not in ("all", "clip"):
+            raise PoiseError(f"help is given by 'all' or by 'clip', got '{self.help_by}'", "TaskConfig")
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:
             raise PoiseError(
