@@ -152,6 +152,22 @@ def test_norms_never_exceed_the_limits(size, worlds):
             )
 
 
+@pytest.mark.parametrize("kind", [ImplicitResidual(80.0, 40.0), ExplicitResidual((0, 3), 80.0, 40.0)])
+def test_each_world_may_have_a_scale_of_its_own(kind, worlds):
+    _, arrays, _ = worlds
+    action = torch.randn(N, kind.dims, generator=torch.Generator().manual_seed(4)).double()
+    scales = torch.tensor([1.0, 0.3, 0.0])
+    sizes = (worlds[2].ctrl.shape[1], worlds[2].qfrc_applied.shape[1], worlds[2].xfrc_applied.shape[1])
+    together = Drive.zeros(N, *sizes)
+    kind.apply(action, *arrays, together, scales)
+    for i, scale in enumerate(scales):
+        alone = Drive.zeros(1, *sizes)
+        kind.apply(action[i : i + 1], *(x[i : i + 1] for x in arrays), alone, scale)
+        for name in ("qfrc_applied", "xfrc_applied"):
+            assert torch.equal(getattr(together, name)[i], getattr(alone, name)[0])
+    assert float(together.qfrc_applied[2].abs().max() + together.xfrc_applied[2].abs().max()) == 0.0
+
+
 def test_residuals_add_to_what_is_there(worlds):
     _, (xpos, xquat, xipos), drive = worlds
     for kind in KINDS:

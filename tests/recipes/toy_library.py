@@ -14,7 +14,7 @@ from poise.recipes.perpetual import Perpetual, RecoveryPlan
 from poise.recipes.perpetual.eval import ClipResults
 from toy_human import swing
 
-#: kind of policy, columns, share of the help, clip -> does it succeed?
+#: kind of policy, columns, largest share of the help, clip -> does it succeed?
 Script = Callable[[str, int, float, int], bool]
 STYLE = AmpConfig(frames=3, hidden=(8,), minibatch=16, steps=1, kept=16, replay=32)
 PPO = PPOConfig(
@@ -58,10 +58,16 @@ class Scripted:
         self.asked: list[tuple[str, int, float, tuple[int, ...]]] = []
 
     def __call__(
-        self, imitation: Imitation, policy: PolicyBundle, clips: Tensor | None, scale: float, *_: object
+        self,
+        imitation: Imitation,
+        policy: PolicyBundle,
+        clips: Tensor | None,
+        scale: float | Tensor,
+        *_: object,
     ) -> ClipResults:
         length = imitation.reference.length
         clips = torch.arange(len(length)) if clips is None else clips
+        scale = float(scale[clips].max()) if isinstance(scale, Tensor) else scale
         kind, columns = policy.shape.get("kind", "perceptron"), policy.shape.get("columns", 0)
         self.asked.append((kind, columns, scale, tuple(clips.tolist())))
         won = torch.tensor([self.script(kind, columns, scale, c) for c in clips.tolist()])

@@ -60,13 +60,21 @@ class Residual(Protocol):
     ) -> Wrench:
         """Add the residual forces of `action (N, dims)` to `drive`; body arrays are MuJoCo's.
 
-        scale: 0-dimensional, multiplies the limits (what a `HelpSchedule` has left of them).
+        scale: multiplies the limits (what a `HelpSchedule` has left of them): 0-dimensional, or `(N,)`
+        where each world has its own.
         """
         ...
 
     def regularizer(self, action: Tensor) -> Tensor:
         """r_reg `(N,)` of the unscaled action, in (0, 1]; 1 without help."""
         ...
+
+
+def _of_worlds(scale: Tensor | float) -> Tensor | float:
+    """A scale that multiplies vectors `(N, M, 3)`."""
+    if isinstance(scale, Tensor) and scale.dim() == 1:
+        return scale.reshape(-1, 1, 1)
+    return scale
 
 
 def _check_limits(limit_n: float, limit_nm: float) -> None:
@@ -116,7 +124,7 @@ class ImplicitResidual:
         # Force and torque are one vector each, so that both are capped and turned together.
         unit = action.reshape(-1, 2, 3)
         local = unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
-        local = local * local.new_tensor([[self.limit_n], [self.limit_nm]]) * scale
+        local = local * local.new_tensor([[self.limit_n], [self.limit_nm]]) * _of_worlds(scale)
         force, torque = quat_rotate(torch.stack((heading_quat(root), root), 1), local).unbind(1)
         drive.qfrc_applied[:, 0:3].add_(force)
         drive.qfrc_applied[:, 3:6].add_(local[:, 1])
@@ -168,6 +176,7 @@ class ExplicitResidual:
         reach = reach * (self.reach_m / reach.norm(dim=-1, keepdim=True).clamp_min(self.reach_m))
         quat = xquat[:, index].to(action.dtype)
         point = xpos[:, index].to(action.dtype) + quat_rotate(quat, reach)
+        scale = _of_worlds(scale)
         force = quat_rotate(quat, _capped(parts[:, :, 1]) * (self.limit_n * scale))
         torque = quat_rotate(quat, _capped(parts[:, :, 2]) * (self.limit_nm * scale))
         drive.add_wrench_at(index, point, force, torque, xipos=xipos)

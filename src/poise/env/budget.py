@@ -9,58 +9,173 @@ import torch
 from torch import Tensor
 
 from poise.control import HelpSchedule
+from poise.errors import PoiseError
 
 #: How much older episodes count, at each decision, against the ones since the last.
 KEPT = 0.8
+#: Ended episodes, older ones counted by `KEPT`, from which on a group's success is known. Five are what
+#: such a memory holds of one episode per decision. The standard error of a share of fewer is wider than
+#: the 0.2 between the shares from which `SuccessHelp` lowers and under which it raises: chance would
+#: push the help down and up. Nor are there many more: 512 characters on 100 clips end about one episode
+#: of each between two decisions.
+EPISODES = 5.0
 
 
 class HelpBudget:
     """Scales the residual force's limits by what a schedule decides from the episodes' outcomes.
 
-    scale: 0-dimensional float32, multiplied with the limits, where the worlds are; `now` is the same
-        number for Python, which need not wait for a GPU. Without a schedule it stays as it is set.
+    With several groups, which are clips, each has a scale of its own, decided from the outcomes of its
+    own episodes: as soon as it knows `EPISODES` of them, while groups with fewer go on collecting (a
+    schedule of time alone, such as `LinearHelp`, lowers them all the same). One group is all worlds,
+    and is decided every time.
+
+    scale: float32, multiplied with the limits, where the worlds are: 0-dimensional for one group, else
+        `(G,)`. now: a Python number, which need not wait for a GPU: the largest scale of any group in
+        use, so that 0 means that nobody is helped. Without a schedule they stay as they are set.
     """
 
-    def __init__(self, schedule: HelpSchedule | None = None, device: torch.device | str = "cpu"):
-        self.schedule = schedule
-        self.scale, self.now = torch.ones((), device=device), 1.0
-        self.steps, self._ended, self._failed = 0, 0.0, 0.0
+    def __init__(
+        self,
+        schedule: HelpSchedule | None = None,
+        device: torch.device | str = "cpu",
+        groups: int = 1,
+    ):
+        if groups < 1:
+            raise PoiseError(f"help needs at least 1 group, got {groups}", "HelpBudget")
+        self.schedule, self.groups, self.steps, self.now = schedule, groups, 0, 1.0
+        self.scale = torch.ones(() if groups == 1 else (groups,), device=device)
+        # The same on the CPU, where decisions are made.
+        self._scales, self._used = np.ones(groups, np.float32), np.ones(groups, bool)
+        # Ended and failed episodes of each group; of several where the worlds are, to wait for no GPU.
+        where = "cpu" if groups == 1 else device
+        self._counts = torch.zeros(2, groups, dtype=torch.float64, device=where)
 
-    def set(self, scale: float) -> None:
-        """Takes a scale into use, in [0, 1]."""
-        self.now = float(np.float32(scale))
-        self.scale.fill_(self.now)
+    def set(self, scale: float | Tensor | np.ndarray) -> None:
+        """Takes a scale into use, in [0, 1]: one for all groups, or `(G,)`.
+
+        Raises:
+            PoiseError: scales of another number of groups.
+        """
+        given = scale.detach().cpu().numpy() if isinstance(scale, Tensor) else np.asarray(scale)
+        if given.ndim and given.shape != (self.groups,):
+            raise PoiseError(f"{self.groups} groups need as many scales of help, got {given.shape}")
+        self._scales = np.broadcast_to(given, (self.groups,)).astype(np.float32)
+        self._look()
+        if self.groups == 1:
+            self.scale.fill_(self.now)
+        else:
+            self.scale.copy_(torch.from_numpy(self._scales))
+
+    def cap(self, most: float) -> None:
+        """No group has more than this scale from now on, until its failures raise it again."""
+        if float(self._scales.max()) > most:
+            self.set(np.minimum(self._scales, most))
+
+    def use(self, used: Tensor) -> None:
+        """Which groups `(G,)` bool take part; what the others have left does not count in `now`."""
+        if self.groups > 1:
+            self._used = used.cpu().numpy().astype(bool)
+            self._look()
+
+    def _look(self) -> None:
+        self.now = float(self._scales[self._used].max(initial=0.0))
+
+    @property
+    def left(self) -> float | Tensor:
+        """What `set` takes: the scale of all, or a copy of those of the groups, `(G,)` on the CPU; 0.0
+        where nobody in use is helped."""
+        return self.now if self.groups == 1 or self.now == 0.0 else torch.tensor(self._scales)
+
+    def at(self, group: Tensor) -> Tensor:
+        """The scale of worlds that belong to `group (N,)`: `(N,)`, or 0-dimensional for one group."""
+        return self.scale if self.groups == 1 else self.scale[group]
+
+    def limit(self, most: float, group: Tensor) -> float | Tensor:
+        """What is left of a limit: a number, or for worlds of different groups `(N,)`."""
+        return self.now * most if self.groups == 1 or self.now == 0.0 else self.at(group) * most
 
     @property
     def success(self) -> float:
         """Share of recent episodes that did not fail; NaN before the first has ended."""
-        return 1.0 - self._failed / self._ended if self._ended else float("nan")
+        ended, failed = self._counts.sum(1).tolist()
+        return 1.0 - failed / ended if ended else float("nan")
 
     def count(self, ended: int, failed: int) -> None:
-        """One control step of all worlds, in which episodes ended, some of them by failure."""
+        """One control step of all worlds of a single group, in which episodes ended, some by failure.
+
+        Raises:
+            PoiseError: there are several groups, whose episodes are not told apart here.
+        """
+        if self.groups > 1:
+            raise PoiseError("whose episodes ended is not told", hint="Use HelpBudget.count_worlds")
         if self.schedule is None:
             return
+        self._counts.numpy()[:, 0] += ended, failed
+        self._tick(self.schedule)
+
+    def count_worlds(self, group: Tensor, failed: Tensor) -> None:
+        """One control step, in which the episodes of worlds of `group (n,)` ended, `failed (n,)` bool.
+
+        Nothing here waits for a GPU if there are several groups, but for a decision now and then.
+        """
+        if self.schedule is None:
+            return
+        if self.groups == 1:
+            self.count(len(group), int(failed.sum()) if len(group) else 0)
+            return
+        if len(group):
+            # Ones are added, so that their order, which a GPU does not keep, makes no difference.
+            outcome = torch.stack((torch.ones_like(failed), failed))
+            self._counts.index_add_(1, group, outcome.double())
+        self._tick(self.schedule)
+
+    def _tick(self, schedule: HelpSchedule) -> None:
         self.steps += 1
-        self._ended += ended
-        self._failed += failed
-        if self.steps % self.schedule.every == 0:
-            self.set(self.schedule.scale(self.now, self.steps, self.success))
-            self._ended *= KEPT
-            self._failed *= KEPT
+        if self.steps % schedule.every:
+            return
+        ended, failed = self._counts.cpu().numpy()
+        known = ended >= EPISODES if self.groups > 1 else ended > 0
+        success = np.full(self.groups, np.nan)
+        np.divide(failed, ended, out=success, where=known)
+        given = zip(self._scales.tolist(), (1.0 - success).tolist(), strict=True)
+        self.set(np.array([schedule.scale(scale, self.steps, share) for scale, share in given]))
+        self._counts *= torch.as_tensor(np.where(known, KEPT, 1.0)).to(self._counts.device)
 
     def state(self) -> Tensor:
-        """What `load_state` takes: float64 `(4)`."""
-        counts = (self.now, self.steps, self._ended, self._failed)
-        return torch.tensor(counts, dtype=torch.float64)
+        """What `load_state` takes: float64 `(4)`: `now`, steps, ended and failed episodes of all; and
+        with G groups their scales, ended and failed, `(4 + 3 G)`."""
+        counts = self._counts.cpu()
+        head = torch.tensor((self.now, self.steps, *counts.sum(1).tolist()), dtype=torch.float64)
+        if self.groups == 1:
+            return head
+        return torch.cat((head, torch.tensor(self._scales).double(), counts.flatten()))
 
     def load_state(self, state: Tensor) -> None:
-        """Goes on from `state()`."""
-        scale, steps, self._ended, self._failed = state.tolist()
-        self.set(scale)
-        self.steps = int(steps)
+        """Goes on from `state()`; from that of one group with its scale for all, which then know no
+        episodes yet, and from that of groups as one group with the most that any has left.
+
+        Raises:
+            PoiseError: the state is that of another number of groups.
+        """
+        now, steps, *totals = state[:4].tolist()
+        own, self.steps = state[4:].cpu().double(), int(steps)
+        if self.groups == 1:
+            self.set(now)
+            self._counts.copy_(torch.tensor(totals, dtype=torch.float64)[:, None])
+        elif not len(own):
+            self.set(now)
+            self._counts.zero_()
+        elif len(own) != 3 * self.groups:
+            what = f"the state is that of help for {len(own) // 3} clips, and there are {self.groups}"
+            raise PoiseError(what)
+        else:
+            own = own.reshape(3, self.groups)
+            self.set(own[0])
+            self._counts.copy_(own[1:])
 
 
 def scale_in(state: Mapping[str, Tensor]) -> float:
-    """The scale of the help in a trainer's saved state; 1 where none was saved."""
+    """The scale of the help in a trainer's saved state, of the clip that has most; 1 where none was
+    saved."""
     found = state.get("env/help")
     return 1.0 if found is None else float(found[0])

@@ -63,7 +63,9 @@ class ImitationEnv:
         self.frame, self.age = self._counts.unbind(0)
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
-        self.help = HelpBudget(task.help if task.auto_reset and task.residual else None, here)
+        schedule = task.help if task.auto_reset and task.residual else None
+        self.help = HelpBudget(schedule, here, len(reference.length) if task.help_by == "clip" else 1)
+        self.help.use(self._starts.weights > 0)
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
@@ -115,6 +117,7 @@ class ImitationEnv:
     @weights.setter
     def weights(self, odds: Tensor) -> None:
         self._starts.weights = odds
+        self.help.use(self._starts.weights > 0)
 
     def reset_to(self, clip: Tensor, frame: Tensor, kind: Tensor | None = None) -> Tensor:
         """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
@@ -180,10 +183,7 @@ class ImitationEnv:
         # A copy, since a restart clears its rows and the caller's actions are the caller's.
         self.action.copy_(actions)
         self._apply()
-        if self._guard is not None:
-            self._guard.step(self.substeps)
-        else:
-            self.backend.step(self.substeps)
+        (self._guard or self.backend).step(self.substeps)
         self._counts += 1
         ref, held = self._goal, None if self.recoveries is None else self.recoveries.tick(self.frame)
         self._goal_rows, self._goal = self.reference.follow(self._goal_rows, self.clip, self.frame, held)
@@ -198,10 +198,11 @@ class ImitationEnv:
         if self.task.finish:
             reward = torch.where(terminated & ~failed, reward * (1.0 + self.task.finish), reward)
         obs, more = final, self.recoveries and self.recoveries.shares()
-        log = Means(self.terms, self.imitation, self.wrench, self.help.now * self._limit_n, more)
+        limit = self.help.limit(self._limit_n, self.clip)
+        log = Means(self.terms, self.imitation, self.wrench, limit, more)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
-            self.help.count(len(ids), int(failed.sum()) if len(ids) else 0)
+            self.help.count_worlds(self.clip[ids], failed[ids])
             if len(ids):
                 self._restart(ids)
                 ref = self.reference.gather_packed(self.clip[ids], self.frame[ids])
@@ -235,7 +236,7 @@ class ImitationEnv:
             drive.ctrl,
             drive.qfrc_applied,
             drive.xfrc_applied,
-            self.help.scale,
+            self.help.at(self.clip),
         )
         helped = self.help.now > 0 and residual is not None and residual.limit_n + residual.limit_nm > 0
         if helped not in self._control:

@@ -12,7 +12,7 @@ from poise.control import Wrench
 
 class Means(Mapping[str, float]):
     """Means over the worlds: "reward/NAME" of every term, "imitation", the help in N and N m,
-    the limit of its force in N, and whatever `more` there is.
+    the limit of its force in N (`limit_n`, a number or `(N,)`), and whatever `more` there is.
 
     All of them come by one pass and one wait for the numbers, at the first that is read.
     """
@@ -22,7 +22,7 @@ class Means(Mapping[str, float]):
         terms: Mapping[str, Tensor],
         imitation: Tensor,
         wrench: Wrench | None,
-        limit_n: float,
+        limit_n: float | Tensor,
         more: Mapping[str, Tensor] | None = None,
     ):
         self._parts = terms, imitation, wrench, limit_n, more or {}
@@ -36,9 +36,11 @@ class Means(Mapping[str, float]):
                 rows["help/force_n"] = wrench.force.norm(dim=-1).sum(-1)
                 rows["help/torque_nm"] = wrench.torque.norm(dim=-1).sum(-1)
             rows.update(more)
+            if wrench is not None and isinstance(limit_n, Tensor):
+                rows["help/limit_n"] = limit_n
             means = torch.stack(list(rows.values())).mean(-1).tolist()
             self._values = dict(zip(rows, means, strict=True))
-            if wrench is not None:
+            if wrench is not None and not isinstance(limit_n, Tensor):
                 self._values["help/limit_n"] = limit_n
         return self._values
 

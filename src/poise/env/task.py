@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from torch import Tensor
 
@@ -37,7 +37,8 @@ class TaskConfig:
 
     obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
     of residual force, None for plain DeepMimic. help: how its limits change while episodes are
-    counted, which is with auto_reset alone; None leaves them. horizon: control steps until an episode
+    counted, which is with auto_reset alone; None leaves them. help_by: whether "all" worlds have one
+    share of them left or each "clip" its own, see `HelpBudget`. horizon: control steps until an episode
     times out. finish: what a clip done to its end is worth, in rewards of its last step; a discount g
     makes g / (1 - g) of a character that goes on as it ended. first: share of the episodes that begin
     on their clip's frame 0, as evaluations do. style: what a motion prior sees of a frame, terms that
@@ -52,6 +53,7 @@ class TaskConfig:
     pd: PDTargets
     residual: Residual | None = None
     help: HelpSchedule | None = None
+    help_by: Literal["all", "clip"] = "all"
     horizon: int = 300
     finish: float = 0.0
     first: float = 0.0
@@ -60,6 +62,8 @@ class TaskConfig:
     recovery: Recovery | None = None
 
     def __post_init__(self) -> None:
+        if self.help_by not in ("all", "clip"):
+            raise PoiseError(f"help is given by 'all' or by 'clip', got '{self.help_by}'", "TaskConfig")
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:
             raise PoiseError(

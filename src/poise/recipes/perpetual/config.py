@@ -69,7 +69,8 @@ class Perpetual:
     expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
     frames of the library where that is None, see `perpetual_clone.clone_for`.
     help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
-    has ended at the share `help_share` of the stage's time, or before by success.
+    has ended at the share `help_share` of the stage's time, or before by success. help_by_clip: success
+    is that of each clip, which keeps or loses help of its own; off, all clips have the same.
     residual_std: deviation of the noise on the residual action, in units of the limits.
     shares: where in the training the first and the last primitive end at the latest; with recovery, of
     what `recovering.share` leaves.
@@ -102,6 +103,7 @@ class Perpetual:
     expert: bool = True
     help_start: float = 100.0
     help_share: float = 0.8
+    help_by_clip: bool = True
     residual_std: float = 0.3
     shares: tuple[float, float] = (0.5, 0.8)
     evaluate_every: int = 0

@@ -80,7 +80,7 @@ def evaluate_clips(
     imitation: Imitation,
     policy: Acts,
     clips: Tensor | None = None,
-    help_scale: float = 0.0,
+    help_scale: float | Tensor = 0.0,
     threads: int = 0,
     device: str = "cpu",
     worlds: int = WORLDS,
@@ -89,7 +89,8 @@ def evaluate_clips(
     """Simulates `clips (E,)`, all by default, from their first frames with the deterministic policy.
 
     Args:
-        help_scale: what is left of the residual force's limits.
+        help_scale: what is left of the residual force's limits, or of those of each clip of the library
+            `(C,)`.
         on_batch: told how many of how many clips are done.
     """
     reference = imitation.reference
@@ -109,7 +110,12 @@ def evaluate_clips(
 
 
 def _batch(
-    imitation: Imitation, policy: Acts, clip: Tensor, scale: float, threads: int, device: str
+    imitation: Imitation,
+    policy: Acts,
+    clip: Tensor,
+    scale: float | Tensor,
+    threads: int,
+    device: str,
 ) -> tuple[Tensor, ...]:
     """Success, frames tracked, mean errors `(E,)` of clips that are simulated together."""
     env = bare_env(imitation, len(clip), scale, threads, device)
@@ -141,15 +147,18 @@ def _batch(
     return tuple(x.cpu() for x in (alive, tracked, local / count, far / count))
 
 
-def bare_env(imitation: Imitation, worlds: int, scale: float, threads: int, device: str) -> ImitationEnv:
+def bare_env(
+    imitation: Imitation, worlds: int, scale: float | Tensor, threads: int, device: str
+) -> ImitationEnv:
     """Worlds without a guard, rewards and ends: one that goes bad is a failure and no reason to stop.
 
-    scale: what is left of the residual force's limits.
+    scale: what is left of the residual force's limits, or of those of each clip `(C,)`.
     """
     config = imitation.config
     backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
     # Only what the policy sees is worked out.
     task = replace(imitation.task, rewards=(), dones=(), style=(), auto_reset=False)
+    task = replace(task, help_by="clip" if isinstance(scale, Tensor) else "all")
     env = ImitationEnv(imitation.reference, backend, task, config.sim.substeps, int(config.seed))
     env.help.set(scale)
     return env
@@ -167,17 +176,23 @@ class History:
         rows = [r for r in self._read() if int(r[0]) <= last and r[1] != FINAL_STAGE]
         self._replace(rows)
 
-    def add(self, iteration: int, stage: str, help_n: float, results: ClipResults) -> None:
-        """Notes one evaluation."""
+    def add(self, iteration: int, stage: str, help_n: float | Tensor, results: ClipResults) -> None:
+        """Notes one evaluation. help_n: what the help was limited to, N, or for each clip of the library
+        `(C,)`."""
         r = results
-        columns = (r.clip, r.succeeded, r.frames, r.tracked, r.mpjpe_mm, r.global_mm)
+        given = (
+            help_n[r.clip]
+            if isinstance(help_n, Tensor)
+            else torch.tensor(help_n, dtype=torch.float64).expand(len(r.clip))
+        )
+        columns = (given, r.clip, r.succeeded, r.frames, r.tracked, r.mpjpe_mm, r.global_mm)
         with self.path.open("a", newline="", encoding="utf-8") as file:
             write = csv.writer(file)
-            for clip, won, frames, tracked, local, far in zip(
+            for newtons, clip, won, frames, tracked, local, far in zip(
                 *(c.tolist() for c in columns), strict=True
             ):
                 write.writerow(
-                    (iteration, stage, f"{help_n:.4g}", self.names[clip], int(won), frames, tracked,
+                    (iteration, stage, f"{newtons:.4g}", self.names[clip], int(won), frames, tracked,
                      f"{local:.4f}", f"{far:.4f}")
                 )  # fmt: skip
 

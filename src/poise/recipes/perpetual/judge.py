@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from poise.eval import RecoveryCard
 from poise.eval.recovery import KINDS
 from poise.learn import Decision, PolicyBundle
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual
 from poise.recipes.perpetual.eval import ClipResults, History, evaluate_clips
-from poise.recipes.perpetual.ledger import Ledger
+from poise.recipes.perpetual.ledger import Ledger, mean_help
 from poise.recipes.perpetual.next import staged
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import back, try_recovery
@@ -58,11 +60,14 @@ class Judge:
         return max(25, round(10 * steps / samples))
 
     def judge(
-        self, stage: Stage, policy: PolicyBundle, scale: float, over: bool, iteration: int
+        self, stage: Stage, policy: PolicyBundle, scale: float | Tensor, over: bool, iteration: int
     ) -> Judged:
         """Evaluates the stage's clips, or trials of recovery, and decides.
 
-        A stage ends by what is done without help. scale: what is left of it. over: the stage's time is.
+        A stage ends by what is done without help: where an evaluation with what is left of it finds that
+        nothing is gained any more, another one without decides what is solved and what the next stage
+        is to learn. scale: what is left, or what each clip of the library has left `(C,)`. over: the
+        stage's time is.
         """
         if stage.kind == "recovery":
             return self._recovery(stage, policy, over)
@@ -70,7 +75,7 @@ class Judge:
         decision = self.ledger.decide(scale)
         if over and decision == "go on":
             decision = "next"
-        if decision == "next" and scale > 0:
+        if decision == "next" and mean_help(scale, self.ledger.clips) > 0:
             clips, card = self._both(stage, policy, 0.0, iteration)
             decision = "solved" if bool(clips.succeeded.all()) else "next"
         if card is not None and decision == "solved" and not self._enough(card):
@@ -85,7 +90,7 @@ class Judge:
         return Judged(ended if over or ended == "solved" else "go on", None, card)
 
     def _both(
-        self, stage: Stage, policy: PolicyBundle, scale: float, iteration: int
+        self, stage: Stage, policy: PolicyBundle, scale: float | Tensor, iteration: int
     ) -> tuple[ClipResults, RecoveryCard | None]:
         own, clips = staged(self.imitation, stage), self.ledger.clips
         results, card, recovered = evaluate_clips(own, policy, clips, scale, *self.where), None, 0.0

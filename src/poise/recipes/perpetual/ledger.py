@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import ceil
 from typing import Any
 
 import torch
@@ -15,10 +16,23 @@ from poise.recipes.perpetual.config import Perpetual
 from poise.recipes.perpetual.eval import ClipResults
 from poise.recipes.perpetual.recovery import back
 
-#: Help that is less by this share of its limit is a gain of a stage.
+#: Help that is less by this share of its limit is a gain of a stage; less of a difference between the
+#: means of clips that have help of their own is none.
 LESS_HELP = 0.01
 #: What a share of trials of recovery is worth beside the same share of clips, where both are learned.
 RECOVERY_WORTH = 0.25
+
+
+def mean_help(scale: float | Tensor, clips: Tensor) -> float:
+    """The share of the help's limits that an evaluation of `clips (E,)` had: `scale`, or the mean of
+    those of the clips, of the library's `(C,)`. It is 0 only where no clip had any."""
+    return float(scale[clips].double().mean()) if isinstance(scale, Tensor) else scale
+
+
+def _in_steps(scale: float) -> float:
+    """Whole steps of `LESS_HELP`, counted up, so that a little help never passes for none."""
+    # The mean of float32 scales, such as 0.3, may lie a hair above the step that is meant.
+    return LESS_HELP * max(1, ceil(scale / LESS_HELP - 1e-4)) if scale > 0 else 0.0
 
 
 class Ledger:
@@ -63,9 +77,21 @@ class Ledger:
         return self.mining.hard | self.best_failed
 
     def record(
-        self, results: ClipResults, policy: PolicyBundle, scale: float, recovered: float = 0.0
+        self,
+        results: ClipResults,
+        policy: PolicyBundle,
+        scale: float | Tensor,
+        recovered: float = 0.0,
     ) -> None:
-        """Notes what `policy` did with the stage's clips, with the share `scale` of the help.
+        """Notes what `policy` did with the stage's clips, with the share `scale` of the help, or for
+        each clip of the library its own `(C,)`.
+
+        The best policy is the one with the least `mean_help`, of those the one with the most clips, of
+        those the one with the smallest error. What was done without help counts before all that was
+        not, and since a stage ends with an evaluation without, its best policy is of those. Which clips
+        have help makes no difference; as the scales of clips go up and down each on its own, means are
+        compared in steps of `LESS_HELP`. A clip that fails with the help that it has left counts as
+        failed for mining and, unless a stage's end shows something else, for the next primitive.
 
         recovered: the share of its trials that were back, where the stage learns recovery, too.
         """
@@ -74,7 +100,9 @@ class Ledger:
         self.mining.record(won, member)
         self.seen = (int(won.sum()), len(results.clip))
         # Less help counts before more clips, more clips before a smaller error.
-        key = (-scale, results.rate + RECOVERY_WORTH * recovered, -results.error_mm)
+        own = isinstance(scale, Tensor)
+        left = _in_steps(mean_help(scale, results.clip)) if own else scale
+        key = (-left, results.rate + RECOVERY_WORTH * recovered, -results.error_mm)
         if not self.best or key > self.best_key:
             self.best, self.best_key, self.best_failed = policy.state(), key, member & ~won
 
@@ -85,11 +113,13 @@ class Ledger:
             self.best, self.best_key = policy.state(), (won / tried,)
             self.recovery = card.to_dict()
 
-    def decide(self, scale: float) -> Decision:
-        """What the last evaluation, with this share of the help, says of the stage.
+    def decide(self, scale: float | Tensor) -> Decision:
+        """What the last evaluation says of the stage. scale: its share of the help, or `(C,)` of clips.
 
-        A stage with help is never solved; that it needs less help is a gain.
+        A stage in which any clip has help is never solved; that its clips need less help, on average,
+        is a gain.
         """
+        scale = mean_help(scale, self.clips)
         succeeded, clips = self.seen
         assert succeeded is not None
         improved = scale < self.least - LESS_HELP

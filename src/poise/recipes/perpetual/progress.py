@@ -46,7 +46,8 @@ class Progress:
 
     stage: the one that was trained, of whose `clips` (of the recovery primitive: trials) the last
     evaluation saw `succeeded`, or None before the first. iteration: over all stages. share: of the whole
-    training, 0 to 1. help_n: N, what is left. results, recovery: evaluations that were made after this
+    training, 0 to 1. help_n: N, what is left on the clip that has
+    most. results, recovery: evaluations that were made after this
     iteration. following: the stage that begins now. trouble: what went wrong before this iteration,
     which then was made again from the last checkpoint.
     """

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.learn import (
@@ -106,8 +107,13 @@ class Course:
 
     @property
     def help(self) -> float:
-        """What is left of the residual force's limits, 0 to 1."""
+        """What is left of the residual force's limits, 0 to 1, on the clip that has most."""
         return self.env.help.now if self.imitation.task.residual is not None else 0.0
+
+    @property
+    def helps(self) -> float | Tensor:
+        """What is left of it on each clip of the library `(C,)`, or a number where that is the same."""
+        return self.env.help.left if self.imitation.task.residual is not None else 0.0
 
     @property
     def primitives(self) -> int:
@@ -165,18 +171,17 @@ class Course:
         self.save()
 
     def _limit_help(self) -> None:
-        """No more help than the stage's time allows."""
+        """No more help, on any clip, than the stage's time allows."""
         if self.imitation.task.residual is None:
             return
         most = most_help(self.config, self.stage, self.began, self.share)
         if most == 0.0:
             self.env.help.schedule = None
-        if self.help > most:
-            self.env.help.set(most)
+        self.env.help.cap(most)
 
     def _judge(self, over: bool) -> Judged:
         """Evaluates the present policy. over: the stage's time is."""
-        judged = self.judge.judge(self.stage, self.trainer.policy(), self.help, over, self.iteration)
+        judged = self.judge.judge(self.stage, self.trainer.policy(), self.helps, over, self.iteration)
         self.env.weights = self.ledger.mining.weights()
         return judged
 
@@ -200,8 +205,8 @@ class Course:
         before = WarmStart(policy, critic_of(t), t.samples, t.seconds)
         where = (self.threads, self.dumps, self.tell)
         start = begin_stage(before, self.imitation, follows, ledger.owner, *where)
-        # A composer and what recovers learn without help.
-        scale = self.help if follows.kind == "primitive" else 0.0
+        # A composer and what recovers learn without help; a primitive's clips keep what they have.
+        scale = self.helps if follows.kind == "primitive" else 0.0
         self.before, self.begun = self.iteration, (start.samples, start.seconds)
         self.env.close()
         ledger.begin(members_of(follows, hard, self.imitation))
@@ -211,8 +216,8 @@ class Course:
             self.trainer.style.load_learned(t.style.state())
         return follows
 
-    def _enter(self, stage: Stage, start: WarmStart | None, warm: bool, scale: float) -> None:
-        """Makes the stage's trainer, whose worlds have the share `scale` of the help."""
+    def _enter(self, stage: Stage, start: WarmStart | None, warm: bool, scale: float | Tensor) -> None:
+        """Makes the stage's trainer, with the share `scale` of the help, or each clip's own `(C,)`."""
         self.stage, self.warm = stage, warm
         where = (self.threads, self.dumps, self.device)
         self.trainer: Trainer = make_trainer(self.imitation, stage, start, warm, *where)

@@ -17,9 +17,9 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | the authors' later single network                 | `Perpetual.single`                          |
 
 What is ours: the first primitive begins as a clone of a scripted expert, a residual force helps at first
-and is taken away (`control.SuccessHelp`), and the composer begins by imitating for each clip the
-primitive that learned it, and the recovery primitive for who is far. At the end of every stage there is
-no help.
+and is taken away clip by clip (`control.SuccessHelp`), and the composer begins by imitating for each
+clip the primitive that learned it, and the recovery primitive for who is far. At the end of every stage
+there is no help.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         residual=ImplicitResidual(limit, limit) if limit else None,
         # What is learned with recovery is learned without help.
         help=SuccessHelp() if limit and recovers is None else None,
+        help_by="clip" if config.help_by_clip else "all",
         horizon=config.horizon,
         # As many of the last rewards as a character that goes on would earn: g + g^2 + ...
         finish=gamma / max(1.0 - gamma, 1.0 / config.horizon),
