@@ -1,4 +1,4 @@
-"""Trains the in-betweening network that comes with Poise, on clips of the CMU motion capture database.
+"""Trains an in-betweening network that may come with Poise, on clips of the CMU motion capture database.
 
     python benchmarks/inbetween_cmu.py --library FOLDER --onto FOLDER/.../02_01.amc --steps 6000
         [--work DIR] [--out src/poise/data/inbetween/model.safetensors]
