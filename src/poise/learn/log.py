@@ -108,10 +108,6 @@ class _Events:
         self.event = events.Event
         self.summary = import_module("tensorboard.compat.proto.summary_pb2").Summary
         folder.mkdir(parents=True, exist_ok=True)
-        # TensorBoard reads files in the order of their names, whose stamps are whole seconds: one begun
-        # in the second of another might be read before it.
-        while any(folder.glob(f"events.out.tfevents.{int(time.time()):010d}.*")):
-            time.sleep(1.001 - time.time() % 1.0)
         self.writer = EventFileWriter(str(folder))
         # A start mark tells TensorBoard to hide the steps that are about to be repeated.
         start = events.SessionLog(status=events.SessionLog.START)
