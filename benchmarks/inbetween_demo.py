@@ -1,7 +1,7 @@
 """A dance with keyframes a second apart, filled by `poise inbetween`, beside the recording.
 
     python benchmarks/inbetween_demo.py CLIP [--skeleton FILE.asf] [--every 1.0] [--model FILE]
-        [--picture docs/inbetween.svg] [--from 60]
+        [--picture docs/inbetween.svg] [--from 1.0]
 
 Writes `inbetween_demo.json`: how exactly keyframes are met, and how much feet slide in the recording, in
 the filled clip, and between the same keyframes interpolated. Draws the filled poses over the recorded.
@@ -22,20 +22,10 @@ from poise.cli.inbetween import model_of
 from poise.metrics.plausibility import foot_slide
 from poise.motion import Clip, read_clip
 from poise.motion.windows import foot_joints
-from poise.spatial import quat_conj, quat_mul, quat_to_rotvec, slerp
-from poise.synth.inbetween import Filling, fill_keyframes
+from poise.spatial import quat_conj, quat_mul, quat_to_rotvec
+from poise.synth.gaps import Gap
+from poise.synth.inbetween import Filling, fill_keyframes, interpolated
 from poise.view.poses import PoseRow, pose_rows
-
-
-def interpolated(clip: Clip, keys: list[int]) -> Clip:
-    """Straight lines and shortest arcs between keyframes."""
-    root, rot = (torch.tensor(x) for x in (clip.root_pos, clip.rot))
-    for a, b in pairwise(keys):
-        t = (torch.arange(a, b, dtype=root.dtype) - a) / (b - a)
-        shape = (b - a, *rot.shape[1:])
-        root[a:b] = root[a] + t[:, None] * (root[b] - root[a])
-        rot[a:b] = slerp(rot[a].expand(shape), rot[b].expand(shape), t[:, None].expand(shape[:2]))
-    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy())
 
 
 def slides(clip: Clip, low: np.ndarray, ground: float) -> dict[str, float]:
@@ -67,7 +57,8 @@ def main() -> None:
     begun = time.perf_counter()
     filled = fill_keyframes(clip, keys, model_of(args.model), Filling())
     seconds = time.perf_counter() - begun
-    made, plain = filled.clips[0], interpolated(clip, keys)
+    gaps = [Gap(a, b) for a, b in pairwise(keys)]
+    made, plain = filled.clips[0], interpolated(clip, *clip.tensors(), gaps)
     apart = np.abs(made.positions()[keys] - clip.positions()[keys]).max() * 1000
     turn = quat_mul(torch.tensor(made.rot[keys]), quat_conj(torch.tensor(clip.rot[keys])))
     degrees = float(torch.rad2deg(quat_to_rotvec(turn).norm(dim=-1)).max())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -45,12 +47,10 @@ def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
     mirror = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
     rot = bank.rot[:, other]
     rot = torch.cat((rot[..., :1], -(rot[..., 1:] @ mirror.to(rot))), -1)
-    return FrameBank(
-        bank.names, bank.parents, bank.fps, bank.root @ mirror.to(bank.root), rot,
-        bank.offsets[:, other] @ mirror.to(bank.offsets), bank.first,
-        tuple(f"{name}{suffix}" for name in bank.clips), bank.feet, bank.facing,
-        bank.ends,
-    )  # fmt: skip
+    offsets = bank.offsets[:, other] @ mirror.to(bank.offsets)
+    names = tuple(f"{name}{suffix}" for name in bank.clips)
+    root = bank.root @ mirror.to(bank.root)
+    return replace(bank, root=root, rot=rot, offsets=offsets, clips=names)
 
 
 def _normal(bank: FrameBank) -> Tensor:
@@ -75,7 +75,4 @@ def joined(a: FrameBank, b: FrameBank) -> FrameBank:
         raise PoiseError("two sets of frames of different skeletons or rates cannot be joined")
     both = {k: torch.cat((getattr(a, k), getattr(b, k))) for k in ("root", "rot", "offsets")}
     first = torch.cat((a.first, b.first[1:] + a.first[-1]))
-    return FrameBank(
-        a.names, a.parents, a.fps, both["root"], both["rot"], both["offsets"], first,
-        a.clips + b.clips, a.feet, a.facing, a.ends,
-    )  # fmt: skip
+    return replace(a, **both, first=first, clips=a.clips + b.clips)

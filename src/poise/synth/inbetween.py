@@ -80,7 +80,7 @@ def fill_keyframes(
         rot[k] = slerp(rot[a], rot[b], t.expand(rot.shape[1]))
     rig = None
     if other is not None:
-        rig = OtherRig.between(_interpolated(own, root, rot, gaps), _example(other, clip, model))
+        rig = OtherRig.between(interpolated(own, root, rot, gaps), _example(other, clip, model))
         warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
     clips = []
     for sample in range(filling.samples):
@@ -117,7 +117,7 @@ def _example(other: str, clip: Clip, model: InbetweenModel) -> Clip:
     raise PoiseError(other, clip.name, hint)
 
 
-def _interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
+def interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
     """The clip with its gaps interpolated: what lies in them is not to be looked at."""
     root, rot = root.clone(), rot.clone()
     for gap in gaps:

@@ -67,7 +67,7 @@ class Perpetual:
     hidden layers of the earlier ones. combine, weights: see `nets.Composer`.
     composer_clone: the composer first imitates for each clip the primitive that learned it.
     expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
-    frames of the library where that is None, see `perpetual_clone.clone_for`.
+    frames of the library where that is None, see `perpetual.clone.clone_for`.
     help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
     has ended at the share `help_share` of the stage's time, or before by success. help_by_clip: success
     is that of each clip, which keeps or loses help of its own; off, all clips have the same.

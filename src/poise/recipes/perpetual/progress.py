@@ -16,7 +16,7 @@ Recovers = Literal["primitive", "composer"]
 
 @dataclass(frozen=True)
 class Stage:
-    """One training after another, see `perpetual_plan`.
+    """One training after another, see `perpetual.plan`.
 
     number: counts all stages of a run from 1. mixed: episodes of recovery are interleaved.
     """

@@ -1,7 +1,7 @@
 """The stage machine: a library's training goes from stage to stage all by itself.
 
-Which stage follows which is said by `perpetual_plan`, when one ends by `perpetual_judge`, how one begins
-by `perpetual_next`. A checkpoint is the whole machine between two iterations; a new stage replaces the
+Which stage follows which is said by `plan`, when one ends by `judge`, how one begins
+by `next`. A checkpoint is the whole machine between two iterations; a new stage replaces the
 checkpoint of the last one in one step, so that a run that was killed anywhere goes on as if nothing had
 happened.
 """

@@ -7,7 +7,7 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | Sec. 3.1 s^p, s^g-rot, s^g-kp, beta               | `env.terms.phc_obs`                         |
 | Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.terms.phc_reward`, `learn.Amp`         |
 | Sec. 3.1 relaxed early termination                | `env.terms.done`, `all_but_feet`            |
-| Sec. 3.2 progressive primitives, hard negatives   | `recipes.perpetual.plan`, `perpetual_stages`|
+| Sec. 3.2 progressive primitives, hard negatives   | `recipes.perpetual.plan` and `.stages`  |
 | Alg. 1, line 3: until success no longer improves  | `learn.converge`, `learn.mining`            |
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
 | fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_recovery`    |
@@ -108,7 +108,7 @@ def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:
 
 
 def build(library: ClipLibrary | Clip, config: Perpetual | None = None) -> Imitation:
-    """Body, reference and task for a library of one skeleton; train it with `perpetual_stages.train`."""
+    """Body, reference and task for a library of one skeleton; train it with `perpetual.run.train`."""
     config = config or Perpetual()
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     library, _ = on_own_body(library, config.body)

@@ -39,7 +39,7 @@ class TrackConfig:
 
     noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
     failed is put back onto the reference. smooth_hz: cut-off of a low-pass on keypoints.
-    count: characters who do the motion side by side in one world, see `track_crowd`. threads: of the
+    count: characters who do the motion side by side in one world, see `track.crowd`. threads: of the
     physics.
     """
 
