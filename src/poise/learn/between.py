@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from poise.learn.frames import Sampler, Windows
-from poise.nets.between import Between, Gap
+from poise.nets.between import Between, Dropout, Gap
 from poise.nets.half import bfloat16_is_fast
 from poise.nets.transition import into_place, place_of
 from poise.spatial import matrix_kinematics, quat_to_matrix
@@ -47,6 +47,8 @@ class BetweenTraining:
     slide: float = 5.0
     kl: float = 0.01
     grad_norm: float = 1.0
+    dropout: float = 0.0
+    """Share of the channels that each layer's branches miss, for small libraries."""
     products: Literal["auto", "float32", "bfloat16"] = "auto"
 
 
@@ -79,7 +81,8 @@ class BetweenObjective:
         for group in optimizer.param_groups:
             group["lr"] = c.lr * schedule(step, c.warmup, self.steps)
         coded = bool(torch.rand((), generator=generator) < c.coded) and self.net.config.latent > 0
-        loss, parts = self.loss(batch, ~hidden, generator if coded else None)
+        drop = Dropout(c.dropout, generator) if c.dropout else None
+        loss, parts = self.loss(batch, ~hidden, generator if coded else None, drop)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), c.grad_norm, foreach=True)
@@ -105,7 +108,11 @@ class BetweenObjective:
         return hidden, len(hidden)
 
     def loss(
-        self, batch: Windows, known: Tensor, coded: torch.Generator | None
+        self,
+        batch: Windows,
+        known: Tensor,
+        coded: torch.Generator | None,
+        drop: Dropout | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of one batch, and its parts.
 
@@ -122,7 +129,7 @@ class BetweenObjective:
             parts["kl"] = 0.5 * (mean.square() + log_var.exp() - 1 - log_var).sum(-1).mean()
             total = total + self.config.kl * parts["kl"]
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            first, refined = self.net(root, rot, known, batch.offsets, code)
+            first, refined = self.net(root, rot, known, batch.offsets, code, drop)
         truth = matrix_kinematics(
             self.net.layout.parents, batch.offsets.unsqueeze(1), root, quat_to_matrix(rot)
         )

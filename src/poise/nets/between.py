@@ -65,6 +65,19 @@ class Gap(NamedTuple):
     contact: Tensor
 
 
+class Dropout(NamedTuple):
+    """Channels that a training step leaves out of each layer's branches, the same in all frames of a
+    window, so that what is left does not tremble: their share, and the source of the draws."""
+
+    share: float
+    generator: torch.Generator
+
+    def mask(self, h: Tensor) -> Tensor:
+        """Factors `(N, 1, width)` of what a branch adds to `h (N, T, width)`."""
+        keep = torch.rand(len(h), 1, h.shape[-1], generator=self.generator) >= self.share
+        return keep.to(h) / (1 - self.share)
+
+
 class Neighbours(NamedTuple):
     """For every frame `(T)`: the nearest known frames before and after it, and the way between, 0..1."""
 
@@ -157,8 +170,9 @@ class Between(nn.Module):
         return self.posterior[1](hidden).chunk(2, -1)
 
     def forward(
-        self, root: Tensor, rot: Tensor, known: Tensor, offsets: Tensor, code: Tensor | None = None
-    ) -> tuple[Gap, Gap | None]:
+        self, root: Tensor, rot: Tensor, known: Tensor, offsets: Tensor, code: Tensor | None = None,
+        drop: Dropout | None = None,
+    ) -> tuple[Gap, Gap | None]:  # fmt: skip
         """All frames and, with a refiner, the refined ones.
 
         Args:
@@ -166,6 +180,7 @@ class Between(nn.Module):
                 unknown frames are not looked at. known `(T)` bool, the same for all.
             offsets: `(N, J, 3)`.
             code: `(N, latent)` where a variant is asked for.
+            drop: what a step of training leaves out.
         """
         near = neighbours(known)
         share = near.share.to(root)[:, None]
@@ -174,20 +189,20 @@ class Between(nn.Module):
         sixd, mats = quat_to_sixd(rot), quat_to_matrix(rot)
         x = (self._joined(root, sixd, mats, offsets) - self.feature_mean) / self.feature_std
         extra = None if code is None else self.code(code).unsqueeze(1)
-        first = self._correct(self.encoder, x, root, sixd, mats, known, near, extra)
+        first = self._correct(self.encoder, x, root, sixd, mats, known, near, extra, drop)
         if self.refiner is None:
             return first, None
         held = Gap(*(v.detach() for v in first))
         sixd = held.mats[..., :2].transpose(-1, -2).flatten(-2)
         x = (self._joined(held.root, sixd, held.mats, offsets) - self.feature_mean) / self.feature_std
         x = torch.cat((x, held.contact), -1)
-        return first, self._correct(self.refiner, x, held.root, sixd, held.mats, known, near, extra)
+        return first, self._correct(self.refiner, x, held.root, sixd, held.mats, known, near, extra, drop)
 
     def _correct(
         self, encoder: _Encoder, x: Tensor, root: Tensor, sixd: Tensor, mats: Tensor,
-        known: Tensor, near: Neighbours, extra: Tensor | None,
+        known: Tensor, near: Neighbours, extra: Tensor | None, drop: Dropout | None,
     ) -> Gap:  # fmt: skip
-        out = encoder(x, known, near, extra).float()
+        out = encoder(x, known, near, extra, drop).float()
         joints = self.layout.joints
         free = (~known).to(out)[:, None]
         root = root + free * out[..., :3] * self.feature_std[:3]
@@ -249,7 +264,9 @@ class _Encoder(nn.Module):
         self.norm = nn.LayerNorm(c.width)
         self.leave = linear(c.width, outputs, g, 0.0)
 
-    def forward(self, x: Tensor, known: Tensor, near: Neighbours, extra: Tensor | None) -> Tensor:
+    def forward(
+        self, x: Tensor, known: Tensor, near: Neighbours, extra: Tensor | None, drop: Dropout | None
+    ) -> Tensor:
         flag = known.to(x)[:, None].expand(*x.shape[:-1], 1)
         t = torch.arange(len(known), device=x.device)
         times = torch.cat((_waves(t - near.before, 16), _waves(near.after - t, 16)), -1).to(x)
@@ -259,7 +276,7 @@ class _Encoder(nn.Module):
         apart = (t[:, None] - t[None, :]).clamp(-self.reach, self.reach) + self.reach
         bias = self.bias[:, apart]
         for layer in self.layers:
-            h = layer(h, bias)
+            h = layer(h, bias, drop)
         return self.leave(self.norm(h))
 
 
@@ -273,12 +290,14 @@ class _Layer(nn.Module):
         self.up = linear(c.width, c.feedforward, g)
         self.down = linear(c.feedforward, c.width, g, 1 / math.sqrt(2 * layers))
 
-    def forward(self, h: Tensor, bias: Tensor) -> Tensor:
+    def forward(self, h: Tensor, bias: Tensor, drop: Dropout | None) -> Tensor:
         n, t, width = h.shape
         q, k, v = self.mix(self.norm1(h)).view(n, t, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         a = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias.to(q).unsqueeze(0))
-        h = h + self.out(a.transpose(1, 2).reshape(n, t, width))
-        return h + self.down(functional.gelu(self.up(self.norm2(h))))
+        mixed = self.out(a.transpose(1, 2).reshape(n, t, width))
+        h = h + (mixed if drop is None else mixed * drop.mask(mixed))
+        more = self.down(functional.gelu(self.up(self.norm2(h))))
+        return h + (more if drop is None else more * drop.mask(more))
 
 
 def _waves(x: Tensor, count: int) -> Tensor:
