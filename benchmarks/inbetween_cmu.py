@@ -5,7 +5,8 @@
 
 All clips are brought onto one subject's skeleton; the whole of the subjects in `HELD_OUT` is kept apart.
 Writes the model in half precision and, beside this script, `inbetween_cmu.json`: clips, cost, figures on
-the held-out subjects next to those of interpolation. Resumable.
+the held-out subjects next to those of interpolation, and after test-time adaptation, whose settings are
+chosen on subjects 03, 11 and 14 and whose figures are of subject 05's dances. Resumable.
 
 CMU's files state 120 frames a second throughout, but some were captured at 60: subject 90 falls with
 four times the gravity at 120, and the salsa of subjects 60 and 61 would be danced at 360 beats a minute.
@@ -20,8 +21,9 @@ import os
 from pathlib import Path
 
 import torch
+from inbetween import adapted_rows, cost
 
-from poise.eval.inbetween import evaluate
+from poise.eval.inbetween import Protocol, evaluate, test_set, truth_rows
 from poise.learn.between import BetweenTraining
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import save_model
@@ -33,6 +35,8 @@ from poise.synth.baselines import Baseline
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, uneven ground of 03, boxing and
 #: exercises of 14.
 HELD_OUT = r"-(05|11|03|14)_\d"
+#: The same subjects apart: settings of the adaptation are chosen on some, its figures are of the others.
+CHOICES = Protocol("CMU", final=r"-05_\d", validation=r"-(11|03|14)_\d")
 SIXTY = (("(^|-)90_", 60.0), ("salsa", 60.0))
 LENGTHS = (5, 15, 30, 45)
 #: A network of 5 million weights learns so little motion by heart; half of it with dropout does less so.
@@ -94,11 +98,25 @@ def main() -> None:
         "interpolation": evaluate(Baseline("interpolation", task.data.layout), held, LENGTHS),
         "zero-velocity": evaluate(Baseline("zero-velocity", task.data.layout), held, LENGTHS),
     }
+    choices, dances = (
+        test_set(CHOICES.split(task.bank, part), held.std, CHOICES) for part in ("validation", "final")
+    )
+    adapted, chosen = adapted_rows(model, choices, dances)
+    line = Baseline("interpolation", task.data.layout)
+    apart = {
+        "recorded": truth_rows(dances), "interpolation": evaluate(line, dances),
+        "network": evaluate(model.net, dances), "network + TTA": adapted,
+    }  # fmt: skip
     parts = {p: [c for c in task.bank.clips if task.config.protocol.part_of(c) == p]
              for p in ("train", "validation")}  # fmt: skip
     found = {
         **model.meta, "frames_with_mirrored": task.data.frames, "windows": len(held.root),
         "rows": {k: [dataclasses.asdict(r) for r in v] for k, v in rows.items()},
+        "adaptation": {
+            "windows": len(dances.root), "windows_of_choices": len(choices.root), "chosen": chosen,
+            "rows": {k: [dataclasses.asdict(r) for r in v] for k, v in apart.items()},
+        },
+        **cost(model, dances),
         "learned_from": parts["train"], "held_out": parts["validation"],
         "machine": f"{args.threads} threads, no GPU",
     }  # fmt: skip

@@ -13,7 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from poise.eval.inbetween import BANDAI, LAFAN1, Protocol, deviation, evaluate, test_set, truth_rows
+from poise.eval.inbetween import (
+    BANDAI,
+    LAFAN1,
+    Protocol,
+    deviation,
+    evaluate,
+    slide,
+    test_set,
+    truth_rows,
+)
+from poise.eval.inbetween import TestSet as InbetweenTestSet
 from poise.motion import read_clip
 from poise.motion.windows import LAFAN1_FACING, pack_frames, without_still_root
 from poise.nets.transition import Layout
@@ -229,3 +239,20 @@ def test_the_truth_has_no_error_and_its_own_physics(data_dir: Path) -> None:
     test = make_test_set(bank, torch.ones(len(bank.names), 3, dtype=torch.float64), BANDAI)
     for row in truth_rows(test):
         assert row.l2p == row.l2q == row.npss == 0.0 and row.sm_mm > 0 and row.fp_mm <= 0
+
+
+def test_feet_slide_where_the_recorded_ones_stand_and_only_there() -> None:
+    pos = torch.zeros(1, 65, 3, 3, dtype=torch.float64)
+    # Joint 1 stands, joint 2 walks: only joint 1 counts.
+    pos[:, :, 2, 0] = torch.arange(65) * 0.02
+    turns, plain = torch.zeros(1, 65, 3, 4), torch.zeros(1, 65, 3)
+    held = InbetweenTestSet(
+        BANDAI, plain, turns, pos, turns, plain[:, 0], plain[0], (1, 2), (-1, 0, 0), 30
+    )
+    made = pos[:, 10:15].clone()
+    assert slide(held, made, 5) == 0.0
+    made[0, :, 1, 0] = torch.arange(1, 6) * 0.01
+    made[0, :, 2, 0] += 1.0
+    # Five steps of 10 mm, and 50 mm back to where it stands.
+    assert slide(held, made, 5) == pytest.approx(100 / 6)
+    assert slide(held, made, 5) != slide(held, made[:, :4], 4)

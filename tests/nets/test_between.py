@@ -6,7 +6,14 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.nets.between import Between, BetweenConfig, last_before_gap, neighbours, parameter_count
+from poise.nets.between import (
+    Between,
+    BetweenConfig,
+    Dropout,
+    last_before_gap,
+    neighbours,
+    parameter_count,
+)
 from poise.nets.transition import Layout, joint_positions
 from poise.spatial import quat_rotate, slerp
 from toy_windows import SMALL, bank, known, layout, moved
@@ -112,6 +119,22 @@ def test_the_refiner_starts_from_the_first_result() -> None:
     refined.root.square().sum().backward()
     assert net.encoder.leave.weight.grad is None
     assert net.refiner is not None and net.refiner.leave.weight.grad is not None
+
+
+def test_dropout_leaves_channels_out_of_whole_windows() -> None:
+    net, of = network(), bank()
+    seen = torch.ones(30, dtype=torch.bool)
+    seen[10:29] = False
+
+    def filled(seed: int | None) -> torch.Tensor:
+        drop = None if seed is None else Dropout(0.5, torch.Generator().manual_seed(seed))
+        return net(of.root[None, :30], of.rot[None, :30], seen, of.offsets[:1], drop=drop)[0].root
+
+    assert torch.equal(filled(3), filled(3)) and not torch.allclose(filled(3), filled(4))
+    assert not torch.allclose(filled(3), filled(None))
+    mask = Dropout(0.25, torch.Generator().manual_seed(0)).mask(torch.zeros(200, 7, 50))
+    assert mask.shape == (200, 1, 50) and mask.mean() == pytest.approx(1.0, abs=0.02)
+    assert torch.allclose(mask.unique(), torch.tensor([0.0, 4 / 3]))
 
 
 def test_sizes() -> None:

@@ -18,6 +18,7 @@ from poise.motion.windows import (
     centred,
     cut,
     faced,
+    step_contacts,
     train_statistics,
     tree_world,
     window_starts,
@@ -102,8 +103,9 @@ class TestSet(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """One method at one length: L2P, L2Q and NPSS, Skeleton2Humanoid's FP (mm), FQ, JQ, SM (mm), and
-    the seconds one sequence took."""
+    """One method at one length: L2P, L2Q and NPSS, Skeleton2Humanoid's FP (mm), FQ, JQ, SM (mm), the
+    seconds one sequence took, and how far a foot joint slides per frame where the recorded one stands
+    (mm): FP and FQ say nothing where no joint's centre ever sinks below the floor."""
 
     length: int
     l2p: float
@@ -114,6 +116,7 @@ class Row:
     jq: float
     sm_mm: float
     seconds: float = 0.0
+    slide_mm: float = 0.0
 
 
 def test_set(held_out: FrameBank, statistics: Tensor, protocol: Protocol) -> TestSet:
@@ -152,15 +155,31 @@ def score(test: TestSet, filled: Filled, length: int, seconds: float = 0.0) -> R
         float(npss(turned.flatten(2), quat.flatten(2))),
         *physics(mine, test.feet, test.fps),
         seconds,
+        slide(test, mine, length),
     )
+
+
+def slide(test: TestSet, pos: Tensor, length: int) -> float:
+    """How far feet of transitions `pos (N, length, J, 3)` m slide per frame, mm.
+
+    Mean over foot joints and steps, those into and out of the transition too, in which the recorded
+    joint stands by Harvey et al.'s rule (`motion.windows.step_contacts`); 0 where none stands.
+    """
+    feet, past = list(test.feet), test.protocol.past
+    truth = test.pos[:, past - 1 : past + length + 1, feet]
+    held = step_contacts(truth)[:, :-1]
+    path = torch.cat((truth[:, :1], pos[:, :, feet], truth[:, -1:]), 1)
+    moved = torch.diff(path[..., :2], dim=1).norm(dim=-1)
+    return float(1000 * (moved * held).sum() / held.sum().clamp_min(1))
 
 
 def truth_rows(test: TestSet) -> list[Row]:
     """The recorded motion's own figures: zero errors, and its FP, FQ, JQ and SM."""
-    return [
-        Row(n, 0.0, 0.0, 0.0, *physics(test.truth(n)[0], test.feet, test.fps))
-        for n in test.protocol.lengths
-    ]
+    rows = []
+    for n in test.protocol.lengths:
+        pos = test.truth(n)[0]
+        rows.append(Row(n, 0.0, 0.0, 0.0, *physics(pos, test.feet, test.fps), 0.0, slide(test, pos, n)))
+    return rows
 
 
 @torch.no_grad()
@@ -197,6 +216,7 @@ def markdown(name: str, methods: Mapping[str, Sequence[Row]]) -> str:
         "L2P": ("l2p", "{:.3f}"), "L2Q": ("l2q", "{:.3f}"), "NPSS": ("npss", "{:.4f}"),
         "FP, mm": ("fp_mm", "{:.3f}"), "FQ": ("fq", "{:.2%}"), "JQ": ("jq", "{:.2%}"),
         "SM, mm/frame": ("sm_mm", "{:.1f}"),
+        "slide, mm/frame": ("slide_mm", "{:.2f}"),
     }  # fmt: skip
     lengths = [row.length for row in next(iter(methods.values()))]
     lines = []

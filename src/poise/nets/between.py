@@ -196,7 +196,9 @@ class Between(nn.Module):
         sixd = held.mats[..., :2].transpose(-1, -2).flatten(-2)
         x = (self._joined(held.root, sixd, held.mats, offsets) - self.feature_mean) / self.feature_std
         x = torch.cat((x, held.contact), -1)
-        return first, self._correct(self.refiner, x, held.root, sixd, held.mats, known, near, extra, drop)
+        return first, self._correct(
+            self.refiner, x, held.root, sixd, held.mats, known, near, extra, drop
+        )
 
     def _correct(
         self, encoder: _Encoder, x: Tensor, root: Tensor, sixd: Tensor, mats: Tensor,
