@@ -93,8 +93,8 @@ def chosen(
 ) -> Adaptation:
     """The setting and the iterations whose transitions have the lowest FP, FQ, slide and L2P on validation.
 
-    Score: foot skating is what TTA is for, but L2P must not rise, so settings that raise it are out; of
-    the others the one counts that lowers the share and depth of penetration, the feet's slide and L2P most.
+    Foot skating is what TTA is for, but L2P must not rise, so settings that raise it are out; of the
+    others the one counts that lowers the share and depth of penetration, the slide and L2P most.
     """
     held = some_of(held, _ENOUGH)
     known = known_of(held, length)
