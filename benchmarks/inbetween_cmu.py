@@ -51,6 +51,8 @@ def config_of(args: argparse.Namespace) -> Inbetween:
     return Inbetween(
         name="CMU",
         validation=HELD_OUT,
+        # By steps alone feet would stand in 18 % of the frames, and none would be held.
+        contacts="floor",
         mirror=True,
         stretch=1.3,
         seed=args.seed,

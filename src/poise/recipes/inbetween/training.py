@@ -27,6 +27,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.eval.inbetween import Protocol, TestSet, deviation, evaluate, test_set
+from poise.kin.contacts import standing_labels
 from poise.learn.between import BetweenObjective, BetweenTraining
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.frames import FrameData, Sampler
@@ -45,6 +46,7 @@ from poise.recipes.inbetween.data import library_bank
 from poise.recipes.library import LibraryConfig
 from poise.spatial import normalize
 
+Contacts = Literal["harvey", "two-stage", "floor"]
 RUN_FILE = "run.safetensors"
 FRAMES = "frames.safetensors"
 
@@ -55,7 +57,9 @@ class Inbetween:
 
     net: transformer or rtn. final, validation: regular expressions in the names of clips that are kept
     apart (see `eval.inbetween.Protocol`); final clips are never read by training or choices.
-    contacts: whose labels the network learns. ema: of the averaged weights that are used.
+    contacts: whose labels the network learns: Harvey et al.'s or Skeleton2Humanoid's, which tell from
+    steps alone, or "floor", of slow feet near it, for recordings whose feet slide.
+    ema: of the averaged weights that are used.
     mirror: whether it learns from every clip in a mirror, too. stretch: windows are drawn up to so many
     times faster and slower than recorded.
     onto: a motion file on whose skeleton all clips are brought by `library_of`, which also cuts what
@@ -67,7 +71,7 @@ class Inbetween:
     name: str = "library"
     final: str = r"(?!)"
     validation: str | None = None
-    contacts: Literal["harvey", "two-stage"] = "harvey"
+    contacts: Contacts = "harvey"
     fps: float = 30.0
     seed: int = 0
     ema: float = 0.999
@@ -124,16 +128,16 @@ def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> 
     return Task(config, bank, data, held, notes)
 
 
-def frame_data(
-    bank: FrameBank, layout: Layout, std: torch.Tensor, rule: Literal["harvey", "two-stage"]
-) -> FrameData:
+def frame_data(bank: FrameBank, layout: Layout, std: torch.Tensor, rule: Contacts) -> FrameData:
     """A bank as float32 tensors with contact labels per clip."""
     points = bank.positions()[:, list(bank.feet)]
-    labels = [
-        step_contacts(part, rule).float() for part in points.split(torch.diff(bank.first).tolist())
-    ]
+    parts = points.split(torch.diff(bank.first).tolist())
+    if rule == "floor":
+        labels = standing_labels(parts, bank.fps)
+    else:
+        labels = [step_contacts(part, rule) for part in parts]
     return FrameData(
-        layout, bank.root.float(), bank.rot.float(), torch.cat(labels), bank.offsets.float(),
+        layout, bank.root.float(), bank.rot.float(), torch.cat(labels).float(), bank.offsets.float(),
         bank.first, std.float(),
     )  # fmt: skip
 
