@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from rich.progress import BarColumn, Progress, TextColumn
+from tyro.conf import arg
 
 from poise.cli.console import err, notes, say, tell
 from poise.cli.library_options import Library
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from poise.learn.inbetween import BlockStats
 
 
+Contacts = Literal["floor", "harvey", "two-stage"]
+
+
 @dataclass(frozen=True)
 class Network:
     """What only the recipe inbetween knows."""
@@ -29,6 +33,12 @@ class Network:
     """inbetween: the network; rtn is that of Harvey et al. 2020."""
     mirror: bool = False
     """inbetween: learn from every clip in a mirror, too."""
+    contacts: Annotated[Contacts, arg(metavar="NAME")] = "floor"
+    """inbetween: when a foot stands: floor says while it is low and slow; harvey and two-stage are the
+    papers' rules, for recordings whose feet never slide."""
+    dropout: Annotated[float, arg(metavar="SHARE")] = 0.0
+    """inbetween: share of the transformer's channels that a step leaves out; 0.15 suits less than an
+    hour of motion."""
 
 
 def run(library: Library, network: Network, out: Path, minutes: float, seed: int, steps: int | None,
@@ -38,6 +48,7 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
 
     import torch
 
+    from poise.learn.between import BetweenTraining
     from poise.recipes.inbetween import RUN_FILE, Inbetween, begin, train
 
     folder = library.folder("inbetween")
@@ -45,11 +56,16 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     torch.set_num_threads(threads or cores)
+    if not 0 <= network.dropout < 1:
+        raise PoiseError(f"--dropout must be at least 0 and below 1, got {network.dropout:g}")
+    if network.dropout and network.net == "rtn":
+        raise PoiseError("the network rtn has no --dropout", hint="Leave it out")
     config = Inbetween(
         net=network.net, name=folder.name, seed=seed, validation=library.hold_out,
-        final=library.never or r"(?!)", mirror=network.mirror,
+        final=library.never or r"(?!)", contacts=network.contacts, mirror=network.mirror,
         onto=None if library.onto is None else str(library.onto.resolve()),
         reading=library.reading() if library.library_fps or library.library_skeleton else None,
+        between_training=BetweenTraining(dropout=network.dropout),
     )  # fmt: skip
     with claimed(out):
         task, steps = begin(out, folder, config, minutes, steps, tell)
