@@ -58,11 +58,10 @@ _LENGTH = 30
 
 
 def settings(protocol: Protocol, net: str, seed: int, args: argparse.Namespace) -> Inbetween:
-    """One training, on mirrored clips too: RTN transitions of 30 as published, or of all lengths with
-    --rtn-longest."""
+    """One training: RTN transitions of 30 as published, or of all lengths with --rtn-longest."""
     config = Inbetween(
         net=net, name=protocol.name, final=protocol.final, validation=protocol.validation, seed=seed,
-        mirror=True, stretch=1.3, between=BetweenConfig(refine=args.refine),
+        between=BetweenConfig(refine=args.refine),
     )  # fmt: skip
     rtn = dataclasses.replace(config.rtn, longest=args.rtn_longest)
     return dataclasses.replace(config, rtn=rtn)
