@@ -1,10 +1,11 @@
-"""A dance with keyframes a second apart, filled by `poise inbetween`, beside the recording.
+"""Dances with keyframes a second apart, filled by `poise inbetween`, beside the recordings.
 
-    python benchmarks/inbetween_demo.py CLIP [--skeleton FILE.asf] [--every 1.0] [--model FILE]
+    python benchmarks/inbetween_demo.py CLIP ... [--skeleton FILE.asf] [--every 1.0] [--model FILE]
         [--picture docs/inbetween.svg] [--from 1.0]
 
 Writes `inbetween_demo.json`: how exactly keyframes are met, and how much feet slide in the recording, in
-the filled clip, and between the same keyframes interpolated. Draws the filled poses over the recorded.
+the filled clip, and between the same keyframes interpolated. Draws the first clip's filled poses over
+the recorded.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from poise.motion import Clip, read_clip
 from poise.motion.windows import foot_joints
 from poise.spatial import quat_conj, quat_mul, quat_to_rotvec
 from poise.synth.gaps import Gap
-from poise.synth.inbetween import Filling, fill_keyframes, interpolated
+from poise.synth.inbetween import EACH_GAP, Filling, fill_keyframes, interpolated
 from poise.view.poses import PoseRow, pose_rows
 
 
@@ -39,23 +40,13 @@ def slides(clip: Clip, low: np.ndarray, ground: float) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Fills, measures, draws."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("clip", type=Path)
-    parser.add_argument("--skeleton", type=Path)
-    parser.add_argument("--model", type=Path)
-    parser.add_argument("--every", type=float, default=1.0, help="seconds between keyframes")
-    parser.add_argument("--from", dest="begin", type=float, default=1.0, help="seconds, first shown")
-    parser.add_argument("--picture", type=Path, default=Path("docs/inbetween.svg"))
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    clip = read_clip(args.clip, skeleton=args.skeleton)
+def one(path: Path, args: argparse.Namespace, picture: Path | None) -> dict:
+    """What came of one clip, and its picture."""
+    clip = read_clip(path, skeleton=args.skeleton)
     step = round(args.every * clip.fps)
     keys = list(range(0, clip.frames, step))
     begun = time.perf_counter()
-    filled = fill_keyframes(clip, keys, model_of(args.model), Filling())
+    filled = fill_keyframes(clip, keys, model_of(args.model), Filling(adaptation=EACH_GAP))
     seconds = time.perf_counter() - begun
     gaps = [Gap(a, b) for a, b in pairwise(keys)]
     made, plain = filled.clips[0], interpolated(clip, *clip.tensors(), gaps)
@@ -68,7 +59,7 @@ def main() -> None:
     speed = np.linalg.norm(np.diff(feet, axis=0, append=feet[-1:]), axis=-1) * clip.fps
     low = (feet[..., 2] < ground + 0.03) & (speed < 0.35)
     found = {
-        "clip": args.clip.name, "fps": clip.fps, "frames": clip.frames, "keyframes": len(keys),
+        "clip": path.name, "fps": clip.fps, "frames": clip.frames, "keyframes": len(keys),
         "seconds_between": args.every, "keyframe_mm": float(apart), "keyframe_degrees": degrees,
         "seconds": seconds, "warnings": list(filled.warnings),
         "slide": {n: slides(c, low, float(ground.min())) for n, c in
@@ -78,15 +69,33 @@ def main() -> None:
             for n, c in (("filled", made), ("interpolated", plain))
         },
     }  # fmt: skip
-    args.out.write_text(json.dumps(found, indent=2) + "\n")
-    print(json.dumps(found, indent=2))
+    if picture is None:
+        return found
     first = keys[min(len(keys) - 3, round(args.begin / args.every))]
     frames = [first + round(k * step / 6) for k in range(13)]
     ghost = clip.positions()
     rows = [PoseRow("interpolated, over the recording", plain.positions(), ghost),
             PoseRow("poise inbetween, over the recording", made.positions(), ghost)]  # fmt: skip
-    pose_rows(f"{args.clip.name}: keyframes {args.every:g} s apart", rows, clip.skeleton.parents, frames,
-              clip.fps, keys, path=args.picture)  # fmt: skip
+    pose_rows(f"{path.name}: keyframes {args.every:g} s apart", rows, clip.skeleton.parents, frames,
+              clip.fps, keys, path=picture)  # fmt: skip
+    return found
+
+
+def main() -> None:
+    """Fills, measures, draws."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("clips", type=Path, nargs="+", metavar="CLIP")
+    parser.add_argument("--skeleton", type=Path)
+    parser.add_argument("--model", type=Path)
+    parser.add_argument("--every", type=float, default=1.0, help="seconds between keyframes")
+    parser.add_argument("--from", dest="begin", type=float, default=1.0, help="seconds, first shown")
+    parser.add_argument("--picture", type=Path, default=Path("docs/inbetween.svg"))
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    found = [one(path, args, args.picture if k == 0 else None) for k, path in enumerate(args.clips)]
+    args.out.write_text(json.dumps(found, indent=2) + "\n")
+    print(json.dumps(found, indent=2))
 
 
 if __name__ == "__main__":
