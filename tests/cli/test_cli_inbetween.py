@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poise.cli.main import main
 from poise.cli.inbetween import model_of
+from poise.cli.main import main
 from poise.motion import read_clip
 
 
