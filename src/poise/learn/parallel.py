@@ -116,6 +116,9 @@ def joined() -> Iterator[Comm]:
         raise PoiseError(f"the processes did not find each other ({reason})", where, hint) from None
     try:
         yield Group(int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+        # Gloo's threads may still hold tensors of the last call, which they can only give back while
+        # Python runs. Waiting for each other lets them, and no process ends while another still sends.
+        dist.barrier()
     finally:
         dist.destroy_process_group()
 
