@@ -88,7 +88,7 @@ def some_of(test: TestSet, most: int) -> TestSet:
 
 
 def chosen(
-    model: InbetweenModel, held: TestSet, length: int, settings: Sequence[Adaptation] = SETTINGS
+    model: InbetweenModel, held: TestSet, length: int, among: Sequence[Adaptation] = SETTINGS
 ) -> Adaptation:
     """The setting and the iterations whose transitions have the lowest figures on validation.
 
@@ -105,7 +105,7 @@ def chosen(
         feet = sum(_ratio(getattr(row, k), getattr(base, k)) for k in ("fq", "fp_mm", "slide_mm"))
         return row.l2p / base.l2p + 0.1 * feet + 100 * worse
 
-    return best_setting(settings, lambda s: choose_iterations(model.net, known, length, rated, s))
+    return best_setting(among, lambda s: choose_iterations(model.net, known, length, rated, s))
 
 
 def _ratio(value: float, before: float) -> float:

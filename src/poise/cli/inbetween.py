@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.progress import BarColumn, Progress, TextColumn
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.console import err, notes, say, tell
+from poise.cli.console import notes, say, tell
 from poise.cli.options import Reading
-from poise.cli.progress import EVERY_S, clock
+from poise.cli.progress import clock, showing
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -65,8 +63,15 @@ def run(options: Options, argv: Sequence[str]) -> int:
     model = model_of(o.model)
     adaptation = replace(EACH_GAP, iterations=o.adapt) if o.adapt else None
     filling = Filling(o.samples, o.foot_lock, adaptation=adaptation, seed=o.seed)
-    with showing() as show:
-        filled = fill_keyframes(clip, keys, model, filling, show)
+    begun = time.monotonic()
+    with showing("filling", at_once=False) as show:
+
+        def count(done: int, of: int) -> None:
+            took = max(1e-9, time.monotonic() - begun)
+            left = clock(took / done * (of - done))
+            show(done / of, f"gap {done} of {of}, {done / took:.1f} gaps/s, {left} left")
+
+        filled = fill_keyframes(clip, keys, model, filling, count)
     for warning in filled.warnings:
         tell(f"warning: {warning}.", "yellow")
     for k, made in enumerate(filled.clips):
@@ -77,31 +82,6 @@ def run(options: Options, argv: Sequence[str]) -> int:
         draw(clip, filled.clips, keys, o.picture)
     notes(clip.skeleton.source.notes)
     return 0
-
-
-@contextlib.contextmanager
-def showing() -> Iterator[Callable[[int, int], None]]:
-    """A bar in a terminal, a line now and then elsewhere."""
-    console, begun = err(), time.monotonic()
-    last = [begun]
-
-    def said(done: int, of: int) -> str:
-        took = max(1e-9, time.monotonic() - begun)
-        return f"gap {done} of {of}, {done / took:.1f} gaps/s, {clock(took / done * (of - done))} left"
-
-    if not console.is_terminal:
-
-        def line(done: int, of: int) -> None:
-            if time.monotonic() - last[0] >= EVERY_S:
-                last[0] = time.monotonic()
-                tell(said(done, of))
-
-        yield line
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("filling", total=1.0, what="")
-        yield lambda done, of: bar.update(task, completed=done / of, what=said(done, of))
 
 
 def draw(clip: Clip, made: Sequence[Clip], keys: Sequence[int], path: Path) -> None:

@@ -62,6 +62,26 @@ def times(stats: IterationStats, until: Until) -> str:
 
 
 @contextlib.contextmanager
+def showing(title: str, at_once: bool = True) -> Iterator[Callable[[float, str], None]]:
+    """Gives the function that shows a share, 0 to 1, and a text: a bar in a terminal, elsewhere a line
+    every `EVERY_S`, and with `at_once` also at the beginning and at the end."""
+    console, last = err(), [float("-inf") if at_once else time.monotonic()]
+    if not console.is_terminal:
+
+        def line(done: float, what: str) -> None:
+            if time.monotonic() - last[0] >= EVERY_S or (at_once and done >= 1):
+                last[0] = time.monotonic()
+                tell(what)
+
+        yield line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=1.0, what="")
+        yield lambda done, what: bar.update(task, completed=done, what=what)
+
+
+@contextlib.contextmanager
 def training(until: Until) -> Iterator[Callable[[IterationStats], None]]:
     """Gives the function that shows one iteration."""
     console = err()

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from rich.progress import BarColumn, Progress, TextColumn
 from tyro.conf import arg
 
-from poise.cli.console import err, notes, say, tell
+from poise.cli.console import notes, say, tell
 from poise.cli.library_options import Library
 from poise.cli.output import claimed
-from poise.cli.progress import EVERY_S, clock
+from poise.cli.progress import clock, showing
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -72,8 +68,10 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
     used = len(task.data.first) - 1
     say(f"{used} clips, {task.data.frames:,} frames to learn from; {steps:,} steps")
     notes(task.notes)
-    with showing() as show:
-        _, stats, stopped = train(task, out, steps, None, show)
+    with showing("training") as show:
+        _, stats, stopped = train(
+            task, out, steps, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}")
+        )
     if stopped:
         tell("Stopped; the training so far is saved. Go on with:")
         tell(f"  {again}")
@@ -86,6 +84,11 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
     return 0
 
 
+def times(stats: BlockStats) -> str:
+    """How far it is."""
+    return f"step {stats.step:,} of {stats.steps:,}, {clock(stats.left)} left"
+
+
 def figures(stats: BlockStats) -> str:
     """What one block of steps says."""
     said = [f"{stats.samples_per_s:,.0f} windows/s", f"loss {stats.parts['loss']:.3f}"]
@@ -93,32 +96,3 @@ def figures(stats: BlockStats) -> str:
         f"{k.split('/')[1]} {v:.3f}" for k, v in stats.parts.items() if k.startswith("validation/l2p")
     ]
     return "  ".join(said)
-
-
-@contextlib.contextmanager
-def showing() -> Iterator[Callable[[BlockStats], None]]:
-    """A bar in a terminal, a line now and then elsewhere."""
-    console, last = err(), [float("-inf")]
-
-    def times(stats: BlockStats) -> str:
-        return f"step {stats.step:,} of {stats.steps:,}, {clock(stats.left)} left"
-
-    if not console.is_terminal:
-
-        def line(stats: BlockStats) -> None:
-            if time.monotonic() - last[0] >= EVERY_S or stats.step >= stats.steps:
-                last[0] = time.monotonic()
-                tell(f"{times(stats)}  {figures(stats)}")
-
-        yield line
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("training", total=1.0, what="")
-
-        def show(stats: BlockStats) -> None:
-            bar.update(
-                task, completed=stats.step / stats.steps, what=f"{times(stats)}  {figures(stats)}"
-            )
-
-        yield show

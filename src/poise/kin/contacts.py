@@ -48,7 +48,8 @@ def standing_labels(
         own = points[..., 2].quantile(0.1, dim=0)
         limits = own.clamp(usual - 0.04, usual + 0.06) + above
         # Each joint has a floor of its own.
-        lowered = points - torch.stack((limits * 0, limits * 0, limits), -1)
+        lowered = points.clone()
+        lowered[..., 2] -= limits
         out.append(contact_labels(lowered, fps, 0.0, speed))
     return out
 
