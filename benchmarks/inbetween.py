@@ -7,7 +7,8 @@ Rows: zero-velocity, interpolation, RTN, RTN + TTA, transformer, transformer + T
 frames: L2P, L2Q, NPSS, FP, FQ, JQ, SM, with the recorded motion's own row. `--name Bandai` holds styles
 out as `eval.inbetween.BANDAI` says, LAFAN1 subject 5. Figures are of the final part (the default) or,
 for development, of `--part validation`. How the adaptation is set is chosen on validation alone.
-Everything is resumable: trainings go on, and finished networks are read back. Give it as many threads
+Everything is resumable: trainings go on, finished networks are read back, and runs that FILE.json holds
+figures of for as many steps are not scored again (their cost is measured anew). Give it as many threads
 as there are cores (`--threads`).
 """
 
@@ -161,27 +162,22 @@ def trained(task: Task, folder: Path, steps: int, again: bool) -> InbetweenModel
     return train(task, folder, steps, on_block=shown)[0]
 
 
-def run_one(
-    net: str, seed: int, protocol: Protocol, args: argparse.Namespace, found: dict
-) -> dict[str, list[Row]]:
-    """Trains one network with one seed and scores it, with and without adaptation."""
+def run_one(net: str, seed: int, protocol: Protocol, args: argparse.Namespace, found: dict) -> None:
+    """Trains one network with one seed and scores it, with and without adaptation, into `found`."""
     folder = args.work / protocol.name / f"{net}-{seed}"
     task, steps = begin(
         folder, args.library, settings(protocol, net, seed, args), args.minutes, args.steps
     )
     model = trained(task, folder, steps, False)
-    held = task.validation
     test = part_of(task, args.part)
-    rows = evaluate(model.net, test)
-    more: dict[str, list[Row]] = {net: rows}
-    key = f"{net}-{seed}"
-    found["runs"][key] = {"rows": [dataclasses.asdict(r) for r in rows], "steps": steps,
-                          "seconds": model.meta.get("seconds"), **cost(model, test)}  # fmt: skip
-    if held is not None:
-        with_tta, notes = adapted_rows(model, held, test)
-        more[f"{net} + TTA"] = with_tta
-        found["runs"][key] |= {"tta": [dataclasses.asdict(r) for r in with_tta], "tta_settings": notes}
-    return more
+    done = found["runs"].setdefault(f"{net}-{seed}", {})
+    if done.get("steps") != steps or "rows" not in done:
+        done.clear()
+        done["rows"] = [dataclasses.asdict(r) for r in evaluate(model.net, test)]
+    done |= {"steps": steps, "seconds": model.meta.get("seconds"), **cost(model, test)}
+    if task.validation is not None and "tta" not in done:
+        with_tta, notes = adapted_rows(model, task.validation, test)
+        done |= {"tta": [dataclasses.asdict(r) for r in with_tta], "tta_settings": notes}
 
 
 def part_of(task: Task, part: str) -> TestSet:
