@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as Bar
-
-from poise.cli.console import err, say, table, tell
-from poise.cli.progress import EVERY_S, clock
+from poise.cli.console import say, table, tell
+from poise.cli.progress import clock, showing
 
 if TYPE_CHECKING:
     from poise.eval import RecoveryCard
-    from poise.learn import Until
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual.progress import Progress
     from poise.recipes.perpetual.run import PerpetualResult
@@ -99,25 +94,12 @@ def events(p: Progress) -> None:
 
 
 @contextlib.contextmanager
-def showing(until: Until) -> Iterator[Callable[[Progress], None]]:
-    """A bar in a terminal, a line now and then elsewhere."""
-    console, last = err(), [-math.inf]
+def training() -> Iterator[Callable[[Progress], None]]:
+    """A bar in a terminal, a line now and then elsewhere, and `events`."""
+    with showing("training") as show:
 
-    def line(p: Progress) -> None:
-        if time.monotonic() - last[0] >= EVERY_S or p.share >= 1.0:
-            last[0] = time.monotonic()
-            tell(f"{times(p)}  {figures(p)}")
-        events(p)
-
-    if not console.is_terminal:
-        yield line
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("training", total=1.0, what="")
-
-        def show(p: Progress) -> None:
-            bar.update(task, completed=p.share, what=f"{times(p)}  {figures(p)}")
+        def one(p: Progress) -> None:
+            show(p.share, f"{times(p)}  {figures(p)}")
             events(p)
 
-        yield show
+        yield one

@@ -84,32 +84,8 @@ def showing(title: str, at_once: bool = True) -> Iterator[Callable[[float, str],
 @contextlib.contextmanager
 def training(until: Until) -> Iterator[Callable[[IterationStats], None]]:
     """Gives the function that shows one iteration."""
-    console = err()
-    if not console.is_terminal:
-        yield _Lines(until)
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.fields[what]}"))
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("training", total=1.0, what="")
-
-        def show(stats: IterationStats) -> None:
-            what = f"{times(stats, until)}  {figures(stats)}"
-            bar.update(task, completed=share_done(stats, until), what=what)
-
-        yield show
-
-
-class _Lines:
-    """The first iteration, the last one, and one every `EVERY_S` seconds."""
-
-    def __init__(self, until: Until):
-        self.until, self.last = until, -math.inf
-
-    def __call__(self, stats: IterationStats) -> None:
-        now = time.monotonic()
-        if now - self.last >= EVERY_S or share_done(stats, self.until) >= 1.0:
-            self.last = now
-            tell(f"{times(stats, self.until)}  {figures(stats)}")
+    with showing("training") as show:
+        yield lambda stats: show(share_done(stats, until), f"{times(stats, until)}  {figures(stats)}")
 
 
 @contextlib.contextmanager

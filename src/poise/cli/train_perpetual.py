@@ -14,7 +14,8 @@ from poise.cli.library_options import Library
 from poise.cli.options import Body, Training
 from poise.cli.output import claimed
 from poise.cli.perpetual_options import Primitives, settings
-from poise.cli.perpetual_shown import report, showing
+from poise.cli.perpetual_shown import report
+from poise.cli.perpetual_shown import training as shown
 from poise.cli.progress import clock
 from poise.errors import PoiseError
 
@@ -43,7 +44,7 @@ def run(
     imitation = begin(library, primitives, out, config, training, held)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result = training, None
-    with contextlib.suppress(KeyboardInterrupt), showing(until) as show:
+    with contextlib.suppress(KeyboardInterrupt), shown() as show:
         # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
         result = train(imitation, out, until, show, t.threads, device=t.device, beginning=beginning())
     if result is None or result.interrupted:
