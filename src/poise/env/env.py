@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.control import Drive, Wrench
+from poise.control import Wrench
+from poise.env.acting import Acting
 from poise.env.bodies import Bodies
 from poise.env.budget import HelpBudget
 from poise.env.frame import Frame, Pose, placed
 from poise.env.means import Means
-from poise.env.record import TensorFunction, record
 from poise.env.recoveries import Recoveries
 from poise.env.recovery import FALLEN, point_goal, root_distance, toward
 from poise.env.reference import FIELDS, Reference
@@ -71,12 +71,9 @@ class ImitationEnv:
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
         self._goal, self._goal_rows = torch.empty(0), torch.empty(0, dtype=torch.long)
         self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long).to(here)
-        # One for characters with help, one for those without.
-        self._control: dict[bool, TensorFunction] = {}
-        self._helped: tuple[int, ...] = getattr(task.residual, "bodies", (0,))
-        self._places = torch.tensor([b + 1 for b in self._helped], device=here)
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
+        self._acting = Acting(backend, task.pd, task.residual, fused)
         asking = (*task.obs, *task.rewards, *task.dones)
         self._torqued = any(getattr(term.fn, "uses_torque", False) for term in asking)
         self._torques = self._bind_torques()
@@ -182,7 +179,10 @@ class ImitationEnv:
             )
         # A copy, since a restart clears its rows and the caller's actions are the caller's.
         self.action.copy_(actions)
-        self._apply()
+        help_left = self.help.at(self.clip)
+        self.wrench = self._acting.apply(
+            self.action, self.reference.hinges, self._goal_rows, help_left, self.help.now > 0
+        )
         (self._guard or self.backend).step(self.substeps)
         self._counts += 1
         ref, held = self._goal, None if self.recoveries is None else self.recoveries.tick(self.frame)
@@ -222,56 +222,6 @@ class ImitationEnv:
             failed, done = failed & free, done & free
         terminated = failed | done
         return failed, terminated, (seen.age >= self.task.horizon) & ~terminated
-
-    def _apply(self) -> None:
-        """Turns the action into what drives the characters, held over the control step."""
-        state, drive, residual = self.backend.state, self.backend.drive, self.task.residual
-        given = (
-            self.action,
-            self.reference.hinges,
-            self._goal_rows,
-            state.xpos,
-            state.xquat,
-            state.xipos,
-            drive.ctrl,
-            drive.qfrc_applied,
-            drive.xfrc_applied,
-            self.help.at(self.clip),
-        )
-        helped = self.help.now > 0 and residual is not None and residual.limit_n + residual.limit_nm > 0
-        if helped not in self._control:
-            plain = self._controlled if helped else self._unhelped
-            self._control[helped] = record(plain, given) if self._terms.fused else plain
-        done = self._control[helped](*given)
-        if residual is not None:
-            force, torque, point = done
-            self.wrench = Wrench(force, torque, point, self._helped)
-
-    def _controlled(
-        self, action: Tensor, hinges: Tensor, goal: Tensor, *state: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Fills the drive, which `state` holds, anew; the wrench's force, torque and point.
-
-        hinges: the reference's angles, of which the rows `goal` are aimed at.
-        """
-        self._unhelped(action, hinges, goal, *state)
-        xpos, xquat, xipos, *applied, scale = state
-        assert self.task.residual is not None
-        force, torque, point, self._helped = self.task.residual.apply(
-            action[:, self.hinges :], xpos, xquat, xipos, Drive(*applied), scale
-        )
-        return force, torque, point
-
-    def _unhelped(
-        self, action: Tensor, hinges: Tensor, goal: Tensor, *state: Tensor
-    ) -> tuple[Tensor, ...]:
-        """The same where no help is left: a wrench of nothing."""
-        drive, joints = Drive(*state[3:6]), action[:, : self.hinges]
-        drive.clear()
-        self.task.pd.apply(joints, hinges.index_select(0, goal), drive)
-        point = state[0][:, self._places].to(joints.dtype)
-        nothing = torch.zeros_like(point)
-        return nothing, nothing, point
 
     # --- views --------------------------------------------------------------------------------
 
