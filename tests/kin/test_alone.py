@@ -65,6 +65,19 @@ def test_held_above_the_floor_is_found_and_the_longest_rest_is_kept() -> None:
     assert (first, stop) == (53, clip.frames)
 
 
+def test_what_leads_away_from_a_spell_goes_with_it() -> None:
+    """From a platform the body is let down by 0.3 m, touches, and is held for another half second."""
+    clip, table = stand(4.0)
+    height = np.zeros(clip.frames)
+    height[20:50], height[53:66] = 0.5, 0.3
+    (found,) = not_alone(raised(clip, height), table)
+    assert (found.start, found.stop) == (20, 49) and found.trail == pytest.approx(16, abs=2)
+    assert longest_alone(clip, [found])[0] == 50 + found.trail + 3
+    # By itself half a second is a jump for all that is known.
+    height[20:50] = 0.0
+    assert not_alone(raised(clip, height), table) == ()
+
+
 def test_a_jump_falls_and_a_slow_one_does_not() -> None:
     clip, table = stand(3.0)
     t = np.arange(clip.frames) / FPS - 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -56,7 +56,8 @@ class NotAlone:
     """Frames `start` to `stop` (inclusive) of a clip that need more than a floor.
 
     kind: "held" above the floor without falling, "leaning" outside of its support, "below" the floor.
-    size_m: how high, how far, or how deep at most. seconds: how long.
+    size_m: how high, how far, or how deep at most. seconds: how long. lead, trail: frames before and
+    after it in which no floor bears the body either, too short to count by themselves.
     """
 
     kind: Kind
@@ -64,6 +65,8 @@ class NotAlone:
     stop: int
     size_m: float
     seconds: float
+    lead: int = 0
+    trail: int = 0
 
     def sentence(self, fps: float) -> str:
         """The spell in words, without a full stop."""
@@ -99,15 +102,25 @@ def not_alone(clip: Clip, table: BodyTable, rules: AloneRules | None = None) -> 
     out = np.where(low > rules.near_m, 0.0, _beyond(points, com, clip.fps, rules.near_m))
     found += _spells("leaning", out, out > rules.margin_m, rules.lean_s, clip.fps, TOUCH_S)
     found += _spells("below", -low, -low > rules.aloft_m, rules.held_s, clip.fps, GAP_S)
-    return tuple(sorted(found, key=lambda f: f.start))
+    unborne = (np.abs(low) > rules.near_m) | (out > rules.margin_m)
+    return tuple(sorted((_with_ends(f, unborne, clip.fps) for f in found), key=lambda f: f.start))
+
+
+def _with_ends(found: NotAlone, unborne: np.ndarray, fps: float) -> NotAlone:
+    """The spell with how long the body is not borne before and after it, moments aside."""
+    for a, b in spells(unborne, round(GAP_S * fps)):
+        if a <= found.stop and b >= found.start:
+            return replace(found, lead=max(0, found.start - a), trail=max(0, b - found.stop))
+    return found
 
 
 def longest_alone(clip: Clip, found: Sequence[NotAlone]) -> tuple[int, int]:
-    """The longest stretch `[first, stop)` of frames without any of the spells, (0, 0) without any."""
+    """The longest stretch `[first, stop)` of frames without any of the spells and what leads there and
+    away, (0, 0) without any."""
     bad = np.zeros(clip.frames, dtype=bool)
     edge = round(EDGE_S * clip.fps)
     for f in found:
-        bad[max(f.start - edge, 0) : f.stop + 1 + edge] = True
+        bad[max(f.start - f.lead - edge, 0) : f.stop + f.trail + 1 + edge] = True
     free = [(a, b + 1) for a, b in spells(~bad, 0)]
     return max(free, key=lambda s: s[1] - s[0], default=(0, 0))
 
