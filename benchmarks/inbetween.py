@@ -51,7 +51,7 @@ PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}
 #: What is tried on validation, at one length; the iterations (0 to 7) are chosen at each.
 SETTINGS = (
     Adaptation(lr=3e-6, beta=0.01), Adaptation(lr=1e-5, beta=0.01), Adaptation(lr=3e-5, beta=0.01),
-    Adaptation(lr=1e-5, beta=0.0), Adaptation(lr=1e-5, beta=0.1),
+    Adaptation(lr=1e-4, beta=0.01), Adaptation(lr=1e-5, beta=0.0), Adaptation(lr=1e-5, beta=0.1),
 )  # fmt: skip
 #: Windows of the validation part that choices are made on.
 _ENOUGH = 128

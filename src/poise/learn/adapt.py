@@ -33,7 +33,7 @@ class Adaptation:
     """How a network is adapted to what it is asked."""
 
     iterations: int = 5
-    """Passes over the whole test set, or steps for one sequence; choose them on validation."""
+    """Steps, each on the whole test set or on one sequence; choose them on validation."""
     lr: float = 1e-5
     beta: float = 0.01
     """Weight of the root's path."""
@@ -42,6 +42,7 @@ class Adaptation:
     so that predicting no contact at all also lowers the loss."""
     optimizer: Literal["sgd", "adam"] = "adam"
     batch: int = 128
+    """Sequences whose gradients are worked out at once; it changes memory and time alone."""
 
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
@@ -87,8 +88,11 @@ def adapt(
 ) -> N:
     """A copy of the network adapted to a whole test set of one length; the given one stays as it is.
 
+    An iteration is one step down the mean loss of all sequences, so that as many iterations do as much
+    to a large set as to the small one that they were chosen on.
+
     Args:
-        known: all sequences; each iteration passes over them once, `config.batch` at a time, in order.
+        known: all sequences; of `config.batch` at a time the gradients are worked out, in order.
         on_iteration: called with its number (from 1), the network so far and the mean loss before it.
 
     Raises:
@@ -102,18 +106,18 @@ def adapt(
     count = len(known.target_root)
     for iteration in range(1, config.iterations + 1):
         total = 0.0
+        optimizer.zero_grad(set_to_none=True)
         for low in range(0, count, config.batch):
             part = Known(*(x[low : low + config.batch] for x in known))
             with torch.enable_grad():
-                loss = test_loss(own, part, own.fill(part, length), config).mean()  # type: ignore[arg-type]
-                optimizer.zero_grad(set_to_none=True)
+                loss = test_loss(own, part, own.fill(part, length), config).sum() / count  # type: ignore[arg-type]
                 loss.backward()
-            optimizer.step()
-            total += float(loss.detach()) * len(part.target_root)
+            total += float(loss.detach())
         if not total < float("inf"):
             raise TrainingError("the loss of the adaptation is not finite", hint="Lower its lr")
+        optimizer.step()
         if on_iteration is not None:
-            on_iteration(iteration, own, total / count)
+            on_iteration(iteration, own, total)
     for p in params:
         p.requires_grad_(False)
     return own

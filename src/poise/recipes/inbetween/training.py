@@ -167,6 +167,15 @@ def steps_in(task: Task, minutes: float, trials: int = 6) -> int:
     return max(20, int(60 * minutes / ((time.perf_counter() - begun) / trials)))
 
 
+def _completed(given: dict[str, Any], default: dict[str, Any]) -> dict[str, Any]:
+    """Settings with what they do not name as it is by default, also within their parts."""
+    parts = {
+        k: _completed(v, default[k]) if isinstance(v, dict) and isinstance(default.get(k), dict) else v
+        for k, v in given.items()
+    }
+    return {**default, **parts}
+
+
 def begin(
     folder: Path, library: Path, config: Inbetween, minutes: float, steps: int | None = None,
     tell: Callable[[str], None] = lambda _: None,
@@ -186,7 +195,7 @@ def begin(
         _, meta = load_checkpoint(run)
         # What a run of an earlier version does not name had today's default.
         default = json.loads(json.dumps(dataclasses.asdict(Inbetween())))
-        if {**default, **meta.get("config", {})} != said:
+        if _completed(meta.get("config", {}), default) != said:
             hint = "Resume it as it is or choose another folder"
             raise PoiseError("the folder holds a run with other settings", folder, hint)
         steps = int(meta["steps"])
