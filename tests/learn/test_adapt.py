@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -98,6 +100,18 @@ def test_no_iteration_changes_nothing_and_seeds_do_not_matter() -> None:
     assert torch.allclose(same.fill(k, 12).pos, net.fill(k, 12).pos, atol=1e-5)
     runs = [adapt(net, k, 12, Adaptation(iterations=2)).fill(k, 12).pos for _ in range(2)]
     assert torch.equal(*runs)
+
+
+def test_an_iteration_is_one_step_however_large_the_set_and_its_parts() -> None:
+    """What was chosen on a small set does as much to a large one."""
+    net, k = network(), known(bank(), dtype=torch.float32)
+    config = Adaptation(iterations=3, lr=1e-4)
+    whole = adapt(net, k, 12, config).fill(k, 12).pos
+    parts = adapt(net, k, 12, replace(config, batch=1)).fill(k, 12).pos
+    assert torch.allclose(whole, parts, atol=1e-5)
+    thrice = type(k)(*(x.repeat(3, *[1] * (x.dim() - 1)) for x in k))
+    more = adapt(net, thrice, 12, config).fill(k, 12).pos
+    assert torch.allclose(whole, more, atol=1e-5)
 
 
 def test_per_sequence_is_each_one_adapted_alone() -> None:

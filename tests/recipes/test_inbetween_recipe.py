@@ -11,10 +11,12 @@ import pytest
 
 from poise.cli.main import main
 from poise.errors import PoiseError
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.model import load_model, save_model
 from poise.motion import read_clip, write_bvh
 from poise.recipes.inbetween import FRAMES, Inbetween, begin, prepare, small, steps_in, train
 from poise.recipes.inbetween.data import library_bank, motion_files
+from poise.recipes.session import RUN_FILE
 from toy_human import swing
 
 
@@ -83,6 +85,18 @@ def test_a_run_is_kept_with_its_settings(run: Path, library: Path) -> None:
     assert (run / FRAMES).exists()
     with pytest.raises(PoiseError, match="other settings"):
         begin(run, library, small(Inbetween(name="toy", seed=5)), 1.0, 4)
+
+
+def test_a_run_of_before_a_setting_existed_goes_on(run: Path, library: Path, tmp_path: Path) -> None:
+    tensors, meta = load_checkpoint(run / RUN_FILE)
+    del meta["config"]["stretch"], meta["config"]["between_training"]["dropout"]
+    save_checkpoint(tmp_path / RUN_FILE, tensors, meta)
+    config = small(Inbetween(name="toy", final="old", validation="sad"))
+    training = replace(config.between_training, batch=4)
+    assert begin(tmp_path, library, replace(config, between_training=training), 1.0)[1] == 4
+    other = replace(training, dropout=0.2)
+    with pytest.raises(PoiseError, match="other settings"):
+        begin(tmp_path, library, replace(config, between_training=other), 1.0)
 
 
 def test_poise_inbetween_meets_its_keyframes(run: Path, library: Path, tmp_path: Path) -> None:
