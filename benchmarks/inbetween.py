@@ -8,8 +8,8 @@ frames: L2P, L2Q, NPSS, FP, FQ, JQ, SM, with the recorded motion's own row. `--n
 out as `eval.inbetween.BANDAI` says, LAFAN1 subject 5. Figures are of the final part (the default) or,
 for development, of `--part validation`. How the adaptation is set is chosen on validation alone.
 Everything is resumable: trainings go on, finished networks are read back, and runs that FILE.json holds
-figures of for as many steps are not scored again (their cost is measured anew). Give it as many threads
-as there are cores (`--threads`).
+figures of from the same training are not scored again (their cost is measured anew). Give it as many
+threads as there are cores (`--threads`).
 """
 
 from __future__ import annotations
@@ -171,10 +171,11 @@ def run_one(net: str, seed: int, protocol: Protocol, args: argparse.Namespace, f
     model = trained(task, folder, steps, False)
     test = part_of(task, args.part)
     done = found["runs"].setdefault(f"{net}-{seed}", {})
-    if done.get("steps") != steps or "rows" not in done:
+    training = {"steps": steps, "seconds": model.meta.get("seconds")}
+    if "rows" not in done or any(done.get(k) != v for k, v in training.items()):
         done.clear()
         done["rows"] = [dataclasses.asdict(r) for r in evaluate(model.net, test)]
-    done |= {"steps": steps, "seconds": model.meta.get("seconds"), **cost(model, test)}
+    done |= training | cost(model, test)
     if task.validation is not None and "tta" not in done:
         with_tta, notes = adapted_rows(model, task.validation, test)
         done |= {"tta": [dataclasses.asdict(r) for r in with_tta], "tta_settings": notes}

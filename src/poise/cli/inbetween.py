@@ -35,7 +35,7 @@ class Options:
     samples: Annotated[int, arg(metavar="N")] = 1
     """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others are variants."""
     foot_lock: bool = True
-    """Hold feet where the network says that they stand."""
+    """Feet that stand are held, and step clear of the floor; so they are left as they are."""
     adapt: Annotated[int, arg(metavar="N")] = 20
     """Iterations of test-time adaptation for each gap, about a second in all: its feet slide less.
     0 does without."""

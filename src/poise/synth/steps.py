@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from poise.kin.flips import spells
+
 #: Below this distance (m) of ankle or toes, whichever is less, a foot shuffles, turns or rolls.
 LEAST_M = 0.05
 #: Seconds that a step takes: those of a short one, and more for every metre.
@@ -83,27 +85,21 @@ def rises(soles: Tensor, stands: Tensor, clear: float = CLEAR_M) -> Tensor:
     """
     height = soles[..., 2] - soles[..., 2].amin(0)
     low, up = height.amin(-1), torch.zeros(stands.shape, dtype=soles.dtype)
+    free = ~stands
+    free[[0, -1]] = False
     for k in range(stands.shape[1]):
-        for start, stop in _swings(stands[:, k]):
-            a, b = max(0, start - 1), min(len(low) - 1, stop)
-            if (soles[b, k, :, :2] - soles[a, k, :, :2]).norm(dim=-1).amin() <= LEAST_M:
+        for first, last in spells(free[:, k].numpy(), 0):
+            gone = soles[last + 1, k, :, :2] - soles[first - 1, k, :, :2]
+            if gone.norm(dim=-1).amin() <= LEAST_M:
                 continue
-            t = torch.arange(1, stop - start + 1, dtype=soles.dtype) / (stop - start + 1)
+            count = last - first + 1
+            t = torch.arange(1, count + 1, dtype=soles.dtype) / (count + 1)
             arc = torch.sin(torch.pi * t)
-            short = (clear * arc - low[start:stop, k]) / arc**2
+            short = (clear * arc - low[first : last + 1, k]) / arc**2
             inner = (t - 0.5).abs() <= 0.5 * _MIDDLE
             if bool(inner.any()):
-                up[start:stop, k] = short[inner].amax().clamp(0, clear) * arc**2
+                up[first : last + 1, k] = short[inner].amax().clamp(0, clear) * arc**2
     return up
-
-
-def _swings(stands: Tensor) -> list[tuple[int, int]]:
-    """`[start, stop)` of the spells without standing, without the first and the last frame."""
-    off = torch.zeros(len(stands) + 2, dtype=torch.long)
-    off[2:-2] = (~stands[1:-1]).long()
-    edge = torch.diff(off)
-    starts, stops = (edge == 1).nonzero().flatten(), (edge == -1).nonzero().flatten()
-    return list(zip(starts.tolist(), stops.tolist(), strict=True))
 
 
 def _moved(path: Tensor) -> float:
