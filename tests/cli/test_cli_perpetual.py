@@ -93,13 +93,14 @@ def test_ctrl_c_saves_and_says_how_to_go_on(
 def test_the_switches_reach_the_run(folder: Path, tmp_path: Path, capsys) -> None:
     out, onto = tmp_path / "run", str(folder / "bend.txt")
     more = ("--goal", "keypoints", "--no-multiplicative", "--termination", "all", "--onto", onto)
-    more += ("--library-fps", "stand=15", "--no-expert")
+    more += ("--library-fps", "stand=15", "--no-expert", "--no-style")
     assert main(command(folder, out, *more)) == 0
     said, told = capsys.readouterr()
     assert "Recovery, 2 trials each: fallen " in said and "single with recovery begins" in told
     config = reopen(out).config
     assert (config.goal, config.multiplicative, config.termination) == ("keypoints", False, "all")
     assert config.method == "perpetual-plain" and config.recovery
+    assert config.action == "absolute" and config.style is None
     # Other frames per second of the same files are another library.
     assert main(command(folder, out, *more, "--library-fps", "bend=15", "--resume")) == 2
     assert "a run on the library" in capsys.readouterr().err
@@ -122,6 +123,7 @@ def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> Non
         (("--method", "deepmimic"), "has no --method"),
         (("--help-limit", "5"), "has no --help-limit"),
         (("--max-primitives", "0"), "--max-primitives must"),
+        (("--goal", "keypoints", "--action", "additive"), "Take absolute actions, or rotations"),
         (("--minutes", "0"), "--minutes must be above 0"),
         (("--hold-out", "nobody"), "fits no clip"),
         (("--single", "--no-progressive"), "only one of single"),

@@ -198,7 +198,7 @@ def test_states_of_other_kinds():
     single = HelpBudget(RULE)
     single.load_state(budget.state())
     assert single.state().tolist() == [0.5, 1, 2, 1]
-    with pytest.raises(PoiseError, match="help for 2 clips, and there are 3"):
+    with pytest.raises(PoiseError, match="help for 2 groups, and there are 3"):
         other.load_state(budget.state())
     with pytest.raises(PoiseError, match="2 groups need as many scales"):
         budget.set(torch.ones(3))
@@ -209,5 +209,5 @@ def test_states_of_other_kinds():
 
 
 def test_another_way_to_share_is_refused(task: Imitation):
-    with pytest.raises(PoiseError, match="by 'all' or by 'clip', got 'world'"):
+    with pytest.raises(PoiseError, match="by 'all', 'clip' or 'moment', got 'world'"):
         replace(task.task, help_by="world")  # type: ignore[arg-type]

@@ -58,8 +58,9 @@ def test_every_clip_is_evaluated_with_what_it_has_left() -> None:
 
 
 def test_the_switch_is_in_the_task() -> None:
-    for by_clip, groups in ((True, 3), (False, 1)):
-        env = build(library(), tiny(help_by_clip=by_clip)).env(2, threads=1)
+    task = build(library(), tiny())
+    for by, groups in (("moment", len(task.reference.moments)), ("clip", 3), ("all", 1)):
+        env = build(library(), tiny(help_by=by)).env(2, threads=1)
         assert env.help.groups == groups
         env.close()
 
@@ -83,7 +84,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[float | Tensor]:
 def test_time_limits_every_clip_and_stages_hand_their_help_on(
     tmp_path: Path, watched: list[float | Tensor]
 ) -> None:
-    imitation = begin(tmp_path, library(), tiny(expert=False))
+    imitation = begin(tmp_path, library(), tiny(expert=False, help_by="clip"))
     course = Course(imitation, tmp_path, Until(iterations=400), 1, tensorboard=False)
     course.env.help.set(torch.tensor([0.1, 1.0, 0.6]))
     course.iterate()
@@ -166,7 +167,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_resumed_run_helps_each_clip_as_before(
     tmp_path: Path, quick: None, watched: list[float | Tensor]
 ) -> None:
-    config = tiny(single=True, expert=False, help_share=1.0, ppo=replace(PPO, horizon=20, std=0.3))
+    ppo = replace(PPO, horizon=20, std=0.3)
+    config = tiny(single=True, expert=False, help_share=1.0, ppo=ppo, help_by="clip")
     until = Until(iterations=1000)
 
     def train(folder: Path, *pieces: int) -> dict[str, Tensor]:
@@ -192,8 +194,10 @@ def test_a_checkpoint_with_one_scale_for_all_goes_on_by_clip(
 ) -> None:
     """As those of before there was help by clip are, whose settings do not know of it either."""
     config, until = tiny(single=True, expert=False), Until(iterations=8)
-    old = {k: v for k, v in to_json(config).items() if k != "help_by_clip"}
-    assert from_json(old) == config
+    old = {k: v for k, v in to_json(config).items() if k not in ("help_by", "hard_starts")}
+    assert from_json(old) == replace(config, help_by="all", hard_starts=0.0)
+    for by_clip, by in ((True, "clip"), (False, "all")):
+        assert from_json(old | {"help_by_clip": by_clip}).help_by == by
     course = Course(begin(tmp_path, library(), config), tmp_path, until, 1, tensorboard=False)
     plain: Callable[[], Tensor] = course.env.help.state
     monkeypatch.setattr(course.env.help, "state", lambda: plain()[:4])

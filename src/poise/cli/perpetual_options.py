@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 Goal = Literal["rotations", "keypoints"]
 Termination = Literal["relaxed", "all", "code"]
+Action = Literal["absolute", "additive"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class Primitives:
     """perpetual: a primitive learns what earlier ones fail; so all learn with the composer."""
     termination: Annotated[Termination, arg(metavar="NAME")] = "relaxed"
     """perpetual: bodies whose mean distance ends an episode: relaxed leaves feet out, all; or code."""
+    action: Annotated[Action, arg(metavar="NAME")] = "absolute"
+    """perpetual: joint targets as such, as in the paper, or additive to the next frame's angles."""
+    style: bool = True
+    """perpetual: a discriminator rewards motion like that of the library; so the task alone does."""
 
 
 def settings(primitives: Primitives, training: Training, body: Body) -> Perpetual:
@@ -56,9 +61,11 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         multiplicative=primitives.multiplicative,
         progressive=primitives.progressive,
         termination=primitives.termination,
+        action=primitives.action,
         help_start=training.help_start,
         seed=training.seed,
         expert=training.expert,
         body=body.config(),
     )
+    config = config if primitives.style else replace(config, style=None)
     return config if training.envs is None else replace(config, num_envs=training.envs)

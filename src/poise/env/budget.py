@@ -24,10 +24,10 @@ EPISODES = 5.0
 class HelpBudget:
     """Scales the residual force's limits by what a schedule decides from the episodes' outcomes.
 
-    With several groups, which are clips, each has a scale of its own, decided from the outcomes of its
-    own episodes: as soon as it knows `EPISODES` of them, while groups with fewer go on collecting (a
-    schedule of time alone, such as `LinearHelp`, lowers them all the same). One group is all worlds,
-    and is decided every time.
+    With several groups, which are clips or their moments, each has a scale of its own, decided from the
+    outcomes of its own episodes: as soon as it knows `EPISODES` of them, while groups with fewer go on
+    collecting (a schedule of time alone, such as `LinearHelp`, lowers them all the same). One group is
+    all worlds, and is decided every time.
 
     scale: float32, multiplied with the limits, where the worlds are: 0-dimensional for one group, else
         `(G,)`. now: a Python number, which need not wait for a GPU: the largest scale of any group in
@@ -123,10 +123,16 @@ class HelpBudget:
         if self.groups == 1:
             self.count(len(group), int(failed.sum()) if len(group) else 0)
             return
+        self.add(group, torch.ones_like(failed).double(), failed.double())
+
+    def add(self, group: Tensor, ended: Tensor, failed: Tensor) -> None:
+        """One control step in which `ended (n,)` outcomes of `group (n,)`, 1 or 0 each, became known,
+        `failed (n,)` of them failures; of several groups."""
+        if self.schedule is None:
+            return
         if len(group):
             # Ones are added, so that their order, which a GPU does not keep, makes no difference.
-            outcome = torch.stack((torch.ones_like(failed), failed))
-            self._counts.index_add_(1, group, outcome.double())
+            self._counts.index_add_(1, group, torch.stack((ended, failed)))
         self._tick(self.schedule)
 
     def _tick(self, schedule: HelpSchedule) -> None:
@@ -166,7 +172,7 @@ class HelpBudget:
             self.set(now)
             self._counts.zero_()
         elif len(own) != 3 * self.groups:
-            what = f"the state is that of help for {len(own) // 3} clips, and there are {self.groups}"
+            what = f"the state is that of help for {len(own) // 3} groups, and there are {self.groups}"
             raise PoiseError(what)
         else:
             own = own.reshape(3, self.groups)

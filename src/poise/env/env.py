@@ -11,6 +11,7 @@ from poise.env.bodies import Bodies
 from poise.env.budget import HelpBudget
 from poise.env.frame import Frame, Pose, placed
 from poise.env.means import Means
+from poise.env.moments import Hardness
 from poise.env.recoveries import Recoveries
 from poise.env.recovery import FALLEN, point_goal, root_distance, toward
 from poise.env.reference import FIELDS, Reference
@@ -44,8 +45,10 @@ class ImitationEnv:
         fused: bool = True,
     ):
         self.num_envs, self.device = backend.num_envs, backend.device
-        self._starts = Starts(reference.length, weights, seed, task.first)
+        by = reference.moments
+        self._starts = Starts(reference.length, weights, seed, task.first, by, task.hard)
         self.reference = reference = reference.to(self.device)
+        self.hardness = Hardness(len(by), self.device) if task.hard and task.auto_reset else None
         self.backend, self.task, self.substeps = backend, task, substeps
         self.hinges = len(reference.humanoid.hinges)
         if backend.model.nu != self.hinges:
@@ -64,8 +67,9 @@ class ImitationEnv:
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
         schedule = task.help if task.auto_reset and task.residual else None
-        self.help = HelpBudget(schedule, here, len(reference.length) if task.help_by == "clip" else 1)
-        self.help.use(self._starts.weights > 0)
+        groups = {"all": 1, "clip": len(reference.length), "moment": len(by)}[task.help_by]
+        self.help = HelpBudget(schedule, here, groups)
+        self._use_help()
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
         # What the reference does one step from now, packed; kept up to date by whatever moves a world.
@@ -114,7 +118,16 @@ class ImitationEnv:
     @weights.setter
     def weights(self, odds: Tensor) -> None:
         self._starts.weights = odds
-        self.help.use(self._starts.weights > 0)
+        self._use_help()
+
+    def _use_help(self) -> None:
+        """Help of what is not drawn does not count."""
+        used = self._starts.weights > 0
+        self.help.use(used[self.reference.moments.clip.cpu()] if self._by_moment else used)
+
+    @property
+    def _by_moment(self) -> bool:
+        return self.task.help_by == "moment"
 
     def reset_to(self, clip: Tensor, frame: Tensor, kind: Tensor | None = None) -> Tensor:
         """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
@@ -139,7 +152,8 @@ class ImitationEnv:
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
     def _restart(self, ids: Tensor) -> None:
-        pick, frame = (x.to(self.device) for x in self._starts.draw(len(ids)))
+        odds = None if self.hardness is None else self.hardness.odds
+        pick, frame = (x.to(self.device) for x in self._starts.draw(len(ids), odds))
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
@@ -179,9 +193,11 @@ class ImitationEnv:
             )
         # A copy, since a restart clears its rows and the caller's actions are the caller's.
         self.action.copy_(actions)
-        help_left = self.help.at(self.clip)
+        row, moments = self._goal_rows, self.reference.moments
+        group = moments.of[row] if self._by_moment else self.clip
+        help_left = self.help.at(group)
         self.wrench = self._acting.apply(
-            self.action, self.reference.hinges, self._goal_rows, help_left, self.help.now > 0
+            self.action, self.reference.hinges, row, help_left, self.help.now > 0
         )
         (self._guard or self.backend).step(self.substeps)
         self._counts += 1
@@ -198,17 +214,32 @@ class ImitationEnv:
         if self.task.finish:
             reward = torch.where(terminated & ~failed, reward * (1.0 + self.task.finish), reward)
         obs, more = final, self.recoveries and self.recoveries.shares()
-        limit = self.help.limit(self._limit_n, self.clip)
+        limit = self.help.limit(self._limit_n, group)
         log = Means(self.terms, self.imitation, self.wrench, limit, more)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
-            self.help.count_worlds(self.clip[ids], failed[ids])
+            self._count(row, ids, failed, terminated)
             if len(ids):
                 self._restart(ids)
                 ref = self.reference.gather_packed(self.clip[ids], self.frame[ids])
                 obs = self._obs.copy_(final)
                 obs[ids] = self._terms.observe(self._seen(ref, self._goal[ids], ids))
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
+
+    def _count(self, row: Tensor, ids: Tensor, failed: Tensor, terminated: Tensor) -> None:
+        """Notes what became of the episodes in a step to `row (N,)`, after which those of `ids` end."""
+        by_moment = self._by_moment and self.help.schedule is not None
+        if by_moment or self.hardness is not None:
+            seen = self.reference.moments.outcomes(row, self.age, failed, terminated & ~failed)
+            if self.recoveries is not None:
+                # Who recovers, or has recovered, has not been where its age says.
+                seen = seen.of(self.recoveries.kind == 0)
+            if self.hardness is not None:
+                self.hardness.add(seen)
+            if by_moment:
+                self.help.add(*seen)
+        if not self._by_moment:
+            self.help.count_worlds(self.clip[ids], failed[ids])
 
     def _ends(self, seen: Seen, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Which episodes failed, are terminated and are truncated."""
@@ -324,6 +355,7 @@ class ImitationEnv:
             "help": self.help.state(),
             "weights": self.weights,
             "rng": self._starts.rng.get_state(),
+            **({} if self.hardness is None else {"hardness": self.hardness.state()}),
             **({} if self.recoveries is None else self.recoveries.state()),
         }
 
@@ -338,6 +370,8 @@ class ImitationEnv:
         for name in ("clip", "frame", "age", "action"):
             getattr(self, name).copy_(state[name])
         self.help.load_state(state["help"])
+        if self.hardness is not None and "hardness" in state:
+            self.hardness.load_state(state["hardness"])
         if self.recoveries is not None:
             self.recoveries.load_state(state)
         self._aim()

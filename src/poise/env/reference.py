@@ -14,6 +14,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.frame import Pose
+from poise.env.moments import Moments
 from poise.errors import PoiseError
 from poise.kin import Kinematics, cycle_step, cycle_velocity, qpos_velocity
 from poise.spatial import heading_quat, quat_mul, quat_rotate
@@ -88,6 +89,8 @@ class Reference:
             [p.min() for p in torch.split(qpos[:, 2].float(), self.length.tolist())]
         )
         self.any_cyclic = bool(self.cyclic.any())
+        #: Its clips cut into moments.
+        self.moments = Moments.cut(self.length, self.cyclic, rate_hz)
         clip = torch.arange(len(motions)).repeat_interleave(self.length)
         frame = torch.arange(len(qpos)) - self.start[clip]
         end = (frame == self.length[clip] - 1) & ~self.cyclic[clip]
@@ -109,6 +112,7 @@ class Reference:
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 setattr(there, name, value.to(device))
+        there.moments = self.moments.to(device)
         there._fast = Kinematics(self.humanoid.table, torch.float32, device)
         return there
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from poise.env.moments import MOMENT_S, Moments
 from poise.errors import PoiseError
+
+#: Who practises a moment begins at most so many seconds before its middle.
+RUN_UP_S = 2.0
 
 
 class Starts:
@@ -17,12 +21,24 @@ class Starts:
         seed: of all draws.
         first: share of the starts that stand on frame 0; the others are uniform over the frames from
             which at least one step can be made (reference state initialisation).
+        moments: of the clips, where some are practised more than others, see `draw`.
+        hard: share of the starts (before those on frame 0 are taken) that practise hard moments.
     """
 
-    def __init__(self, length: Tensor, weights: Tensor | None = None, seed: int = 0, first: float = 0.0):
-        self.length, self.first = length.cpu(), first
-        if not 0.0 <= first <= 1.0:
-            raise PoiseError(f"the share of starts on frame 0 must lie in [0, 1], got {first}")
+    def __init__(
+        self,
+        length: Tensor,
+        weights: Tensor | None = None,
+        seed: int = 0,
+        first: float = 0.0,
+        moments: Moments | None = None,
+        hard: float = 0.0,
+    ):
+        self.length, self.first, self.hard = length.cpu(), first, hard
+        self.moments = None if moments is None else moments.to(torch.device("cpu"))
+        for what, share in (("on frame 0", first), ("at hard moments", hard)):
+            if not 0.0 <= share <= 1.0:
+                raise PoiseError(f"the share of starts {what} must lie in [0, 1], got {share}")
         self._weights = self._checked((self.length - 1).double() if weights is None else weights)
         self.rng = torch.Generator().manual_seed(seed)
 
@@ -44,12 +60,34 @@ class Starts:
             raise PoiseError("the odds of clips must be finite, not below 0 and not all 0")
         return odds
 
-    def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """(clip, frame) of `count` starts, `(count,)` each."""
+    def draw(self, count: int, odds: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(clip, frame) of `count` starts, `(count,)` each.
+
+        odds: `(G,)` float64 of the moments, such as `Hardness.odds`. The share `hard` of the starts lies
+        in the `RUN_UP_S` before the middle of a moment that is drawn by them among those of its clip;
+        clips of which all are 0 are begun as without.
+        """
         pick = torch.multinomial(self._weights, count, replacement=True, generator=self.rng)
         span = (self.length[pick] - 1).double()
         u = torch.rand(count, dtype=torch.float64, generator=self.rng)
         frame = torch.minimum((u * span).long(), self.length[pick] - 2)
+        if self.hard and odds is not None and self.moments is not None:
+            frame = self._practise(self.moments, pick, frame, odds)
         if self.first:
             frame[torch.rand(count, generator=self.rng) < self.first] = 0
         return pick, frame
+
+    def _practise(self, m: Moments, pick: Tensor, frame: Tensor, odds: Tensor) -> Tensor:
+        """Some of the frames anew, before moments that are drawn by their odds."""
+        chance, where, before = torch.rand(3, len(pick), dtype=torch.float64, generator=self.rng)
+        summed = torch.cat((odds.new_zeros(1), odds.cumsum(0)))
+        low, high = summed[m.offset[pick]], summed[m.offset[pick] + m.count[pick]]
+        # Rounding must not lead out of the clip.
+        last = m.offset[pick] + m.count[pick] - 1
+        found = torch.searchsorted(summed, low + where * (high - low), right=True) - 1
+        moment = torch.minimum(torch.maximum(found, m.offset[pick]), last)
+        size = m.size[moment].double()
+        run_up = (RUN_UP_S / MOMENT_S) * size
+        begun = (m.begin[moment] + 0.5 * size - before * run_up).long().clamp(min=0)
+        begun = torch.minimum(begun, self.length[pick] - 2)
+        return torch.where((chance < self.hard) & (high > low), begun, frame)

@@ -38,13 +38,15 @@ class TaskConfig:
     obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
     of residual force, None for plain DeepMimic. help: how its limits change while episodes are
     counted, which is with auto_reset alone; None leaves them. help_by: whether "all" worlds have one
-    share of them left or each "clip" its own, see `HelpBudget`. horizon: control steps until an episode
-    times out. finish: what a clip done to its end is worth, in rewards of its last step; a discount g
-    makes g / (1 - g) of a character that goes on as it ended. first: share of the episodes that begin
-    on their clip's frame 0, as evaluations do. style: what a motion prior sees of a frame, terms that
-    look at `frame.sim` alone, see `ImitationEnv.features`. auto_reset: start a new episode where one
-    ended (off while evaluating). recovery: falls and getting up, being far and coming back as part of
-    the episodes, see `poise.env.recovery`; None for episodes that begin and stay on their clip.
+    share of them left, or each "clip" or each "moment" of the clips its own, see `HelpBudget`.
+    horizon: control steps until an episode times out. finish: what a clip done to its end is worth, in
+    rewards of its last step; a discount g makes g / (1 - g) of a character that goes on as it ended.
+    first: share of the episodes that begin on their clip's frame 0, as evaluations do. hard: share of
+    the others that begin before moments in which episodes lately failed, see `Starts.draw`. style: what
+    a motion prior sees of a frame, terms that look at `frame.sim` alone, see `ImitationEnv.features`.
+    auto_reset: start a new episode where one ended (off while evaluating). recovery: falls and getting
+    up, being far and coming back as part of the episodes, see `poise.env.recovery`; None for episodes
+    that begin and stay on their clip.
     """
 
     obs: tuple[ObsTerm, ...]
@@ -53,17 +55,19 @@ class TaskConfig:
     pd: PDTargets
     residual: Residual | None = None
     help: HelpSchedule | None = None
-    help_by: Literal["all", "clip"] = "all"
+    help_by: Literal["all", "clip", "moment"] = "all"
     horizon: int = 300
     finish: float = 0.0
     first: float = 0.0
+    hard: float = 0.0
     style: tuple[ObsTerm, ...] = ()
     auto_reset: bool = True
     recovery: Recovery | None = None
 
     def __post_init__(self) -> None:
-        if self.help_by not in ("all", "clip"):
-            raise PoiseError(f"help is given by 'all' or by 'clip', got '{self.help_by}'", "TaskConfig")
+        if self.help_by not in ("all", "clip", "moment"):
+            what = f"help is given by 'all', 'clip' or 'moment', got '{self.help_by}'"
+            raise PoiseError(what, "TaskConfig")
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:
             raise PoiseError(

@@ -69,8 +69,11 @@ class Perpetual:
     expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
     frames of the library where that is None, see `perpetual.clone.clone_for`.
     help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
-    has ended at the share `help_share` of the stage's time, or before by success. help_by_clip: success
-    is that of each clip, which keeps or loses help of its own; off, all clips have the same.
+    has ended at the share `help_share` of the stage's time, or before by success. help_by: success
+    is that of each "moment" of a clip, a second or so, which keeps or loses help of its own, of each
+    "clip", or of "all" episodes.
+    hard_starts: share of the episodes (but for those on frame 0) that begin up to two seconds before
+    where others lately failed; the rest begin anywhere, as in the paper.
     residual_std: deviation of the noise on the residual action, in units of the limits.
     shares: where in the training the first and the last primitive end at the latest; with recovery, of
     what `recovering.share` leaves.
@@ -103,7 +106,8 @@ class Perpetual:
     expert: bool = True
     help_start: float = 100.0
     help_share: float = 0.8
-    help_by_clip: bool = True
+    help_by: Literal["all", "clip", "moment"] = "moment"
+    hard_starts: float = 0.5
     residual_std: float = 0.3
     shares: tuple[float, float] = (0.5, 0.8)
     evaluate_every: int = 0
@@ -136,6 +140,12 @@ class Perpetual:
             raise PoiseError(what, "Perpetual")
         if not 0 < self.help_share <= 1:
             raise PoiseError(f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual")
+        if self.goal == "keypoints" and self.action == "additive":
+            what = "additive actions need the next frame's angles, of which keypoints tell nothing"
+            raise PoiseError(what, hint="Take absolute actions, or rotations as the goal")
+        if not 0 <= self.hard_starts <= 1:
+            what = f"hard_starts must lie in [0, 1], got {self.hard_starts}"
+            raise PoiseError(what, "Perpetual")
         if self.ppo.learn_std:
             raise PoiseError("primitives keep their action noise", "Perpetual", "Set learn_std=False")
         self._check_networks()
@@ -179,8 +189,13 @@ def from_json(data: Mapping[str, Any]) -> Perpetual:
     """
     # The types of what may be left out; runs of before there was recovery did without.
     types = replace(Perpetual(), clone=CloneConfig())
+    old = {"recovery": False} | ({} if "hard_starts" in data else {"hard_starts": 0.0})
+    given = old | dict(data)
+    if "help_by_clip" in given:
+        given["help_by"] = "clip" if given.pop("help_by_clip") else "all"
+    given.setdefault("help_by", "all")
     try:
-        return _filled(types, {"recovery": False} | dict(data))
+        return _filled(types, given)
     except (TypeError, KeyError, AttributeError) as problem:
         raise PoiseError(
             f"the run was made by another version of Poise ({problem})", hint="Train it again"

@@ -89,8 +89,8 @@ def evaluate_clips(
     """Simulates `clips (E,)`, all by default, from their first frames with the deterministic policy.
 
     Args:
-        help_scale: what is left of the residual force's limits, or of those of each clip of the library
-            `(C,)`.
+        help_scale: what is left of the residual force's limits, or of those of each clip or moment of
+            the library, as the task's `help_by` says.
         on_batch: told how many of how many clips are done.
     """
     reference = imitation.reference
@@ -152,13 +152,13 @@ def bare_env(
 ) -> ImitationEnv:
     """Worlds without a guard, rewards and ends: one that goes bad is a failure and no reason to stop.
 
-    scale: what is left of the residual force's limits, or of those of each clip `(C,)`.
+    scale: what is left of the residual force's limits, or of those of each of the task's groups `(G,)`.
     """
     config = imitation.config
     backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
     # Only what the policy sees is worked out.
     task = replace(imitation.task, rewards=(), dones=(), style=(), auto_reset=False)
-    task = replace(task, help_by="clip" if isinstance(scale, Tensor) else "all")
+    task = task if isinstance(scale, Tensor) else replace(task, help_by="all")
     env = ImitationEnv(imitation.reference, backend, task, config.sim.substeps, int(config.seed))
     env.help.set(scale)
     return env

@@ -38,6 +38,16 @@ class Judged:
         return row
 
 
+def help_of_clips(imitation: Imitation, scale: float | Tensor, most: bool = False) -> float | Tensor:
+    """What each clip of the library has left on average, or at most, `(C,)`.
+
+    scale: that of its moments `(G,)`, of clips `(C,)`, or the one that all have.
+    """
+    if not isinstance(scale, Tensor) or imitation.config.help_by != "moment":
+        return scale
+    return imitation.reference.moments.by_clip(scale, most)
+
+
 class Judge:
     """Evaluates the policies of a run's stages and notes it in the ledger and the history."""
 
@@ -66,16 +76,17 @@ class Judge:
 
         A stage ends by what is done without help: where an evaluation with what is left of it finds that
         nothing is gained any more, another one without decides what is solved and what the next stage
-        is to learn. scale: what is left, or what each clip of the library has left `(C,)`. over: the
+        is to learn. scale: what is left, or what each clip or moment of the library has left. over: the
         stage's time is.
         """
         if stage.kind == "recovery":
             return self._recovery(stage, policy, over)
         clips, card = self._both(stage, policy, scale, iteration)
-        decision = self.ledger.decide(scale)
+        by_clip = help_of_clips(self.imitation, scale)
+        decision = self.ledger.decide(by_clip)
         if over and decision == "go on":
             decision = "next"
-        if decision == "next" and mean_help(scale, self.ledger.clips) > 0:
+        if decision == "next" and mean_help(by_clip, self.ledger.clips) > 0:
             clips, card = self._both(stage, policy, 0.0, iteration)
             decision = "solved" if bool(clips.succeeded.all()) else "next"
         if card is not None and decision == "solved" and not self._enough(card):
@@ -98,8 +109,9 @@ class Judge:
             card = self.trials(stage, policy, self.config.recovering.trials)
             won, tried = back(card)
             recovered = won / tried
-        self.ledger.record(results, policy, scale, recovered)
-        self.history.add(iteration, stage.name, scale * self.config.help_start, results)
+        self.ledger.record(results, policy, help_of_clips(self.imitation, scale), recovered)
+        most = help_of_clips(self.imitation, scale, most=True) * self.config.help_start
+        self.history.add(iteration, stage.name, most, results)
         return results, card
 
     def trials(self, stage: Stage, policy: PolicyBundle, count: int) -> RecoveryCard:

@@ -40,7 +40,8 @@ class Ledger:
 
     Args:
         config: the recipe's settings.
-        length: `(C,)` frames of the clips, by which they are drawn where none fails.
+        length: `(C,)` frames of the clips. Where none fails all are drawn alike but for those that are
+            longer than an episode, by as much as they are: then each second is seen about as often.
 
     Attributes: `owner (C,)`, the primitive that learned each clip, from 0; `best`, the state of the
     stage's policy that did best, which had `best_failed (C,)`; `seen`, how many clips (trials of the
@@ -50,7 +51,8 @@ class Ledger:
 
     def __init__(self, config: Perpetual, length: Tensor):
         clips = len(length)
-        self.mining = HardNegatives(clips, config.mining, (length.cpu() - 1).double())
+        base = (length.cpu() - 1).clamp(min=config.horizon).double()
+        self.mining = HardNegatives(clips, config.mining, base)
         self.convergence = Convergence(config.convergence)
         self.owner = torch.zeros(clips, dtype=torch.long)
         self.recovery: dict[str, Any] | None = None

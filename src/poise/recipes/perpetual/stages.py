@@ -107,12 +107,12 @@ class Course:
 
     @property
     def help(self) -> float:
-        """What is left of the residual force's limits, 0 to 1, on the clip that has most."""
+        """What is left of the residual force's limits, 0 to 1, where most is left."""
         return self.env.help.now if self.imitation.task.residual is not None else 0.0
 
     @property
     def helps(self) -> float | Tensor:
-        """What is left of it on each clip of the library `(C,)`, or a number where that is the same."""
+        """What is left of it in each group of `Perpetual.help_by`, or a number for all."""
         return self.env.help.left if self.imitation.task.residual is not None else 0.0
 
     @property
@@ -217,7 +217,7 @@ class Course:
         return follows
 
     def _enter(self, stage: Stage, start: WarmStart | None, warm: bool, scale: float | Tensor) -> None:
-        """Makes the stage's trainer, with the share `scale` of the help, or each clip's own `(C,)`."""
+        """Makes the stage's trainer, with the share `scale` of the help, or each group's own `(G,)`."""
         self.stage, self.warm = stage, warm
         where = (self.threads, self.dumps, self.device)
         self.trainer: Trainer = make_trainer(self.imitation, stage, start, warm, *where)
