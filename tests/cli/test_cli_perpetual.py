@@ -123,7 +123,7 @@ def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> Non
         (("--method", "deepmimic"), "has no --method"),
         (("--help-limit", "5"), "has no --help-limit"),
         (("--max-primitives", "0"), "--max-primitives must"),
-        (("--goal", "keypoints", "--action", "additive"), "Take absolute actions, or rotations"),
+        (("--goal", "keypoints", "--action", "additive"), "of which keypoints tell nothing"),
         (("--minutes", "0"), "--minutes must be above 0"),
         (("--hold-out", "nobody"), "fits no clip"),
         (("--single", "--no-progressive"), "only one of single"),

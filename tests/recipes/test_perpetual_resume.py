@@ -154,6 +154,12 @@ def test_a_finished_run_goes_on_with_more_time(tmp_path: Path) -> None:
         assert (tmp_path / FINAL).exists() and len(curve(tmp_path)) == iterations
 
 
+def test_settings_for_additive_actions() -> None:
+    config = Perpetual.additive(single=True, num_envs=8)
+    assert (config.action, config.style, config.single, config.num_envs) == ("additive", None, True, 8)
+    assert config.ppo.std == 0.055 and from_json(to_json(config)) == config
+
+
 def test_settings_survive_json() -> None:
     for config in (tiny(), tiny(style=None, lateral=True, start="random"), Perpetual()):
         assert from_json(to_json(config)) == config

@@ -37,7 +37,7 @@ class Primitives:
     termination: Annotated[Termination, arg(metavar="NAME")] = "relaxed"
     """perpetual: bodies whose mean distance ends an episode: relaxed leaves feet out, all; or code."""
     action: Annotated[Action, arg(metavar="NAME")] = "absolute"
-    """perpetual: joint targets as such, as in the paper, or additive to the next frame's angles."""
+    """perpetual: joint targets as in the paper, or additive ones, with settings for hours on a CPU."""
     style: bool = True
     """perpetual: a discriminator rewards motion like that of the library; so the task alone does."""
 
@@ -53,7 +53,12 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         raise PoiseError(f"--max-primitives must lie in 1 to 64, got {primitives.max_primitives}")
     from poise.recipes.perpetual import Perpetual
 
-    config = Perpetual(
+    additive = primitives.action == "additive"
+    if additive and primitives.goal == "keypoints":
+        what = "--action additive needs the next frame's angles, of which keypoints tell nothing"
+        raise PoiseError(what, hint="Leave out --action, or --goal")
+    config = replace(
+        Perpetual.additive() if additive else Perpetual(),
         single=primitives.single,
         max_primitives=primitives.max_primitives,
         goal=primitives.goal,
@@ -61,11 +66,11 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         multiplicative=primitives.multiplicative,
         progressive=primitives.progressive,
         termination=primitives.termination,
-        action=primitives.action,
         help_start=training.help_start,
         seed=training.seed,
         expert=training.expert,
         body=body.config(),
     )
-    config = config if primitives.style else replace(config, style=None)
+    if not primitives.style:
+        config = replace(config, style=None)
     return config if training.envs is None else replace(config, num_envs=training.envs)

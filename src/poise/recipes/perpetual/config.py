@@ -164,6 +164,15 @@ class Perpetual:
         if not self.progressive and self.max_primitives < 2:
             raise PoiseError("a composer without progressive training needs at least 2 primitives")
 
+    @classmethod
+    def additive(cls, **changes: Any) -> Perpetual:
+        """Settings for hours on a CPU: actions add to the reference's angles, with noise in radians
+        that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
+        stage has more evaluations before it counts as learned."""
+        ppo = replace(cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32)
+        own = {"ppo": ppo, "convergence": ConvergenceConfig(patience=12)} | changes
+        return cls(action="additive", style=None, **own)
+
     @property
     def method(self) -> str:
         """What a score card calls it."""
