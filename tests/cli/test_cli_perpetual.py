@@ -24,7 +24,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     ppo = PPOConfig(horizon=4, epochs=1, std=0.02, policy_hidden=(8,), value_hidden=(8,))
     own = {"ppo": ppo, "clone": CloneConfig(steps=4, rounds=0, critic_steps=4), "style": None}
     own["recovering"] = RecoveryPlan(falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2))
-    monkeypatch.setattr(perpetual, "Perpetual", lambda **k: Perpetual(**(own | k)))
+
+    def plain(**given: object) -> Perpetual:
+        return Perpetual(**(own | given))
+
+    plain.additive = lambda: Perpetual.additive(**own)
+    monkeypatch.setattr(perpetual, "Perpetual", plain)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +111,12 @@ def test_the_switches_reach_the_run(folder: Path, tmp_path: Path, capsys) -> Non
     assert "a run on the library" in capsys.readouterr().err
     # Half as many frames a second last twice as long.
     assert reopen(out).library.clips[1].seconds == pytest.approx(15 / 15)
+
+
+def test_additive_actions_come_with_their_settings(folder: Path, tmp_path: Path) -> None:
+    assert main(command(folder, tmp_path / "run", "--action", "additive", "--no-recovery")) == 0
+    config = reopen(tmp_path / "run").config
+    assert config.action == "additive" and config.convergence.patience == 12 and not config.recovery
 
 
 def test_what_it_needs_and_refuses(folder: Path, tmp_path: Path, refused) -> None:

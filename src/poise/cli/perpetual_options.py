@@ -53,12 +53,8 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         raise PoiseError(f"--max-primitives must lie in 1 to 64, got {primitives.max_primitives}")
     from poise.recipes.perpetual import Perpetual
 
-    additive = primitives.action == "additive"
-    if additive and primitives.goal == "keypoints":
-        what = "--action additive needs the next frame's angles, of which keypoints tell nothing"
-        raise PoiseError(what, hint="Leave out --action, or --goal")
     config = replace(
-        Perpetual.additive() if additive else Perpetual(),
+        Perpetual.additive() if primitives.action == "additive" else Perpetual(),
         single=primitives.single,
         max_primitives=primitives.max_primitives,
         goal=primitives.goal,

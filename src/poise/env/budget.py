@@ -118,17 +118,15 @@ class HelpBudget:
 
         Nothing here waits for a GPU if there are several groups, but for a decision now and then.
         """
-        if self.schedule is None:
-            return
-        if self.groups == 1:
-            self.count(len(group), int(failed.sum()) if len(group) else 0)
-            return
         self.add(group, torch.ones_like(failed).double(), failed.double())
 
     def add(self, group: Tensor, ended: Tensor, failed: Tensor) -> None:
         """One control step in which `ended (n,)` outcomes of `group (n,)`, 1 or 0 each, became known,
-        `failed (n,)` of them failures; of several groups."""
+        `failed (n,)` of them failures."""
         if self.schedule is None:
+            return
+        if self.groups == 1:
+            self.count(int(ended.sum()), int(failed.sum()))
             return
         if len(group):
             # Ones are added, so that their order, which a GPU does not keep, makes no difference.

@@ -45,10 +45,10 @@ class ImitationEnv:
         fused: bool = True,
     ):
         self.num_envs, self.device = backend.num_envs, backend.device
-        by = reference.moments
-        self._starts = Starts(reference.length, weights, seed, task.first, by, task.hard)
+        moments = reference.moments
+        self._starts = Starts(reference.length, weights, seed, task.first, moments, task.hard)
         self.reference = reference = reference.to(self.device)
-        self.hardness = Hardness(len(by), self.device) if task.hard and task.auto_reset else None
+        self.hardness = Hardness(len(moments), self.device) if task.hard and task.auto_reset else None
         self.backend, self.task, self.substeps = backend, task, substeps
         self.hinges = len(reference.humanoid.hinges)
         if backend.model.nu != self.hinges:
@@ -67,7 +67,7 @@ class ImitationEnv:
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
         schedule = task.help if task.auto_reset and task.residual else None
-        groups = {"all": 1, "clip": len(reference.length), "moment": len(by)}[task.help_by]
+        groups = {"all": 1, "clip": len(reference.length), "moment": len(moments)}[task.help_by]
         self.help = HelpBudget(schedule, here, groups)
         self._use_help()
         self.terms: dict[str, Tensor] = {}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.env.moments import MOMENT_S, Moments
+from poise.env.moments import Moments
 from poise.errors import PoiseError
 
-#: Who practises a moment begins at most so many seconds before its middle.
-RUN_UP_S = 2.0
+#: Who practises a moment begins at most so many times its length before its middle.
+RUN_UP = 2.0
 
 
 class Starts:
@@ -64,7 +64,7 @@ class Starts:
         """(clip, frame) of `count` starts, `(count,)` each.
 
         odds: `(G,)` float64 of the moments, such as `Hardness.odds`. The share `hard` of the starts lies
-        in the `RUN_UP_S` before the middle of a moment that is drawn by them among those of its clip;
+        in the `RUN_UP` before the middle of a moment that is drawn by them among those of its clip;
         clips of which all are 0 are begun as without.
         """
         pick = torch.multinomial(self._weights, count, replacement=True, generator=self.rng)
@@ -87,7 +87,6 @@ class Starts:
         found = torch.searchsorted(summed, low + where * (high - low), right=True) - 1
         moment = torch.minimum(torch.maximum(found, m.offset[pick]), last)
         size = m.size[moment].double()
-        run_up = (RUN_UP_S / MOMENT_S) * size
-        begun = (m.begin[moment] + 0.5 * size - before * run_up).long().clamp(min=0)
+        begun = (m.begin[moment] + (0.5 - before * RUN_UP) * size).long().clamp(min=0)
         begun = torch.minimum(begun, self.length[pick] - 2)
         return torch.where((chance < self.hard) & (high > low), begun, frame)

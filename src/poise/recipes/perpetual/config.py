@@ -170,8 +170,8 @@ class Perpetual:
         that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
         stage has more evaluations before it counts as learned."""
         ppo = replace(cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32)
-        own = {"ppo": ppo, "convergence": ConvergenceConfig(patience=12)} | changes
-        return cls(action="additive", style=None, **own)
+        own = {"ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None}
+        return cls(action="additive", **(own | changes))
 
     @property
     def method(self) -> str:
@@ -196,15 +196,11 @@ def from_json(data: Mapping[str, Any]) -> Perpetual:
     Raises:
         PoiseError: they are of another version.
     """
-    # The types of what may be left out; runs of before there was recovery did without.
+    # The types of what may be left out; runs of before there was something did without.
     types = replace(Perpetual(), clone=CloneConfig())
-    old = {"recovery": False} | ({} if "hard_starts" in data else {"hard_starts": 0.0})
-    given = old | dict(data)
-    if "help_by_clip" in given:
-        given["help_by"] = "clip" if given.pop("help_by_clip") else "all"
-    given.setdefault("help_by", "all")
+    old = {"recovery": False, "help_by": "all", "hard_starts": 0.0}
     try:
-        return _filled(types, given)
+        return _filled(types, old | dict(data))
     except (TypeError, KeyError, AttributeError) as problem:
         raise PoiseError(
             f"the run was made by another version of Poise ({problem})", hint="Train it again"
