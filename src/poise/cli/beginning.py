@@ -10,6 +10,7 @@ from poise.cli.console import tell
 from poise.cli.progress import clock
 
 if TYPE_CHECKING:
+    from poise.env import PathStats
     from poise.eval import ScoreCard
     from poise.learn import CloneStats, PolicyBundle, WarmStart
     from poise.recipes.expert import Beginning
@@ -31,7 +32,14 @@ def beginning(first: First | None = None) -> Beginning:
     def failed(why: str) -> None:
         tell(f"Training starts from nothing, since the expert failed: {why}")
 
-    return Beginning(expert, cloned_round, first, failed)
+    def path(s: PathStats, of: int) -> None:
+        left = clock(s.seconds / s.iteration * (of - s.iteration))
+        tell(
+            f"{clock(s.seconds)}  path {s.iteration} of {of}: root off by {1000 * s.error_m:.0f} mm, "
+            f"help {s.help_n:.0f} N, {100 * s.unhelped:.0f} % without, {left} to go"
+        )
+
+    return Beginning(expert, cloned_round, first, failed, path)
 
 
 def first_delivery(

@@ -38,6 +38,9 @@ class Primitives:
     """perpetual: bodies whose mean distance ends an episode: relaxed leaves feet out, all; or code."""
     action: Annotated[Action, arg(metavar="NAME")] = "absolute"
     """perpetual: joint targets as in the paper, or additive ones, with settings for hours on a CPU."""
+    paths: Annotated[int, arg(metavar="N")] = 0
+    """perpetual: learn without help, from motions near the clips that need none, found first by so
+    many iterations, 11 say; 0 learns with --help-start at first."""
     style: bool = True
     """perpetual: a discriminator rewards motion like that of the library; so the task alone does."""
 
@@ -51,6 +54,11 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
             raise PoiseError(f"the recipe perpetual has no --{option}", hint="Leave it out")
     if not 1 <= primitives.max_primitives <= 64:
         raise PoiseError(f"--max-primitives must lie in 1 to 64, got {primitives.max_primitives}")
+    if primitives.paths and not training.expert:
+        raise PoiseError(
+            "--paths are for the expert, and --no-expert does without", hint="Leave one out"
+        )
+    from poise.env import PathConfig
     from poise.recipes.perpetual import Perpetual
 
     config = replace(
@@ -62,7 +70,9 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         multiplicative=primitives.multiplicative,
         progressive=primitives.progressive,
         termination=primitives.termination,
-        help_start=training.help_start,
+        # What follows paths needs no help from the beginning.
+        help_start=0.0 if primitives.paths else training.help_start,
+        paths=PathConfig(iterations=primitives.paths) if primitives.paths else None,
         seed=training.seed,
         expert=training.expert,
         body=body.config(),

@@ -2,6 +2,7 @@
 
 from poise.control.drive import Drive
 from poise.control.inverse import ContactRule, InverseDynamics, inverse_dynamics, step_midpoints
+from poise.control.lqr import Regulator, regulate
 from poise.control.pd import PDTargets, range_scale, stable_pd_torque
 from poise.control.residual import ExplicitResidual, ImplicitResidual, Residual, Wrench
 from poise.control.schedule import HelpSchedule, LinearHelp, SuccessHelp
@@ -17,12 +18,14 @@ __all__ = [
     "InverseDynamics",
     "LinearHelp",
     "PDTargets",
+    "Regulator",
     "Residual",
     "SuccessHelp",
     "Wrench",
     "clearance",
     "inverse_dynamics",
     "range_scale",
+    "regulate",
     "stable_pd_torque",
     "step_midpoints",
 ]

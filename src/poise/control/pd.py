@@ -37,6 +37,11 @@ class PDTargets:
         target = action if plain else action * scale
         drive.ctrl.add_(target if base is None else target + base.to(target.device))
 
+    def action(self, target: Tensor, q_ref_next: Tensor) -> Tensor:
+        """The actions `(N, n)` whose targets are `target (N, n)` rad: the inverse of `apply`."""
+        base = q_ref_next if self.mode == "additive" else self.offset
+        return (target if base is None else target - base) / self.scale
+
 
 def range_scale(ranges: Tensor) -> Tensor:
     """Rad per unit of absolute action, `(n)` of joint ranges `(n, 2)` rad: min(1.2 max |limit|, pi).

@@ -2,8 +2,10 @@
 
 from poise.env.env import ImitationEnv
 from poise.env.expert import Expert, ExpertConfig, Plan, make_plan
+from poise.env.follower import Follower
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.gym import GymEnv, GymVectorEnv
+from poise.env.paths import PathConfig, Paths, PathSearch, PathStats
 from poise.env.recovery import Recovery
 from poise.env.reference import Reference
 from poise.env.task import EnvStep, TaskConfig
@@ -13,11 +15,16 @@ __all__ = [
     "EnvStep",
     "Expert",
     "ExpertConfig",
+    "Follower",
     "Frame",
     "GymEnv",
     "GymVectorEnv",
     "ImitationEnv",
     "ObsTerm",
+    "PathConfig",
+    "PathSearch",
+    "PathStats",
+    "Paths",
     "Plan",
     "Recovery",
     "Reference",

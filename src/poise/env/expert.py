@@ -135,9 +135,7 @@ class Expert:
         target = path + plan.torque[rows] / kp
         q, reach = env.backend.state.qpos[:, 7:].float(), self._most[body] / kp
         target = torch.maximum(torch.minimum(target, q + reach), q - reach)
-        pd = env.task.pd
-        base = then if pd.mode == "additive" else pd.offset
-        return (target if base is None else target - base) / pd.scale
+        return env.task.pd.action(target, then)
 
     def _help(self, rows: Tensor) -> Tensor:
         """The root wrench as residual action: planned part and spring, cut to the limits."""

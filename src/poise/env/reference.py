@@ -193,7 +193,7 @@ class Reference:
         rows: what `self.rows(clip, frame)` gives, where it is known already.
         """
         packed = self._packed.index_select(0, self.rows(clip, frame) if rows is None else rows)
-        carry = self._carry(clip, frame)
+        carry = self.carry(clip, frame)
         if carry is None:
             return packed
         pose = _carried(self.unpacked(packed), carry[0].float(), carry[1].float())
@@ -234,7 +234,7 @@ class Reference:
     def coordinates(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """`qpos (N, 7 + n)` and `qvel (N, 6 + n)`, float64, of the poses that `gather` gives."""
         rows = self.rows(clip, frame)
-        qpos, qvel, carry = self.qpos[rows], self.qvel[rows], self._carry(clip, frame)
+        qpos, qvel, carry = self.qpos[rows], self.qvel[rows], self.carry(clip, frame)
         if carry is None:
             return qpos, qvel
         turn, move = carry
@@ -243,7 +243,7 @@ class Reference:
         linear = quat_rotate(turn, qvel[:, :3])
         return torch.cat((pos, quat, qpos[:, 7:]), -1), torch.cat((linear, qvel[:, 3:]), -1)
 
-    def _carry(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor] | None:
+    def carry(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor] | None:
         """The turn `(N, 4)` and then the move `(N, 3)` m of the cycles before `frame`; None if none."""
         if not self.any_cyclic:
             return None

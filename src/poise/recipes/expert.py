@@ -14,7 +14,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from poise.env import Expert, ImitationEnv, Plan, make_plan
+from poise.env import Expert, Follower, ImitationEnv, Paths, PathStats, Plan, make_plan
 from poise.eval import ScoreCard, run_episodes, score_rollouts, start_frames
 from poise.learn import (
     LATEST,
@@ -43,13 +43,15 @@ class Beginning:
     """Who is told what before PPO begins.
 
     expert: the expert's own score. round: each round of cloning. cloned: the clone, once it is saved.
-    failed: why the run begins without an expert.
+    failed: why the run begins without an expert. path: each iteration of a search for paths, and of how
+    many it is one.
     """
 
     expert: Callable[[ScoreCard], None] | None = None
     round: Callable[[CloneStats], None] | None = None
     cloned: Callable[[PolicyBundle, WarmStart], None] | None = None
     failed: Callable[[str], None] | None = None
+    path: Callable[[PathStats, int], None] | None = None
 
 
 def begin_training(
@@ -98,13 +100,15 @@ def clone_expert(
     tell: Beginning | None = None,
     config: CloneConfig | None = None,
     start: PolicyBundle | None = None,
+    paths: Paths | None = None,
 ) -> WarmStart:
     """Scores the expert and clones it into a policy of the recipe's networks and observation.
 
-    start: the policy that is taught, see `learn.clone`; a new perceptron by default.
+    start: the policy that is taught, see `learn.clone`; a new perceptron by default. paths: what the
+    teacher follows in place of the expert, without help.
     """
-    tell, plan = tell or Beginning(), make_plan(imitation.reference)
-    if tell.expert is not None:
+    tell, plan = tell or Beginning(), None if paths else make_plan(imitation.reference)
+    if tell.expert is not None and plan is not None:
         tell.expert(score_expert(imitation, plan))
     worlds = min(imitation.config.num_envs, CLONE_WORLDS)
     env = imitation.env(worlds, threads=threads, dumps=dumps)
@@ -113,7 +117,7 @@ def clone_expert(
     try:
         return clone(
             cast(VecEnv, env),
-            Expert(env, plan=plan),
+            Follower(env, paths) if paths else Expert(env, plan=plan),
             config,
             imitation.ppo(),
             imitation.config.seed,

@@ -14,6 +14,8 @@ from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
 from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
 from poise.sim.make import check_device, make_backend
+from poise.sim.slopes import Slopes, driven, slopes
+from poise.sim.tangent import difference, displaced
 from poise.sim.warp import WarpBackend
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "Replay",
     "SimConfig",
     "SimState",
+    "Slopes",
     "UnstableError",
     "WarpBackend",
     "add_contact_sensors",
@@ -38,6 +41,10 @@ __all__ = [
     "check_device",
     "contact_columns",
     "diagnose",
+    "difference",
+    "displaced",
+    "driven",
     "make_backend",
     "replay_dump",
+    "slopes",
 ]

@@ -14,6 +14,7 @@ from poise.sim.backend import SimState
 from poise.sim.checks import check_state, compile_model
 from poise.sim.contacts import contact_columns
 
+State = tuple[Tensor, Tensor]
 _NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _BAD = [
@@ -45,6 +46,7 @@ class CpuBackend:
         self._rows = torch.from_numpy(self._live.state)
         self._outputs: dict[str, Tensor] = {}
         self._state = SimState(self._views)
+        self._warmstart = self._view("qacc_warmstart")
         self._drive = Drive(**self._views(["ctrl", "qfrc_applied", "xfrc_applied"]))
         bodies, columns = contact_columns(self._model)
         self._contact_bodies, self._contact_columns = torch.from_numpy(bodies), torch.from_numpy(columns)
@@ -88,6 +90,26 @@ class CpuBackend:
         # The velocity stage afterwards makes positions, velocities and what depends on them
         # describe the new state, where mj_step alone leaves them one physics step behind.
         self._run("step", None, nstep=nstep, stage=_VEL)
+
+    def successors(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, applied: Tensor, nstep: int) -> State:
+        """What n <= `num_envs` states come to in `nstep` physics steps, positions and velocities.
+
+        qpos `(n, nq)`, qvel `(n, nv)`; ctrl `(n, nu)` and applied `(n, nv)`, generalized forces, are
+        held. The first n worlds are used for it: afterwards they stand there, with fields of `state`
+        that still describe where they were. Nothing of what a world did before has a part in it.
+        """
+        n = len(qpos)
+        for view, value in (
+            (self._state.qpos, qpos),
+            (self._state.qvel, qvel),
+            (self._drive.ctrl, ctrl),
+            (self._drive.qfrc_applied, applied),
+            (self._drive.xfrc_applied, None),
+            (self._warmstart, None),
+        ):
+            view[:n] = 0.0 if value is None else value
+        self._run("step", np.arange(n, dtype=np.int32), nstep=nstep, stage=_NONE)
+        return self._state.qpos[:n].clone(), self._state.qvel[:n].clone()
 
     def forward(self, rows: Tensor | None = None) -> None:
         self._run("forward", self._ids(rows)[0])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from poise.body import BodyConfig
+from poise.env import PathConfig
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
 from poise.recipes.perpetual.shapes import BodyShapes
@@ -68,6 +69,8 @@ class Perpetual:
     composer_clone: the composer first imitates for each clip the primitive that learned it.
     expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
     frames of the library where that is None, see `perpetual.clone.clone_for`.
+    paths: the expert follows paths that need no help, which are searched first, see `env.paths`; None
+    takes inverse dynamics, which need help.
     help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
     has ended at the share `help_share` of the stage's time, or before by success. help_by: success
     is that of each "moment" of a clip, a second or so, which keeps or loses help of its own, of each
@@ -104,6 +107,7 @@ class Perpetual:
     composer_hidden: tuple[int, ...] = (256, 128)
     composer_clone: bool = True
     expert: bool = True
+    paths: PathConfig | None = None
     help_start: float = 100.0
     help_share: float = 0.8
     help_by: Literal["all", "clip", "moment"] = "moment"
@@ -146,6 +150,9 @@ class Perpetual:
         if not 0 <= self.hard_starts <= 1:
             what = f"hard_starts must lie in [0, 1], got {self.hard_starts}"
             raise PoiseError(what, "Perpetual")
+        if self.paths is not None and self.shapes.count > 1:
+            what = "paths are searched for one body, and there are several shapes"
+            raise PoiseError(what, "Perpetual", "Leave one of the two out")
         if self.ppo.learn_std:
             raise PoiseError("primitives keep their action noise", "Perpetual", "Set learn_std=False")
         self._check_networks()
@@ -197,7 +204,7 @@ def from_json(data: Mapping[str, Any]) -> Perpetual:
         PoiseError: they are of another version.
     """
     # The types of what may be left out; runs of before there was something did without.
-    types = replace(Perpetual(), clone=CloneConfig())
+    types = replace(Perpetual(), clone=CloneConfig(), paths=PathConfig())
     old = {"recovery": False, "help_by": "all", "hard_starts": 0.0}
     try:
         return _filled(types, old | dict(data))

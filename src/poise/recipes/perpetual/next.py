@@ -28,17 +28,24 @@ from poise.nets import Composer
 from poise.recipes.expert import CLONE_WORLDS, Beginning, clone_expert, finetuning
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.clone import clone_for
+from poise.recipes.perpetual.paths import find_paths
 from poise.recipes.perpetual.plan import first_stage
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import walking_clips
 from poise.recipes.perpetual.task import Perpetual, stage_task
 from poise.sim import UnstableError
 
+#: The folder in a run folder with worlds that went bad.
+DUMPS = "dumps"
+
 
 def begin_first(
-    imitation: Imitation, threads: int, dumps: Path | None, tell: Beginning
+    imitation: Imitation, threads: int, folder: Path, tell: Beginning
 ) -> tuple[Stage, WarmStart | None]:
-    """The first stage, and the policy it starts from; None starts a single network from nothing."""
+    """The first stage, and the policy it starts from; None starts a single network from nothing.
+
+    folder: of the run, where the search for paths is kept.
+    """
     config: Perpetual = imitation.config
     stage = first_stage(config)
     own = staged(imitation, stage)
@@ -47,7 +54,9 @@ def begin_first(
     start = None
     if config.expert:
         try:
-            start = clone_expert(sized, threads, dumps, tell, clone_config(imitation), joint)
+            paths = find_paths(imitation, folder, threads, tell) if config.paths else None
+            how = (threads, folder / DUMPS, tell, clone_config(imitation), joint, paths)
+            start = clone_expert(sized, *how)
         except UnstableError as problem:
             # Clips that throw the expert off may still be learned from nothing.
             if tell.failed is not None:

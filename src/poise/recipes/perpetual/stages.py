@@ -35,7 +35,14 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.eval import History
 from poise.recipes.perpetual.judge import Judge, Judged
 from poise.recipes.perpetual.ledger import Ledger
-from poise.recipes.perpetual.next import begin_first, begin_stage, critic_of, make_trainer, members_of
+from poise.recipes.perpetual.next import (
+    DUMPS,
+    begin_first,
+    begin_stage,
+    critic_of,
+    make_trainer,
+    members_of,
+)
 from poise.recipes.perpetual.plan import ends, following, is_over, lasts, most_help, primitives
 from poise.recipes.perpetual.progress import Progress, Stage, share_of
 from poise.recipes.perpetual.recovery import check_falls
@@ -65,7 +72,7 @@ class Course:
         self.config: Perpetual = imitation.config
         self.threads, self.device, self.save_s = threads, device, save_s
         self.tensorboard = tensorboard
-        self.dumps, self.tell = folder / "dumps", tell or Beginning()
+        self.dumps, self.tell = folder / DUMPS, tell or Beginning()
         self.ledger = Ledger(self.config, imitation.reference.length)
         self.finished, self.before, self.begun = False, 0, (0, 0.0)
         self.troubles = Troubles()
@@ -74,7 +81,7 @@ class Course:
             remove_partial(folder)
         else:
             check_falls(imitation)
-            stage, start = begin_first(imitation, threads, self.dumps, self.tell)
+            stage, start = begin_first(imitation, threads, folder, self.tell)
             warm = start is not None and start.critic is not None
             self._enter(stage, start, warm, 1.0)
             # What the clone has cost is no time with help.
