@@ -32,6 +32,16 @@ def test_help_ends_where_the_motion_is_followed(make_task) -> None:
     assert stats[-1].help_n < 0.2 * stats[0].help_n + 1.0 and stats[-1].error_m < 0.1
 
 
+def test_what_went_astray_begins_again_on_its_reference(make_task) -> None:
+    found = search(make_task(swing(0.5, name="calm")))
+    found.share[:] = 0.1
+    found.qpos[:, 2] += 3.0
+    found.iterate()
+    steps = ~torch.from_numpy(found.last)
+    assert torch.equal(found.qpos[steps], found.reference.qpos[steps])
+    assert found.share[0] == pytest.approx(0.1 / SHORT.less**3)
+
+
 def test_a_search_that_goes_on_finds_the_same(make_task) -> None:
     imitation = make_task(swing(0.5, name="calm"), swing(0.6, speed=1.0, name="walk"))
     whole, first, then = (search(imitation) for _ in range(3))
@@ -78,8 +88,8 @@ def test_on_its_path_a_character_gets_the_paths_targets(make_task) -> None:
     imitation = make_task(swing(0.5, name="calm"), method="deepmimic")
     env, obs = at(imitation, 3)
     ahead = env.reference.hinges[4].float()
-    joints, paths = len(imitation.humanoid.hinges), search(imitation).paths()
-    paths = replace(paths, feedback=torch.randn(len(paths.target), joints, 2 * (joints + 6)))
+    paths = search(imitation).paths()
+    paths = replace(paths, feedback=torch.randn_like(paths.feedback))
     given = Follower(env, paths).act(obs)
     torch.testing.assert_close(given[0] + ahead, paths.target[3])
     env.backend.write(None, env.backend.state.qpos + 0.5, env.backend.state.qvel)

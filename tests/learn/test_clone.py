@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 
 import pytest
@@ -115,6 +116,34 @@ def test_the_teacher_drives_round_0_and_the_student_the_rest() -> None:
     assert teacher.calls == 40
 
 
+class Half(Pusher):
+    """Says nonsense on the left, where it knows that it knows nothing."""
+
+    known = torch.zeros(0, dtype=torch.bool)
+
+    def act(self, obs: Tensor) -> Tensor:
+        wish = super().act(obs)
+        self.known = self.env.p[:, 0] > 0
+        return torch.where(self.known[:, None], wish, -wish)
+
+
+def test_nothing_is_learned_where_the_teacher_knows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitter, learned = sys.modules["poise.learn.clone"]._Fitter, []
+    plain = fitter.add
+
+    def add(self: object, obs: Tensor, action: Tensor) -> None:
+        learned.append(obs)
+        plain(self, obs, action)
+
+    monkeypatch.setattr(fitter, "add", add)
+    env = PointEnv(64)
+    _, stats = clone(env, Half(env), QUICK, SMALL)
+    kept = torch.cat(learned)
+    assert (kept[:, 0] > 0).all() and 500 < len(kept) < 3500
+    # All steps count as seen.
+    assert [s.samples for s in stats] == [1280, 2560, 3840]
+
+
 def test_errors_are_said() -> None:
     with pytest.raises(PoiseError, match="steps must be at least 1, got 0"):
         CloneConfig(steps=0)
@@ -125,6 +154,13 @@ def test_errors_are_said() -> None:
         def act(self, obs: Tensor) -> Tensor:
             return torch.full_like(self.env.p, math.nan)
 
+    class Blank(Half):
+        def act(self, obs: Tensor) -> Tensor:
+            self.known = torch.zeros(8, dtype=torch.bool)
+            return Pusher.act(self, obs)
+
     env = PointEnv(8)
+    with pytest.raises(TrainingError, match="in no state"):
+        clone(env, Blank(env), QUICK, SMALL)
     with pytest.raises(TrainingError, match="teacher's action is not finite"):
         clone(env, Broken(env), QUICK, SMALL)

@@ -16,20 +16,23 @@ class Follower:
 
         u = u_path + K d, where d is how far the character is from its path
 
-    reach: rad, the most that feedback changes a target: far from the path its linear model says nothing.
-    A residual force is never used. A teacher for `poise.learn.clone`, and a policy that `poise.eval`
-    can score.
+    reach: rad, the most that feedback changes a target. near: mean cost of a state's deviations up to
+    which its linear model says anything; beyond, the action is no lesson (`known`). A residual force is
+    never used. A teacher for `poise.learn.clone`, and a policy that `poise.eval` can score.
     """
 
-    def __init__(self, env: ImitationEnv, paths: Paths, reach: float = 0.6):
-        self.env, self.paths, self.reach = env, paths, reach
+    def __init__(self, env: ImitationEnv, paths: Paths, reach: float = 0.6, near: float = 0.03):
+        self.env, self.paths, self.reach, self.near = env, paths, reach, near
+        self.known: Tensor | None = None
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for the worlds as they stand now; `obs` is not looked at."""
         env, reference = self.env, self.env.reference
         rows = reference.rows(env.clip, env.frame)
-        change = torch.einsum("nij,nj->ni", self.paths.feedback[rows], self._off(rows))
+        off = self._off(rows)
+        self.known = (off.square() * self.paths.price).mean(1) < self.near
+        change = torch.einsum("nij,nj->ni", self.paths.feedback[rows], off)
         target = self.paths.target[rows] + change.clamp(-self.reach, self.reach)
         ahead = reference.rows(env.clip, env.frame + 1)
         action = env.task.pd.action(target, reference.hinges[ahead].float())

@@ -47,7 +47,8 @@ class PathConfig:
     astray: cost from which on a stretch begins again on its reference, with the help of three
     iterations ago.
     steps: of which the best is taken. lost: error of a whole body, in units of what costs 1, beyond
-    which a step is no choice.
+    which a step is no choice. blur: the feedback of a frame is the mean over so many frames before
+    and after it: from frame to frame it jumps, which a network learns last.
     """
 
     iterations: int = 11
@@ -69,6 +70,7 @@ class PathConfig:
     astray: float = 25.0
     steps: tuple[float, ...] = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
     lost: float = 1.2
+    blur: int = 3
     plan: ExpertConfig = field(default_factory=ExpertConfig)
 
     def __post_init__(self) -> None:
@@ -90,12 +92,14 @@ class Paths:
 
     qpos `(F, nq)`, qvel `(F, nv)`, float64. target `(F, n)` rad and feedback `(F, n, 2 nv)`: servo
     targets, and how they change with the deviation (`sim.difference`, then velocities); float32.
+    price `(2 nv)`: what the squares of deviations cost in the search.
     """
 
     qpos: Tensor
     qvel: Tensor
     target: Tensor
     feedback: Tensor
+    price: Tensor
 
 
 @dataclass(frozen=True)
@@ -184,7 +188,22 @@ class PathSearch:
             gains = self._regulate(rows, self.lengths[clips], worlds, self.config.sizes[1], helped=False)
             feedback[rows] = torch.from_numpy(gains.feedback)
         worlds.close()
-        return Paths(self.qpos, self.qvel, self.action[:, : self.joints].float(), feedback)
+        target, price = self.action[:, : self.joints].float(), torch.from_numpy(self.price).float()
+        return Paths(self.qpos, self.qvel, target, self._blurred(feedback), price)
+
+    def _blurred(self, feedback: Tensor) -> Tensor:
+        """Means over the frames around each, as far as its clip has them."""
+        clip = torch.from_numpy(np.repeat(np.arange(len(self.lengths)), self.lengths))
+        moving = torch.from_numpy(~self.last)
+        total, count = torch.zeros_like(feedback), torch.zeros(len(feedback))
+        for by in range(-self.config.blur, self.config.blur + 1):
+            row = (torch.arange(len(feedback)) + by).clamp(0, len(feedback) - 1)
+            # A last frame has no feedback; the clamped rows beyond the ends are seen by their distance.
+            known = (clip[row] == clip) & moving[row] & (row - torch.arange(len(row)) == by)
+            rows = known.nonzero().squeeze(-1)
+            total[rows] += feedback[row[rows]]
+            count += known
+        return total / count.clamp_min(1.0)[:, None, None]
 
     # --- persistence --------------------------------------------------------------------------
 

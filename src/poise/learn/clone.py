@@ -113,10 +113,10 @@ def clone(
         obs, reward, failures = _gather(env, teacher, learner.actor, fitter, config, k, obs, seed)
         loss = fitter.fit(config.epochs[min(k, 1)])
         elapsed = time.perf_counter() - begun
-        stats.append(CloneStats(k, fitter.size, loss, reward, failures, elapsed))
+        stats.append(CloneStats(k, fitter.seen, loss, reward, failures, elapsed))
         if on_round is not None and on_round(stats[-1]) is False:
             break
-    policy, samples, critic = learner.actor.copy(), fitter.size, None
+    policy, samples, critic = learner.actor.copy(), fitter.seen, None
     if config.critic_steps:
         critic = _fit_critic(env, learner, config, obs, seed)
         samples += config.critic_steps * env.num_envs
@@ -128,7 +128,8 @@ class _Fitter:
 
     def __init__(self, learner: PPO, config: CloneConfig, capacity: int, seed: int):
         actor = learner.actor
-        self.actor, self.config, self.size = actor, config, 0
+        # States learned from; control steps seen.
+        self.actor, self.config, self.size, self.seen = actor, config, 0, 0
         # The products of the hidden layers are those of the learner.
         self.mean = learner.mean
         device = actor.norm.shift.device
@@ -149,6 +150,8 @@ class _Fitter:
 
     def fit(self, epochs: int) -> float:
         """Some passes over everything; the loss of the last one."""
+        if not self.size:
+            raise TrainingError("the teacher knew in no state what to do")
         policy, norm = self.actor.policy, self.actor.norm
         norm.freeze()
         scale = (-policy.action_log_std.detach()).exp()
@@ -201,7 +204,9 @@ def _gather(
         check_finite("observation", obs)
         wish = teacher.act(obs)
         check_finite("teacher's action", wish)
-        data.add(obs, wish)
+        known: Tensor | None = getattr(teacher, "known", None)
+        data.add(*((obs, wish) if known is None else (obs[known], wish[known])))
+        data.seen += n
         action, level = wish, levels
         if round_:
             action = torch.where(taught[:, None], wish, student.act(obs))

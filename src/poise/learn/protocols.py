@@ -143,7 +143,10 @@ class Style(Protocol):
 
 
 class Teacher(Protocol):
-    """What cloning learns from: it knows the environment's state and what to do there."""
+    """What cloning learns from: it knows the environment's state and what to do there.
+
+    It may have an attribute `known`, `(N,)` bool: where the last `act` is worth learning.
+    """
 
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for the environment as it stands now, whose observation is `obs (N, O)`."""

@@ -206,7 +206,9 @@ def clone_config(imitation: Imitation) -> CloneConfig:
     """How an expert is cloned: as the settings say, or by the frames of the library."""
     config: Perpetual = imitation.config
     worlds = min(config.num_envs, CLONE_WORLDS)
-    return config.clone or clone_for(int(imitation.reference.length.sum()), worlds)
+    return config.clone or clone_for(
+        int(imitation.reference.length.sum()), worlds, config.paths is not None
+    )
 
 
 def unhelped(imitation: Imitation) -> Imitation:

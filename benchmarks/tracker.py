@@ -1,0 +1,75 @@
+"""Trains the policy that comes with Poise, on clips of CMU and DeepMimic.
+
+    python benchmarks/tracker.py --library FOLDER --onto FOLDER/cmu_amc/02/02_01.amc -o RUN --minutes 60
+
+FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`benchmarks/README.md` says which). Whole
+subjects of CMU are held out. There is no help at any time: training begins with a search for motions
+that need none. Ctrl-C and --resume as in `poise train perpetual`; the policy is written with
+`poise.recipes.track.export_policy(RUN, FILE)` and measured by `perpetual.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+
+from poise.body import BodyConfig
+from poise.cli.beginning import beginning
+from poise.cli.perpetual_shown import training as shown
+from poise.env import PathConfig
+from poise.learn import ConvergenceConfig, Until
+from poise.recipes.library.folder import LibraryConfig
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual.run import begin, clips_of, resume, train
+
+#: Dances, a kick, boxing and exercises.
+HELD_OUT = ("cmu 05$", "cmu 11$", "cmu 14$")
+#: One take in two files.
+TWINS = (r"fairmotion.*01_01", r"135_06")
+#: CMU's files state 120 Hz throughout, but some were captured at 60.
+SIXTY = (("(^|-)90_", 60.0), ("salsa", 60.0))
+
+
+def config(seed: int) -> Perpetual:
+    """A single network without help, motion prior and recovery, that adds to the reference's angles."""
+    plain = Perpetual.additive()
+    return replace(
+        plain,
+        single=True,
+        single_hidden=(1024, 512),
+        recovery=False,
+        help_start=0.0,
+        paths=PathConfig(),
+        convergence=ConvergenceConfig(patience=1000),
+        ppo=replace(plain.ppo, std=0.04),
+        seed=seed,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--library", type=Path, required=True)
+    parser.add_argument("--onto", type=Path, required=True)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--resume", action="store_true")
+    a = parser.parse_args()
+    settings, source = config(a.seed), str(a.library)
+    if a.resume:
+        imitation = resume(a.out, settings, source)
+    else:
+        how = LibraryConfig(rates=SIXTY)
+        held = (HELD_OUT, TWINS, print, a.onto, how)
+        library, notes = clips_of(a.library, BodyConfig(), *held)
+        print(*notes, sep="\n")
+        imitation = begin(a.out, library, settings, source)
+    with contextlib.suppress(KeyboardInterrupt), shown() as show:
+        train(imitation, a.out, Until(minutes=a.minutes), show, a.threads, beginning=beginning())
+
+
+if __name__ == "__main__":
+    main()
