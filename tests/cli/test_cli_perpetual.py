@@ -44,6 +44,43 @@ def command(folder: Path, out: Path, *more: str) -> list[str]:
     return ["train", "perpetual", "--library", str(folder), "-o", str(out), *MINIATURE, *more]
 
 
+def test_a_run_goes_on_from_another_ones_policy(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, then = tmp_path / "first", tmp_path / "then"
+    one = ("--no-multiplicative", "--no-recovery", "--help-start", "0")
+    assert main(command(folder, first, *one)) == 0
+    go_on = command(folder, then, "--no-recovery", "--seed", "3", "--from", str(first))
+    go_on = [x for x in go_on if x not in ("--max-primitives", "2")]
+    assert main(go_on) == 0
+    before, after = (json.loads((x / "result.json").read_text()) for x in (first, then))
+    assert after["samples"] > 0 and before["clips"] == after["clips"]
+    config = reopen(then).config
+    assert config.seed == 3 and not config.multiplicative and not config.expert
+    assert main([*go_on, "--resume"]) == 0
+    capsys.readouterr()
+    go_on[go_on.index(str(first))], go_on[go_on.index(str(then))] = "nothing", str(tmp_path / "none")
+    assert main(go_on) == 2
+    assert "no such policy" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_policy_that_goes_on_has_its_own_settings_and_body(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = ("--from", str(tmp_path), "--mass", "120", "--goal", "keypoints")
+    own = [x for x in command(folder, tmp_path / "run", *more) if x not in ("--max-primitives", "2")]
+    assert main(own) == 2
+    assert "there is goal, mass" in capsys.readouterr().err
+
+
+def test_paths_and_no_expert_contradict(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(folder, tmp_path / "run", "--paths", "2", "--no-expert")) == 2
+    assert "--paths are for the expert" in capsys.readouterr().err
+
+
 def test_all_stages_by_one_command(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
@@ -38,6 +39,8 @@ class Primitives:
     """perpetual: bodies whose mean distance ends an episode: relaxed leaves feet out, all; or code."""
     action: Annotated[Action, arg(metavar="NAME")] = "absolute"
     """perpetual: joint targets as in the paper, or additive ones, with settings for hours on a CPU."""
+    going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
+    """perpetual: go on from a trained policy, a file or a run, with its settings and networks."""
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
@@ -80,3 +83,13 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
     if not primitives.style:
         config = replace(config, style=None)
     return config if training.envs is None else replace(config, num_envs=training.envs)
+
+
+def check_going_on(primitives: Primitives, body: Body) -> None:
+    """Refuses options whose say a policy has that training goes on from."""
+    plain = Primitives(recovery=primitives.recovery, going_on=primitives.going_on)
+    names = [f.name for f in fields(plain) if getattr(primitives, f.name) != getattr(plain, f.name)]
+    names += [f.name for f in fields(body) if getattr(body, f.name) != getattr(Body(), f.name)]
+    if names:
+        what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
+        raise PoiseError(what, hint="Leave it out")

@@ -13,7 +13,7 @@ from poise.cli.console import launched, notes, say, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Training
 from poise.cli.output import claimed
-from poise.cli.perpetual_options import Primitives, settings
+from poise.cli.perpetual_options import Primitives, check_going_on, settings
 from poise.cli.perpetual_shown import report
 from poise.cli.perpetual_shown import training as shown
 from poise.cli.progress import clock
@@ -22,6 +22,7 @@ from poise.errors import PoiseError
 if TYPE_CHECKING:
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
+    from poise.recipes.track.policy import Tracker
 
 
 def run(
@@ -41,12 +42,23 @@ def run(
     held = (out / RUN_FILE).exists()
     if held and not training.resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
-    imitation = begin(library, primitives, out, config, training, held)
+    tracker = None
+    if primitives.going_on is not None:
+        from poise.recipes.perpetual.run import going_on
+        from poise.recipes.track.policy import open_tracker
+
+        check_going_on(primitives, body)
+        tracker = open_tracker(primitives.going_on)
+        config = going_on(tracker.config, config)
+    imitation = begin(library, primitives, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result = training, None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
-        result = train(imitation, out, until, show, t.threads, device=t.device, beginning=beginning())
+        result = train(
+            imitation, out, until, show, t.threads, device=t.device, beginning=beginning(),
+            trained=tracker and tracker.policy,
+        )  # fmt: skip
     if result is None or result.interrupted:
         where = "" if result is None or result.last is None else f" in {result.last.stage.name}"
         tell(f"Stopped{where}; the training so far is saved. Go on with:")
@@ -63,10 +75,12 @@ def begin(
     config: Perpetual,
     training: Training,
     held: bool,
+    tracker: Tracker | None,
 ) -> Imitation:
     """Reads the folder, tries the run folder, builds the task; nothing stays if that fails.
 
-    held: the run folder holds a run already, which then is all that is read.
+    held: the run folder holds a run already, which then is all that is read. tracker: the policy that it
+    goes on from.
     """
     from poise.recipes.perpetual import run as perpetual_run
 
@@ -74,6 +88,10 @@ def begin(
     hold_out, never = ((p,) if p else () for p in (library.hold_out, library.never))
     source = ", without ".join((str(folder.resolve()), *hold_out, *never))
     source = ", ".join((source, *library.source()))
+    earlier = None
+    if tracker is not None:
+        cost = tracker.about["samples"], tracker.about["seconds"]
+        earlier = perpetual_run.Earlier(*cost, tracker.humanoid.identity)
     if held:
         with progress.working("opening the run"):
             return perpetual_run.resume(out, config, source, training.device)
@@ -84,4 +102,4 @@ def begin(
     say(f"{len(clips)} clips, {clock(clips.seconds)}")
     notes(said)
     with claimed(out), progress.working("making the body"):
-        return perpetual_run.begin(out, clips, config, source, training.device)
+        return perpetual_run.begin(out, clips, config, source, training.device, earlier)

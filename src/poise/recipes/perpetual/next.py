@@ -40,14 +40,23 @@ DUMPS = "dumps"
 
 
 def begin_first(
-    imitation: Imitation, threads: int, folder: Path, tell: Beginning
+    imitation: Imitation,
+    threads: int,
+    folder: Path,
+    tell: Beginning,
+    trained: PolicyBundle | None = None,
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
-    folder: of the run, where the search for paths is kept.
+    folder: of the run, where the search for paths is kept. trained: a policy that goes on learning.
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
+    if trained is not None:
+        start = WarmStart(trained.copy())
+        if stage.kind == "primitive":
+            start = replace(start, policy=columns_of(trained, config.lateral))
+        return stage, start
     own = staged(imitation, stage)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None

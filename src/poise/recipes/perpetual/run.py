@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
+from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint, save_checkpoint
 from poise.learn.run import interruptible
 from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
@@ -32,6 +32,32 @@ from poise.recipes.perpetual.result import RESULT, PerpetualResult, finish
 from poise.recipes.perpetual.stages import Course
 from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
 from poise.recipes.session import FINAL, RUN_FILE
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What a policy has cost that a run goes on from, and the identity of the body it moves."""
+
+    samples: int
+    seconds: float
+    character: str
+
+
+def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
+    """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
+    who learns, with which seed, and whether recovery is learned.
+
+    Raises:
+        PoiseError: the policy is made of primitives.
+    """
+    if not policy.single and policy.multiplicative:
+        raise PoiseError(
+            "the policy is made of primitives and a composer, which are frozen and cannot go on",
+            hint="Go on from a single network, or resume its run",
+        )
+    done = {"expert": False, "paths": None, "help_start": 0.0}
+    asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery")}
+    return replace(policy, **done, **asked)
 
 
 def clips_of(
@@ -59,11 +85,17 @@ def clips_of(
 
 
 def begin(
-    folder: Path, library: ClipLibrary, config: Perpetual, source: str = "", device: str = "cpu"
+    folder: Path,
+    library: ClipLibrary,
+    config: Perpetual,
+    source: str = "",
+    device: str = "cpu",
+    earlier: Earlier | None = None,
 ) -> Imitation:
     """Builds the task and writes the run file; a folder that holds another run is refused.
 
-    source: where the clips are from, by which `resume` knows them.
+    source: where the clips are from, by which `resume` knows them. earlier: the training that the run
+    goes on from.
 
     Raises:
         PoiseError: a single clip, another run in the folder, or not enough memory.
@@ -86,11 +118,19 @@ def begin(
             )
     imitation = build(library, config)
     imitation.check_room(config.num_envs, device)
+    own = imitation.humanoid.identity
+    if earlier is not None and earlier.character != own:
+        raise PoiseError(
+            f"the policy moves the body '{earlier.character}', and that of the library is '{own}'",
+            hint="Give --onto the clip that the policy's library was brought onto, and its --mass",
+        )
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         meta = {"kind": "run", "recipe": RECIPE["name"], "config": said, "clips": notes}
-        character = imitation.humanoid.identity
-        save_checkpoint(path, tensors, {**meta, "source": source, "character": character})
+        meta |= {"source": source, "character": own}
+        if earlier is not None:
+            meta["earlier"] = {"samples": earlier.samples, "seconds": earlier.seconds}
+        save_checkpoint(path, tensors, meta)
     return imitation
 
 
@@ -170,6 +210,7 @@ def train(
     device: str = "cpu",
     beginning: Beginning | None = None,
     save_s: float = 30.0,
+    trained: PolicyBundle | None = None,
 ) -> PerpetualResult:
     """Trains all stages, or goes on with them, until nothing fails or a limit is reached.
 
@@ -178,10 +219,11 @@ def train(
         on_iteration: called after each; returning False ends the call as Ctrl-C does.
         device: "cpu" or "cuda"; no part of the run.
         save_s: seconds between checkpoints, beside those at evaluations.
+        trained: a policy that a new run goes on from; a run in progress has its own.
 
     Ctrl-C ends it after the present iteration with a checkpoint, a second one at once.
     """
-    course = Course(imitation, folder, until, threads, device, tensorboard, beginning, save_s)
+    course = Course(imitation, folder, until, threads, device, tensorboard, beginning, save_s, trained)
     last, asked = None, False
     try:
         if not (course.finished or course.share >= 1):

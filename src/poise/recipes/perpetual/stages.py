@@ -54,7 +54,8 @@ class Course:
     """A library's training in a run folder; begins it, or goes on from its checkpoint.
 
     until: limits of the whole training, of which every stage has its part. save_s: seconds between two
-    checkpoints, beside those after evaluations; 0 saves after every iteration.
+    checkpoints, beside those after evaluations; 0 saves after every iteration. trained: a policy that a
+    new run goes on from.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Course:
         tensorboard: bool = True,
         tell: Beginning | None = None,
         save_s: float = 30.0,
+        trained: PolicyBundle | None = None,
     ):
         self.imitation, self.folder, self.until = imitation, folder, until
         self.config: Perpetual = imitation.config
@@ -81,8 +83,8 @@ class Course:
             remove_partial(folder)
         else:
             check_falls(imitation)
-            stage, start = begin_first(imitation, threads, folder, self.tell)
-            warm = start is not None and start.critic is not None
+            stage, start = begin_first(imitation, threads, folder, self.tell, trained)
+            warm = start is not None and (start.critic is not None or trained is not None)
             self._enter(stage, start, warm, 1.0)
             # What the clone has cost is no time with help.
             self.begun = self.trainer.samples, self.trainer.seconds

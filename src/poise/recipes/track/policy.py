@@ -108,12 +108,14 @@ def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
     """The latest policy of a run in `folder`, whose task is built already."""
     policy, said = trained_policy(folder, imitation)
     inner: Mapping[str, Any] = said.get("metadata", {})
+    earlier = load_checkpoint(folder / RUN_FILE)[1].get("earlier", {"samples": 0, "seconds": 0.0})
     about = {
         "clips": list(imitation.library.names),
         "stage": inner.get("stage") or inner.get("course", {}).get("stage", {}).get("kind", ""),
         "finished": (folder / FINAL).exists(),
-        "samples": int(said.get("samples", 0)),
-        "seconds": float(said.get("seconds", 0.0)),
+        # With what the policy had cost that the run went on from.
+        "samples": int(said.get("samples", 0)) + earlier["samples"],
+        "seconds": float(said.get("seconds", 0.0)) + earlier["seconds"],
         "help_n": float(said["help_limit"]),
         "poise": __version__,
     }
