@@ -68,6 +68,13 @@ def test_matrices_are_halved_and_statistics_are_not(tracker: Tracker, file: Path
     assert track_policy._halved("policy/w", big).dtype == torch.float32
 
 
+def test_the_policy_that_comes_with_poise_is_sought_among_its_data() -> None:
+    import poise
+
+    assert track_policy.SHIPPED.parent == Path(poise.__file__).parent / "data"
+    assert (track_policy.SHIPPED.parent / "walk.bvh").exists()
+
+
 def test_no_policy_and_files_of_another_kind(run: Path, file: Path, tmp_path: Path) -> None:
     if not track_policy.SHIPPED.exists():
         with pytest.raises(PoiseError, match=r"no policy comes with this version .* --policy RUN"):
