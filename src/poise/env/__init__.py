@@ -5,7 +5,8 @@ from poise.env.expert import Expert, ExpertConfig, Plan, make_plan
 from poise.env.follower import Follower
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.gym import GymEnv, GymVectorEnv
-from poise.env.paths import PathConfig, Paths, PathSearch, PathStats
+from poise.env.path_config import PathConfig, Paths, PathStats
+from poise.env.paths import PathSearch
 from poise.env.recovery import Recovery
 from poise.env.reference import Reference
 from poise.env.task import EnvStep, TaskConfig

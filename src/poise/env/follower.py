@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
-from poise.env.paths import Paths
+from poise.env.path_config import Paths
 from poise.sim import difference
 from poise.spatial import quat_conj, quat_mul, quat_rotate
 

@@ -3,7 +3,7 @@
 An expert that needs no residual force. It is found by iLQR along all clips at once (Tassa et al. 2012),
 with three things that the motion of a human on stiff contacts asks for:
 
-- the linear model is taken over differences of a few hundredths of a radian (`sim.slopes`);
+- the linear model is taken over differences of about a tenth of a radian (`sim.slopes`);
 - at first a wrench on the root may help, whose price rises wherever the character is near its reference:
   the curriculum of residual forces (Skeleton2Humanoid Eq. 9), for each stretch of a motion by itself;
 - the step is chosen for each stretch of some seconds by itself, among rollouts that are made side by
@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.control import Regulator, regulate
-from poise.env.expert import ExpertConfig, make_plan
+from poise.env.expert import make_plan
+from poise.env.path_config import PathConfig, Paths, PathStats
 from poise.env.reference import Reference
 from poise.env.stretches import Stretch, best_steps, stretches
 from poise.errors import PoiseError
@@ -31,90 +31,6 @@ from poise.sim import CpuBackend, SimConfig, difference, slopes
 WORLDS, ROWS = 4096, 4000
 #: Damping never leaves these.
 DAMPING = (1e-3, 30.0)
-
-
-@dataclass(frozen=True)
-class PathConfig:
-    """How paths are searched.
-
-    iterations: of the search; 0 searches none. sizes: rad, of the differences in the first and in the
-    last iteration, see `sim.slopes`. stretch_s: seconds of which each chooses its own step.
-    place_m, turn, joint: errors that cost 1, of the root's place in m and attitude and of a joint in
-    rad; speed, spin, joint_speed: of their velocities. effort: rad of a joint's target, likewise.
-    help_n, help_nm: the wrench that costs 1 at first. less: what is left of that after an iteration
-    on stretches whose mean error cost is below `good`; more comes back above `bad`, up to the whole.
-    least: the share that help ends at, which is next to nothing; paths themselves are without.
-    astray: cost from which on a stretch begins again on its reference, with the help of three
-    iterations ago.
-    steps: of which the best is taken. lost: error of a whole body, in units of what costs 1, beyond
-    which a step is no choice. blur: the feedback of a frame is the mean over so many frames before
-    and after it: from frame to frame it jumps, which a network learns last.
-    """
-
-    iterations: int = 11
-    sizes: tuple[float, float] = (0.1, 0.065)
-    stretch_s: float = 2.0
-    place_m: float = 0.3
-    turn: float = 0.4
-    joint: float = 0.5
-    speed: float = 1.5
-    spin: float = 4.0
-    joint_speed: float = 8.0
-    effort: float = 0.5
-    help_n: float = 100.0
-    help_nm: float = 30.0
-    less: float = 0.6
-    least: float = 0.02
-    good: float = 4.0
-    bad: float = 10.0
-    astray: float = 25.0
-    steps: tuple[float, ...] = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
-    lost: float = 1.2
-    blur: int = 3
-    plan: ExpertConfig = field(default_factory=ExpertConfig)
-
-    def __post_init__(self) -> None:
-        if self.iterations < 0 or not 0 < self.less < 1 or min(*self.sizes, self.stretch_s) <= 0:
-            what = "iterations must not be negative, less lie in (0, 1), sizes and stretch_s be above 0"
-            raise PoiseError(what, "PathConfig")
-        if 0.0 not in self.steps:
-            raise PoiseError("one of the steps must be 0, with which a path stays", "PathConfig")
-
-    def size(self, iteration: int) -> float:
-        """Of the differences, falling geometrically."""
-        first, last = self.sizes
-        return first * (last / first) ** min(1.0, iteration / max(1, self.iterations - 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Paths:
-    """One path per clip; row r stands where row r of the reference does.
-
-    qpos `(F, nq)`, qvel `(F, nv)`, float64. target `(F, n)` rad and feedback `(F, n, 2 nv)`: servo
-    targets, and how they change with the deviation (`sim.difference`, then velocities); float32.
-    price `(2 nv)`: what the squares of deviations cost in the search.
-    """
-
-    qpos: Tensor
-    qvel: Tensor
-    target: Tensor
-    feedback: Tensor
-    price: Tensor
-
-
-@dataclass(frozen=True)
-class PathStats:
-    """What an iteration came to, over all frames.
-
-    error_m: mean distance of the root from the reference. help_n: mean force that still helps.
-    unhelped: share of the frames where help has ended. seconds: of all iterations.
-    """
-
-    iteration: int
-    error_m: float
-    help_n: float
-    unhelped: float
-    seconds: float
 
 
 class PathSearch:
@@ -167,10 +83,10 @@ class PathSearch:
     def iterate(self) -> PathStats:
         """One iteration over all clips."""
         begun = time.perf_counter()
-        with_worlds = self._worlds()
+        worlds = self._worlds()
         for clips in self._parts():
-            self._improve(clips, with_worlds)
-        with_worlds.close()
+            self._improve(clips, worlds)
+        worlds.close()
         self.iteration += 1
         self.seconds += time.perf_counter() - begun
         off = (self.qpos[:, :3] - self.reference.qpos[:, :3]).norm(dim=1).mean()

@@ -1,6 +1,6 @@
 """How the state after a control step depends on state and action before it, by finite differences.
 
-The differences are not small: over a few hundredths of a radian a foot that hovers touches the floor
+The differences are not small: over a tenth of a radian a foot that hovers touches the floor
 and one that sticks slides, so that the slope speaks of contacts that are not made yet, where the
 derivative itself says that nothing below the foot matters. It is the average of the derivative over
 the difference, a smoothing (Suh et al. 2022, "Bundled gradients through contact").
