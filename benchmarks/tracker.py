@@ -1,11 +1,11 @@
-"""Trains the policy that comes with Poise, on clips of CMU and DeepMimic.
+"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
 
     python benchmarks/tracker.py --library FOLDER --onto FOLDER/cmu_amc/02/02_01.amc -o RUN --minutes 60
 
-FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`benchmarks/README.md` says which). Whole
+FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
 that need none. Ctrl-C and --resume as in `poise train perpetual`; the policy is written with
-`poise.recipes.track.export_policy(RUN, FILE)` and measured by `perpetual.py`.
+`poise.recipes.track.policy.export_policy` and measured by `perpetual.py`.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from toy_library import library, tiny
 
 from poise.env import PathConfig, PathStats
 from poise.errors import PoiseError
-from poise.learn import LATEST, Until, load_checkpoint
+from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
 from poise.recipes.expert import Beginning
 from poise.recipes.perpetual.config import from_json, to_json
 from poise.recipes.perpetual.paths import PATHS
@@ -53,6 +53,12 @@ def test_a_killed_search_goes_on_where_it_was(tmp_path: Path) -> None:
     one, other = (load_checkpoint(tmp_path / name / LATEST)[0] for name in ("whole", "killed"))
     policy = [name for name in one if name.startswith("policy")]
     assert policy and all(torch.equal(one[name], other[name]) for name in policy)
+
+
+def test_paths_of_other_clips_are_refused(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / PATHS, {"qpos": torch.zeros(2, 3)}, {"kind": "paths", "clips": ["other"]})
+    with pytest.raises(PoiseError, match="paths of other clips"):
+        run(tmp_path)
 
 
 def test_settings_survive_and_shapes_are_refused() -> None:

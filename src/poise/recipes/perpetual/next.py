@@ -48,15 +48,12 @@ def begin_first(
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
-    folder: of the run, where the search for paths is kept. trained: a policy that goes on learning.
+    folder: of the run, where the search for paths is kept. trained: a single network that goes on.
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
     if trained is not None:
-        start = WarmStart(trained.copy())
-        if stage.kind == "primitive":
-            start = replace(start, policy=columns_of(trained, config.lateral))
-        return stage, start
+        return stage, WarmStart(trained.copy())
     own = staged(imitation, stage)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from poise.env import Paths, PathSearch
+from poise.errors import PoiseError
 from poise.learn import load_checkpoint, save_checkpoint
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
@@ -19,14 +20,17 @@ def find_paths(imitation: Imitation, folder: Path, threads: int, tell: Beginning
     config: Perpetual = imitation.config
     assert config.paths is not None
     search = PathSearch(imitation.reference, config.sim, config.paths, threads)
-    path = folder / PATHS
+    path, names = folder / PATHS, list(imitation.reference.names)
     if path.exists():
-        search.load_state(load_checkpoint(path)[0])
+        state, meta = load_checkpoint(path)
+        if meta.get("clips") != names or state["qpos"].shape != search.qpos.shape:
+            raise PoiseError(
+                "it holds paths of other clips", path, "Remove it, or choose another folder"
+            )
+        search.load_state(state)
     while not search.done:
         stats = search.iterate()
-        save_checkpoint(
-            path, search.state(), {"kind": "paths", "clips": list(imitation.reference.names)}
-        )
+        save_checkpoint(path, search.state(), {"kind": "paths", "clips": names})
         if tell.path is not None:
             tell.path(stats, config.paths.iterations)
     return search.paths()
