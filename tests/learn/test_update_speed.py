@@ -9,7 +9,7 @@ import torch
 from toy_point_env import PointEnv
 
 from poise.errors import PoiseError
-from poise.learn import PPOConfig, Trainer
+from poise.learn import PPOConfig, Trainer, beside
 from poise.nets import RunningNorm
 
 SMALL = PPOConfig(std=0.3, horizon=24, epochs=1, policy_hidden=(8,), value_hidden=(8,), minibatch=256)
@@ -36,7 +36,9 @@ def test_moments_say_what_observing_says():
 
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
-def test_training_policy_and_critic_side_by_side_changes_no_number(products):
+@pytest.mark.parametrize("worth", [1, beside.WORTH])
+def test_training_side_by_side_changes_no_number(products, worth, monkeypatch):
+    monkeypatch.setattr(beside, "WORTH", worth)
     config = replace(SMALL, epochs=3, critic_warmup=1, products=products)
     states = []
     for threads in (1, 2):
@@ -46,6 +48,33 @@ def test_training_policy_and_critic_side_by_side_changes_no_number(products):
         states.append(trainer.state())
     first, other = states
     assert all(torch.equal(first[k], other[k]) for k in first if k != "trainer/counters")
+
+
+def test_a_minibatch_in_two_parts_has_the_gradient_of_one(monkeypatch):
+    grads = []
+    for worth in (1, beside.WORTH):
+        monkeypatch.setattr(beside, "WORTH", worth)
+        # An odd number of rows, so that the parts are of different sizes.
+        config = replace(SMALL, products="float32", minibatch=10**6, policy_lr=1e-9, horizon=7)
+        trainer = Trainer(PointEnv(33, 0), config, seed=1)
+        trainer.iterate()
+        grads.append([p.grad.clone() for p in trainer.ppo.actor.policy.parameters() if p.requires_grad])
+    for split, whole in zip(*grads, strict=True):
+        torch.testing.assert_close(split, whole, rtol=1e-4, atol=1e-7)
+
+
+def test_a_failure_in_the_second_part_is_told_and_no_thread_goes_on():
+    param = torch.nn.Parameter(torch.ones(1))
+
+    def loss_and_terms(index):
+        if int(index[0]) > 0:
+            raise ValueError("second part")
+        return (param * index.float()).sum(), torch.zeros(1)
+
+    parts = torch.arange(4).tensor_split(2)
+    with pytest.raises(ValueError, match="second part"):
+        beside.mean_gradient(parts, [param], loss_and_terms, beside.Beside(), True)
+    assert param.grad is None
 
 
 def test_bfloat16_products_learn_as_well():

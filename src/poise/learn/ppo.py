@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.learn.beside import Acting, Beside, mean_gradient, parts_of
 from poise.learn.config import PPOConfig
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
@@ -35,7 +35,6 @@ from poise.nets import (
     GaussianPolicy,
     RunningNorm,
     bfloat16_is_fast,
-    gaussian_log_prob,
     half_forward,
 )
 
@@ -120,7 +119,7 @@ class PPO:
         self._half = config.products == "bfloat16" or (
             config.products == "auto" and here and bfloat16_is_fast()
         )
-        self._pool: ThreadPoolExecutor | None = None
+        self._beside = Beside()
 
     def value(self, obs: Tensor) -> Tensor:
         """V of normalised observations `(..., O)` in units of reward, `(...)`."""
@@ -207,11 +206,7 @@ class PPO:
             # What never changes in an update is looked up in it.
             context = policy.context(obs)
             if self._half:
-                # The old policy in the arithmetic of the new one, so that both are equal at first.
                 obs = obs.bfloat16()
-                mean, log_std = policy.distribution(obs, context)
-                log_prob = gaussian_log_prob(old.action, mean, log_std)
-                old = Drawn(old.action, log_prob, mean, log_std.detach().clone())
         mean, std = moments(self.comm, advantage)
         target = self.return_norm(rollout.returns.view(-1, 1))
         batch = _Batch(obs, (advantage - mean) / (std + 1e-8), target, old, context)
@@ -224,9 +219,9 @@ class PPO:
             indices = order.tensor_split(parts)
             value = self._beside(parallel and train_policy, self._fit_value, batch, indices)
             try:
-                sums = (
-                    self._fit_policy(batch, indices) if train_policy else advantage.new_zeros(len(_SUMS))
-                )
+                sums = advantage.new_zeros(len(_SUMS))
+                if train_policy:
+                    sums = self._fit_policy(batch, indices, parallel)
             finally:
                 # The critic's thread never outlives the epoch.
                 value_loss = value()
@@ -240,14 +235,10 @@ class PPO:
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
         return {name: sum(m[name] for m in means) / len(means) for name in means[0]}, kl
 
-    def _beside(self, parallel: bool, work: Callable[..., Tensor], *args: Any) -> Callable[[], Tensor]:
-        """Starts `work` in the critic's thread, or at once where not `parallel`; gives its result."""
-        if not parallel:
-            result = work(*args)
-            return lambda: result
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, "critic", torch.set_num_threads, (1,))
-        return self._pool.submit(work, *args).result
+    def acting(self, threads: int = 1) -> Acting:
+        """The collecting policy: in the arithmetic of the update, so that both are equal at first."""
+        parallel = threads > 1 and self.comm.size == 1
+        return Acting(self.actor.policy, self._half, self._beside, parallel)
 
     def mean(self, obs: Tensor) -> Tensor:
         """Mean actions of normalised `obs (N, O)` by the products of the update, with gradients."""
@@ -272,12 +263,15 @@ class PPO:
             total += loss.detach()
         return total
 
-    def _fit_policy(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
+    def _fit_policy(self, batch: _Batch, indices: Sequence[Tensor], parallel: bool) -> Tensor:
         """One epoch of the policy; the sums of `_SUMS`."""
         sums = batch.advantage.new_zeros(len(_SUMS))
         given = self.config.policy_grad_norm
         limit = math.inf if given is None else given
-        for index in indices:
+        params = self._policy_params
+        weights = sum(p.numel() for p in params)
+
+        def loss_and_terms(index: Tensor) -> tuple[Tensor, Tensor]:
             obs = batch.obs.index_select(0, index)
             context = None if batch.context is None else batch.context.index_select(0, index)
             loss, *terms = policy_loss(
@@ -286,12 +280,15 @@ class PPO:
                 batch.advantage.index_select(0, index),
                 batch.old.take(index),
             )
-            self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            average_gradients(self.comm, self._policy_params)
-            norm = torch.nn.utils.clip_grad_norm_(self._policy_params, limit, foreach=True)
+            return loss, torch.stack(terms)
+
+        for index in indices:
+            parts = parts_of(index, weights, self.comm.size)
+            terms = mean_gradient(parts, params, loss_and_terms, self._beside, parallel)
+            average_gradients(self.comm, params)
+            norm = torch.nn.utils.clip_grad_norm_(params, limit, foreach=True)
             self.optimizer.step()
-            sums += torch.stack([*terms, norm])
+            sums += torch.cat((terms, norm.view(1)))
         return sums
 
     @torch.no_grad()

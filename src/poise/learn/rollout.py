@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from poise.learn.beside import Acting
 from poise.learn.guard import check_finite
 from poise.learn.protocols import Style, VecEnv
 from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
@@ -89,12 +90,13 @@ def collect(
     episodes: Episodes,
     noise: torch.Generator,
     style: Style | None = None,
+    acting: Acting | None = None,
 ) -> Tensor:
     """Fills the rollout's `obs` to `truncated` with on-policy steps from the raw `obs (N, O)`.
 
     Raw observations are gathered in `norm`, which is not frozen here. Returns the raw observation
     to go on from. A number that is not finite raises a `TrainingError`. `style` watches; the rewards are
-    the environment's.
+    the environment's. `acting` computes what is drawn from, by default as `policy` does.
     """
     episodes.begin()
     logs: list[Mapping[str, float]] = []
@@ -102,6 +104,7 @@ def collect(
     cut_obs: list[Tensor] = []
     log_stds: list[Tensor] = []
     horizon, num_envs = rollout.reward.shape
+    distribution = acting or policy.distribution
     std, started = policy.log_std.exp(), float(norm.count) > 0
     if style is not None:
         style.begin(horizon)
@@ -116,7 +119,7 @@ def collect(
             norm.observe(obs)
             rollout.obs[t] = norm(obs)
         context = policy.context(rollout.obs[t])
-        rollout.mean[t], log_std = policy.distribution(rollout.obs[t], context)
+        rollout.mean[t], log_std = distribution(rollout.obs[t], context)
         if log_std.dim() > 1:
             log_stds.append(log_std)
             std = log_std.exp()

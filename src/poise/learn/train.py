@@ -160,7 +160,7 @@ class Trainer:
         with shared_statistics(self.comm, ppo.actor.norm), together(self.comm, TrainingError):
             self._obs = collect(
                 self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise,
-                self.style,
+                self.style, ppo.acting(self.update_threads),
             )  # fmt: skip
             task = float(rollout.reward.mean())
             if self.style is not None:
