@@ -148,10 +148,12 @@ def test_moments_are_hard_where_episodes_fail():
     assert fresh.odds.tolist() == [0.0] * 4
 
 
-def drawn(odds: Tensor | None, hard: float = 1.0, first: float = 0.0) -> tuple[Tensor, Tensor]:
+def drawn(
+    odds: Tensor | None, hard: float = 1.0, first: float = 0.0, over: str = "clip", weight: float = 1.0
+) -> tuple[Tensor, Tensor]:
     length = torch.tensor([300, 150])
     moments = Moments.cut(length, torch.zeros(2).bool(), RATE)
-    starts = Starts(length, torch.tensor([1.0, 1.0]), 7, first, moments, hard)
+    starts = Starts(length, torch.tensor([1.0, weight]), 7, first, moments, hard, over)
     return starts.draw(20_000, odds)
 
 
@@ -173,6 +175,21 @@ def test_episodes_begin_before_hard_moments_of_their_clip():
     near = ((ours >= 75) & (ours <= 135) | (ours >= 195) & (ours <= 255)).double().mean()
     assert float(near) == pytest.approx(0.9 * (0.5 + 0.5 * 122 / 299), abs=0.02)
     assert float((ours == 0).double().mean()) == pytest.approx(0.1, abs=0.02)
+
+
+def test_hard_moments_of_a_whole_library_decide_which_clips_are_drawn():
+    odds = torch.zeros(15).double()
+    odds[[4, 12]] = torch.tensor([0.1, 0.3]).double()
+    clip, frame = drawn(odds, over="library")
+    assert float((clip == 1).double().mean()) == pytest.approx(0.75, abs=0.02)
+    assert int(frame[clip == 0].min()) >= 75 and int(frame[clip == 0].max()) <= 135
+    assert int(frame[clip == 1].min()) >= 15 and int(frame[clip == 1].max()) <= 75
+    # Half of the starts as without.
+    clip, _ = drawn(odds, 0.5, over="library")
+    assert float((clip == 1).double().mean()) == pytest.approx(0.5 * 0.75 + 0.25, abs=0.02)
+    # What is not drawn at all is not practised, and nothing hard is as without.
+    assert not bool(drawn(odds, over="library", weight=0.0)[0].any())
+    torch.testing.assert_close(drawn(0 * odds, over="library"), drawn(0 * odds))
 
 
 def test_starts_stay_within_clips():

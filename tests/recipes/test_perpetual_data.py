@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.kin import fit_humanoid
+from poise.kin import Kinematics, fit_humanoid
+from poise.kin.ground import stance_heights
 from poise.motion import Clip, shifted, write_clip
 from poise.recipes.library import folder as perpetual_data
 from poise.recipes.library.files import content_key, is_motion, motion_files_of, subject_of
@@ -220,6 +222,17 @@ def test_real_clips(data_dir: Path, tmp_path: Path) -> None:
     stated = LibraryConfig(skeletons=(("90_", asf),), rates=(("90_11", 60.0),))
     (hand,), _ = library_of(paths[2:3], onto=onto, config=stated)
     assert hand.seconds == pytest.approx(179 / 60, abs=0.04)
+
+
+def test_feet_that_a_humanoid_turns_otherwise_stand_on_the_floor(data_dir: Path) -> None:
+    # The skeleton's own feet point their toes down, which a rigid foot on two axes does not.
+    paths = [data_dir / f"cmu_bvh/{name}.bvh" for name in ("acrnn_martial/04", "ad/frontkick001")]
+    library, _ = library_of(paths, onto=data_dir / "cmu_amc/02/02_01.amc")
+    body, motions, _ = fit_humanoid(library)
+    for qpos in motions:
+        pose = Kinematics(body.table)(torch.tensor(qpos))
+        heights = stance_heights(body.table, pose.pos, pose.quat, 30.0)
+        assert len(heights) > 100 and abs(float(np.median(heights))) < 0.02
 
 
 def test_a_partner_is_missed(data_dir: Path) -> None:

@@ -46,7 +46,8 @@ class ImitationEnv:
     ):
         self.num_envs, self.device = backend.num_envs, backend.device
         moments = reference.moments
-        self._starts = Starts(reference.length, weights, seed, task.first, moments, task.hard)
+        practised = moments, task.hard, task.hard_over
+        self._starts = Starts(reference.length, weights, seed, task.first, *practised)
         self.reference = reference = reference.to(self.device)
         self.hardness = Hardness(len(moments), self.device) if task.hard and task.auto_reset else None
         self.backend, self.task, self.substeps = backend, task, substeps

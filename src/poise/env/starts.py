@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -23,6 +25,8 @@ class Starts:
             which at least one step can be made (reference state initialisation).
         moments: of the clips, where some are practised more than others, see `draw`.
         hard: share of the starts (before those on frame 0 are taken) that practise hard moments.
+        over: whether the hard moments are those of the drawn "clip", or of the whole "library", so that
+            clips are drawn by how much of them is hard.
     """
 
     def __init__(
@@ -33,8 +37,9 @@ class Starts:
         first: float = 0.0,
         moments: Moments | None = None,
         hard: float = 0.0,
+        over: Literal["clip", "library"] = "clip",
     ):
-        self.length, self.first, self.hard = length.cpu(), first, hard
+        self.length, self.first, self.hard, self.over = length.cpu(), first, hard, over
         self.moments = None if moments is None else moments.to(torch.device("cpu"))
         for what, share in (("on frame 0", first), ("at hard moments", hard)):
             if not 0.0 <= share <= 1.0:
@@ -64,29 +69,35 @@ class Starts:
         """(clip, frame) of `count` starts, `(count,)` each.
 
         odds: `(G,)` float64 of the moments, such as `Hardness.odds`. The share `hard` of the starts lies
-        in the `RUN_UP` before the middle of a moment that is drawn by them among those of its clip;
-        clips of which all are 0 are begun as without.
+        in the `RUN_UP` before the middle of a moment that is drawn by them among those of its clip, or
+        of all clips of odds above 0; where all are 0 it is begun as without.
         """
         pick = torch.multinomial(self._weights, count, replacement=True, generator=self.rng)
         span = (self.length[pick] - 1).double()
         u = torch.rand(count, dtype=torch.float64, generator=self.rng)
         frame = torch.minimum((u * span).long(), self.length[pick] - 2)
         if self.hard and odds is not None and self.moments is not None:
-            frame = self._practise(self.moments, pick, frame, odds)
+            pick, frame = self._practise(self.moments, pick, frame, odds)
         if self.first:
             frame[torch.rand(count, generator=self.rng) < self.first] = 0
         return pick, frame
 
-    def _practise(self, m: Moments, pick: Tensor, frame: Tensor, odds: Tensor) -> Tensor:
-        """Some of the frames anew, before moments that are drawn by their odds."""
+    def _practise(self, m: Moments, pick: Tensor, frame: Tensor, odds: Tensor) -> tuple[Tensor, Tensor]:
+        """Some of the starts anew, before moments that are drawn by their odds."""
         chance, where, before = torch.rand(3, len(pick), dtype=torch.float64, generator=self.rng)
+        if self.over == "library":
+            # Those of clips that are not drawn at all are not practised either.
+            odds = torch.where(self._weights[m.clip] > 0, odds, 0.0)
+            first, last = torch.zeros_like(pick), torch.full_like(pick, len(m) - 1)
+        else:
+            first, last = m.offset[pick], m.offset[pick] + m.count[pick] - 1
         summed = torch.cat((odds.new_zeros(1), odds.cumsum(0)))
-        low, high = summed[m.offset[pick]], summed[m.offset[pick] + m.count[pick]]
+        low, high = summed[first], summed[last + 1]
         # Rounding must not lead out of the clip.
-        last = m.offset[pick] + m.count[pick] - 1
         found = torch.searchsorted(summed, low + where * (high - low), right=True) - 1
-        moment = torch.minimum(torch.maximum(found, m.offset[pick]), last)
-        size = m.size[moment].double()
+        moment = torch.minimum(torch.maximum(found, first), last)
+        clip, size = m.clip[moment], m.size[moment].double()
         begun = (m.begin[moment] + (0.5 - before * RUN_UP) * size).long().clamp(min=0)
-        begun = torch.minimum(begun, self.length[pick] - 2)
-        return torch.where((chance < self.hard) & (high > low), begun, frame)
+        begun = torch.minimum(begun, self.length[clip] - 2)
+        hard = (chance < self.hard) & (high > low)
+        return torch.where(hard, clip, pick), torch.where(hard, begun, frame)

@@ -42,8 +42,9 @@ class TaskConfig:
     horizon: control steps until an episode times out. finish: what a clip done to its end is worth, in
     rewards of its last step; a discount g makes g / (1 - g) of a character that goes on as it ended.
     first: share of the episodes that begin on their clip's frame 0, as evaluations do. hard: share of
-    the others that begin before moments in which episodes lately failed, see `Starts.draw`. style: what
-    a motion prior sees of a frame, terms that look at `frame.sim` alone, see `ImitationEnv.features`.
+    the others that begin before moments in which episodes lately failed, those of the drawn clip or of
+    all clips as `hard_over` says, see `Starts`. style: what a motion prior sees of a frame, terms that
+    look at `frame.sim` alone, see `ImitationEnv.features`.
     auto_reset: start a new episode where one ended (off while evaluating). recovery: falls and getting
     up, being far and coming back as part of the episodes, see `poise.env.recovery`; None for episodes
     that begin and stay on their clip.
@@ -60,6 +61,7 @@ class TaskConfig:
     finish: float = 0.0
     first: float = 0.0
     hard: float = 0.0
+    hard_over: Literal["clip", "library"] = "clip"
     style: tuple[ObsTerm, ...] = ()
     auto_reset: bool = True
     recovery: Recovery | None = None

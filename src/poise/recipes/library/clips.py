@@ -15,6 +15,8 @@ from poise.body import BodyConfig, BodyTable, generate_table, read_mjcf
 from poise.errors import PoiseError
 from poise.kin.alone import AloneRules, longest_alone, not_alone
 from poise.kin.clean import clean_clip
+from poise.kin.coords import clip_to_qpos
+from poise.kin.fk import Kinematics
 from poise.kin.flight import rate_sentence
 from poise.kin.ground import fit_heights
 from poise.kin.retarget import retarget
@@ -215,9 +217,9 @@ def place(
     if note.direction_deg > config.max_unlike_deg and not keep:
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
-    joints = [r.joint for r in target.table.rows]
-    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
-    fit = fit_heights(target.table, pos, quat, clip.fps)
+    # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
+    body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
+    fit = fit_heights(target.table, body.pos, body.quat, clip.fps)
     clip, note = shifted(clip, (0.0, 0.0, fit.lift_m)), replace(note, lift_m=fit.lift_m)
     # The file's own rate is what a doubt is about, at whatever rate the library is.
     doubt = rate_sentence(fit.flights, taken.fps)

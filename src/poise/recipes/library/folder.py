@@ -31,7 +31,7 @@ from poise.recipes.library.report import ClipNote, LibraryReport
 __all__ = ["ClipNote", "LibraryConfig", "LibraryReport", "Split", "library_of", "split"]
 
 #: Grows whenever the same files and settings would give other clips.
-VERSION = 2
+VERSION = 3
 
 
 class Split(NamedTuple):

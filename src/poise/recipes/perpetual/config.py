@@ -76,7 +76,8 @@ class Perpetual:
     is that of each "moment" of a clip, a second or so, which keeps or loses help of its own, of each
     "clip", or of "all" episodes.
     hard_starts: share of the episodes (but for those on frame 0) that begin up to two seconds before
-    where others lately failed; the rest begin anywhere, as in the paper.
+    where others lately failed; the rest begin anywhere, as in the paper. hard_over: such places of the
+    "clip" that was drawn, or of the whole "library", so that more is seen of long and hard clips.
     residual_std: deviation of the noise on the residual action, in units of the limits.
     shares: where in the training the first and the last primitive end at the latest; with recovery, of
     what `recovering.share` leaves.
@@ -112,6 +113,7 @@ class Perpetual:
     help_share: float = 0.8
     help_by: Literal["all", "clip", "moment"] = "moment"
     hard_starts: float = 0.5
+    hard_over: Literal["clip", "library"] = "clip"
     residual_std: float = 0.3
     shares: tuple[float, float] = (0.5, 0.8)
     evaluate_every: int = 0
@@ -205,7 +207,7 @@ def from_json(data: Mapping[str, Any]) -> Perpetual:
     """
     # The types of what may be left out; runs of before there was something did without.
     types = replace(Perpetual(), clone=CloneConfig(), paths=PathConfig())
-    old = {"recovery": False, "help_by": "all", "hard_starts": 0.0}
+    old = {"recovery": False, "help_by": "all", "hard_starts": 0.0, "hard_over": "clip"}
     try:
         return _filled(types, old | dict(data))
     except (TypeError, KeyError, AttributeError) as problem:

@@ -75,6 +75,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         finish=gamma / max(1.0 - gamma, 1.0 / config.horizon),
         first=config.first,
         hard=config.hard_starts,
+        hard_over=config.hard_over,
         style=phc_obs.style_terms(humanoid) if config.style else (),
         recovery=recovery,
     )

@@ -1,0 +1,84 @@
+"""Walks, runs, jumps, basketball and soccer of CMU, as they are published for prediction, as BVH.
+
+    python benchmarks/cmu_expmaps.py data/cmu_mocap --skeleton FOLDER/01_01.bvh -o LIBRARY/cmu_expmaps
+
+`data/cmu_mocap` is that folder of the repository of Li et al. (CVPR 2018), "Convolutional Sequence to
+Sequence Model for Human Dynamics": one row of 117 numbers a frame, the root's place in CMU's units and
+the exponential maps of 38 joints, the ends of limbs among them, at 120 Hz. `--skeleton` is any BVH of
+CMU's 31 joints. Its proportions are not the performers', with which standing feet would slide: the root
+travels as far as they say. Takes of performers that are held out (05, 11, 14) are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from poise.motion import Clip, Skeleton
+from poise.motion.io import read_clip, write_clip
+from poise.spatial import rotvec_to_quat
+
+UNIT = 0.0254 / 0.45
+#: Rows of the 31 joints among the 38; the others are the ends of limbs.
+ENDS = (6, 12, 19, 26, 28, 35, 37)
+ROWS = [j for j in range(38) if j not in ENDS]
+ACTIONS = ("walking", "walking_extra", "running", "jumping", "basketball", "soccer")
+#: 02_01 again, 05_01, what may be of 14, and 11_01.
+NOT = ("train-walking_1", "train-walking_2", "train-jumping_2", "test-jumping_1", "test-soccer_1")
+FEET = ("LeftToeBase", "RightToeBase")
+
+
+def to_z_up(vectors: np.ndarray) -> np.ndarray:
+    """`(..., 3)` with Y up as with Z up."""
+    return np.stack((vectors[..., 0], -vectors[..., 2], vectors[..., 1]), -1)
+
+
+def clip_of(path: Path, skeleton: Skeleton, name: str) -> Clip:
+    """A file's motion. Its first row is a T-pose; its maps turn row vectors, the other way round."""
+    # Some rows end in a comma.
+    rows = [[float(x) for x in line.split(",") if x.strip()] for line in path.read_text().splitlines()]
+    data = np.array([r for r in rows if len(r) == 117])[1:]
+    turns = -to_z_up(data[:, 3:].reshape(len(data), 38, 3)[:, ROWS])
+    rot = rotvec_to_quat(torch.tensor(turns)).numpy()
+    clip = Clip(skeleton, to_z_up(data[:, :3]) * UNIT, rot, 120.0, name)
+    return clip.replaced(root_pos=clip.root_pos * travel(clip))
+
+
+def travel(clip: Clip) -> float:
+    """The scale of the root's path with which the standing foot slides least."""
+    toes = clip.positions()[:, [clip.skeleton.index(n) for n in FEET]]
+    low = toes[..., 2] < np.quantile(toes[..., 2], 0.1, axis=0) + 0.02
+    own, root = np.diff(toes - clip.root_pos[:, None], axis=0), np.diff(clip.root_pos, axis=0)[:, None]
+    stands = (low[1:] & low[:-1])[..., None]
+    own, root = own[..., :2] * stands, (root[..., :2] * stands)
+    size = float((root**2).sum())
+    scale = -float((own * root).sum()) / size if size else 1.0
+    far = np.linalg.norm(np.diff(clip.root_pos[:, :2], axis=0), axis=1).sum() > 1.0
+    return scale if far and 0.8 < scale < 1.25 else 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--skeleton", type=Path, required=True)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    a = parser.parse_args()
+    skeleton = read_clip(a.skeleton).skeleton
+    assert len(skeleton) == len(ROWS), f"{a.skeleton} has {len(skeleton)} joints and not {len(ROWS)}"
+    a.out.mkdir(parents=True, exist_ok=True)
+    for path in sorted(p for action in ACTIONS for p in a.data.glob(f"*/{action}/*.txt")):
+        part = path.parent.parent.name
+        name = f"{part}-{path.stem}"
+        if name in NOT and path.parent.name != "walking_extra":
+            continue
+        extra = "-extra" if path.parent.name == "walking_extra" else ""
+        clip = clip_of(path, skeleton, name + extra)
+        write_clip(clip, a.out / f"{clip.name}.bvh")
+        print(f"{clip.name}: {clip.frames} frames")
+
+
+if __name__ == "__main__":
+    main()
