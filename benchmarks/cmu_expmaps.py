@@ -6,7 +6,8 @@
 Sequence Model for Human Dynamics": one row of 117 numbers a frame, the root's place in CMU's units and
 the exponential maps of 38 joints, the ends of limbs among them, at 120 Hz. `--skeleton` is any BVH of
 CMU's 31 joints. Its proportions are not the performers', with which standing feet would slide: the root
-travels as far as they say. Takes of performers that are held out (05, 11, 14) are left out.
+travels as far as they say. Takes whose feet slide in spite of that are left out, and so are those of
+performers that are held out (05, 11, 14).
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ ROWS = [j for j in range(38) if j not in ENDS]
 ACTIONS = ("walking", "walking_extra", "running", "jumping", "basketball", "soccer")
 #: 02_01 again, 05_01, what may be of 14, and 11_01.
 NOT = ("train-walking_1", "train-walking_2", "train-jumping_2", "test-jumping_1", "test-soccer_1")
+#: m/s of standing feet, beyond which a take is left out.
+SLIDE = 0.4
 FEET = ("LeftToeBase", "RightToeBase")
 
 
@@ -47,17 +50,28 @@ def clip_of(path: Path, skeleton: Skeleton, name: str) -> Clip:
     return clip.replaced(root_pos=clip.root_pos * travel(clip))
 
 
-def travel(clip: Clip) -> float:
-    """The scale of the root's path with which the standing foot slides least."""
+def standing(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps `(T - 1, 2, 2)` of both toes relative to the root, of the root, and which toes stand."""
     toes = clip.positions()[:, [clip.skeleton.index(n) for n in FEET]]
     low = toes[..., 2] < np.quantile(toes[..., 2], 0.1, axis=0) + 0.02
-    own, root = np.diff(toes - clip.root_pos[:, None], axis=0), np.diff(clip.root_pos, axis=0)[:, None]
-    stands = (low[1:] & low[:-1])[..., None]
-    own, root = own[..., :2] * stands, (root[..., :2] * stands)
-    size = float((root**2).sum())
-    scale = -float((own * root).sum()) / size if size else 1.0
+    own = np.diff(toes - clip.root_pos[:, None], axis=0)[..., :2]
+    root = np.broadcast_to(np.diff(clip.root_pos, axis=0)[:, None, :2], own.shape)
+    return own, root, low[1:] & low[:-1]
+
+
+def travel(clip: Clip) -> float:
+    """The scale of the root's path with which standing feet slide least."""
+    own, root, stands = standing(clip)
+    own, root = own[stands], root[stands]
+    scale = -float((own * root).sum()) / max(float((root**2).sum()), 1e-12)
     far = np.linalg.norm(np.diff(clip.root_pos[:, :2], axis=0), axis=1).sum() > 1.0
     return scale if far and 0.8 < scale < 1.25 else 1.0
+
+
+def slide(clip: Clip) -> float:
+    """Median speed of standing toes, m/s."""
+    own, root, stands = standing(clip)
+    return float(np.median(np.linalg.norm(own + root, axis=-1)[stands])) * clip.fps
 
 
 def main() -> None:
@@ -76,8 +90,10 @@ def main() -> None:
             continue
         extra = "-extra" if path.parent.name == "walking_extra" else ""
         clip = clip_of(path, skeleton, name + extra)
+        if (speed := slide(clip)) > SLIDE:
+            print(f"{clip.name}: left out, its feet slide at {speed:.2f} m/s")
+            continue
         write_clip(clip, a.out / f"{clip.name}.bvh")
-        print(f"{clip.name}: {clip.frames} frames")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ MOMENT_S = 1.0
 EVERY, KEPT = 64, 0.9
 #: Outcomes without a failure that every moment is taken to have had.
 PRIOR = 5.0
+#: With which odds a moment is practised that always fails; one that fails half of the time has 0.3.
+STILL = 0.1
 
 
 class Outcomes(NamedTuple):
@@ -113,8 +115,9 @@ class Moments:
 class Hardness:
     """How often episodes failed in each of G moments lately.
 
-    Attributes: `odds (G,)` float64 on the CPU, with which moments are to be practised: f (1 - f)
-    of the share f that failed, most where every second one fails. What always fails is not dwelled on.
+    Attributes: `odds (G,)` float64 on the CPU, with which moments are to be practised: f (1 + `STILL` -
+    f) of the share f that failed, most where about every second one fails. What always fails is not
+    dwelled on, nor given up.
     """
 
     def __init__(self, moments: int, device: torch.device | str = "cpu"):
@@ -134,7 +137,7 @@ class Hardness:
     def _rate(self) -> None:
         ended, failed = self._counts.cpu()
         share = failed / (ended + PRIOR)
-        self.odds = share * (1.0 - share)
+        self.odds = share * (1.0 + STILL - share)
 
     def state(self) -> Tensor:
         """What `load_state` takes: float64 `(1 + 3 G)`."""
