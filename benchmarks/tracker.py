@@ -43,7 +43,7 @@ def config(seed: int) -> Perpetual:
         help_start=0.0,
         paths=PathConfig(),
         convergence=ConvergenceConfig(patience=1000),
-        ppo=replace(plain.ppo, std=0.04),
+        ppo=replace(plain.ppo, std=0.04, kl_target=None),
         seed=seed,
     )
 

@@ -17,6 +17,7 @@ from poise.kin.ik_body import IkBody, ik_body
 from poise.kin.ik_config import CORRECTIONS, IkConfig
 from poise.kin.ik_paper import paper_humanoid
 from poise.kin.ik_polish import PolishConfig, Polished, polish
+from poise.kin.level import Levelled, level_feet
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
 from poise.kin.retarget import RetargetConfig, retarget
 from poise.kin.retarget_report import RetargetReport
@@ -39,6 +40,7 @@ __all__ = [
     "IkBody",
     "IkConfig",
     "Kinematics",
+    "Levelled",
     "Limb",
     "PolishConfig",
     "Polished",
@@ -68,6 +70,7 @@ __all__ = [
     "heal",
     "hold_feet",
     "ik_body",
+    "level_feet",
     "limb_of",
     "lowest_height",
     "match_positions",

@@ -19,6 +19,7 @@ from poise.kin.coords import clip_to_qpos
 from poise.kin.fk import Kinematics
 from poise.kin.flight import rate_sentence
 from poise.kin.ground import fit_heights
+from poise.kin.level import level_feet
 from poise.kin.retarget import retarget
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
 from poise.recipes.library.files import MotionFile, check_patterns, matches
@@ -217,6 +218,7 @@ def place(
     if note.direction_deg > config.max_unlike_deg and not keep:
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
+    clip = level_feet(clip, target.table).onto(clip)
     # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
     body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
     fit = fit_heights(target.table, body.pos, body.quat, clip.fps)

@@ -177,9 +177,16 @@ class Perpetual:
     def additive(cls, **changes: Any) -> Perpetual:
         """Settings for hours on a CPU: actions add to the reference's angles, with noise in radians
         that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
-        stage has more evaluations before it counts as learned."""
-        ppo = replace(cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32)
-        own = {"ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None}
+        stage has more evaluations before it counts as learned. Many worlds make large batches: what one
+        hard moment of many tells is lost in small ones, with steps large enough to learn it. Half of
+        the episodes begin before hard moments, those of the whole library, and the others anywhere."""
+        ppo = replace(
+            cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3
+        )
+        own = {
+            "ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None, "num_envs": 2048,
+            "hard_over": "library", "mining": MiningConfig(rule="uniform"),
+        }  # fmt: skip
         return cls(action="additive", **(own | changes))
 
     @property

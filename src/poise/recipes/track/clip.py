@@ -15,6 +15,7 @@ from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.ground import GroundFit, clip_flights, fit_ground
 from poise.kin.hinges import within_turns
+from poise.kin.level import Levelled, level_feet
 from poise.motion import Clip, Skeleton, resample
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ class Placed:
 
     source: as it came. clip: on the body's skeleton, at the source's rate. qpos: `(T, 7 + n)` at the
     control rate, on the floor. report: what fitting did. moved: how it was retargeted, None where it is
-    on the body's skeleton already. notes: what else is to be said.
+    on the body's skeleton already. level: how its feet were turned to stand flat. notes: what else is to
+    be said.
     """
 
     source: Clip
@@ -40,6 +42,7 @@ class Placed:
     qpos: np.ndarray
     report: FitReport
     moved: RetargetReport | None
+    level: Levelled
     notes: tuple[str, ...]
 
 
@@ -57,10 +60,11 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
         made, moved = retarget(clip, tracker.example)
     mended, found = clean_clip(made)
     table = humanoid.table
-    qpos = within_turns(clip_to_qpos(resample(mended, rate), table), humanoid)
+    level = level_feet(mended, table)
+    qpos = within_turns(clip_to_qpos(resample(level.onto(mended), rate), table), humanoid)
     qpos, ground = fit_ground(qpos, table, rate, known=known)
     report = _report(made, qpos, humanoid, rate, found, ground)
-    return Placed(clip, made, qpos, report, moved, _notes(qpos, humanoid, moved))
+    return Placed(clip, made, qpos, report, moved, level, _notes(qpos, humanoid, moved))
 
 
 def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
@@ -68,6 +72,7 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
 
     Joints that the body does not have, such as fingers, move as they did in the source.
     """
+    motion = placed.level.off(motion)
     if placed.moved is None:
         return motion
     config = RetargetConfig(scale=1.0 / placed.moved.scale)

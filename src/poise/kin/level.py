@@ -1,0 +1,82 @@
+"""Feet that stand flat on the soles of a body that was made from other clips.
+
+The roll of a foot is what motion capture knows least: soles of one performer stand 5 to 20 degrees apart
+from one recording to the next, and retargeting adds its own. A rigid sole then stands on its edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.motion import Clip
+from poise.spatial import quat_conj, quat_mul, quat_rotate, shortest_arc
+
+#: Share of the frames, those in which a foot is lowest, of which the slow ones are taken to stand.
+LOWEST = 0.3
+#: m/s of a foot that stands, and frames of which the mean is to be trusted.
+SLOW, ENOUGH = 0.4, 5
+#: Degrees: less is no fault, and more is no foot that stands.
+LEAST, MOST = 1.0, 35.0
+
+
+@dataclass(frozen=True, eq=False)
+class Levelled:
+    """Turns of feet, constant over a clip: joint index to quaternion wxyz in the foot's own frame."""
+
+    turns: Mapping[int, Tensor]
+
+    def onto(self, clip: Clip) -> Clip:
+        """The clip with its feet turned; what hangs on them stays as it is in the world."""
+        return self._turned(clip, self.turns)
+
+    def off(self, clip: Clip) -> Clip:
+        """What `onto` did, undone."""
+        return self._turned(clip, {j: quat_conj(q) for j, q in self.turns.items()})
+
+    @staticmethod
+    def _turned(clip: Clip, turns: Mapping[int, Tensor]) -> Clip:
+        if not turns:
+            return clip
+        rot = torch.tensor(clip.rot)
+        for joint, turn in turns.items():
+            rot[:, joint] = quat_mul(rot[:, joint], turn.expand(len(rot), 4))
+            for child in clip.skeleton.children(joint):
+                rot[:, child] = quat_mul(quat_conj(turn).expand(len(rot), 4), rot[:, child])
+        return clip.replaced(rot=rot.numpy())
+
+
+def level_feet(clip: Clip, table: BodyTable) -> Levelled:
+    """The turns with which the table's soles are level on average while the feet of a clip stand.
+
+    A foot stands while it is among the lowest and slow. The turn is the shortest from the sole's normal
+    to the mean of the vertical, both in the foot's frame.
+    """
+    pos, quat = (torch.tensor(x) for x in clip.world())
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype)
+    turns: dict[int, Tensor] = {}
+    for row in table.rows:
+        box = next((g for g in row.geoms if g.kind == "box"), None)
+        if row.kind != "foot" or box is None:
+            continue
+        normal = quat_rotate(torch.tensor(box.quat, dtype=pos.dtype), up)
+        place = pos[:, row.joint] + quat_rotate(
+            quat[:, row.joint], torch.tensor(box.pos, dtype=pos.dtype).expand(len(pos), 3)
+        )
+        speed = np.linalg.norm(np.gradient(place.numpy(), axis=0), axis=1) * clip.fps
+        height = place[:, 2].numpy()
+        stands = (height <= np.quantile(height, LOWEST) + 1e-9) & (speed < SLOW)
+        if stands.sum() < ENOUGH:
+            continue
+        here = quat[torch.from_numpy(stands), row.joint]
+        mean = quat_rotate(quat_conj(here), up.expand(len(here), 3)).mean(0)
+        mean = mean / mean.norm()
+        angle = float(torch.rad2deg(torch.acos((normal @ mean).clamp(-1.0, 1.0))))
+        if LEAST < angle < MOST:
+            turns[row.joint] = shortest_arc(normal, mean)
+    return Levelled(turns)
