@@ -43,7 +43,9 @@ LADDER = {
 def settings(name: str, seed: int) -> Perpetual:
     """One run's."""
     additive = Perpetual.additive(help_start=0.0, max_primitives=2, single_hidden=(1024, 512), seed=seed)
-    ppo = additive.ppo
+    # A small library has fewer hard moments, and the budget is small.
+    additive = replace(additive, num_envs=512)
+    ppo = replace(additive.ppo, minibatch=2048)
     if name.startswith("absolute"):
         # Noise in shares of a joint's range.
         ppo = replace(ppo, std=0.02)

@@ -140,7 +140,7 @@ class Training:
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of everything random."""
     envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Characters simulated at once; by default the recipe's 512."""
+    """Characters simulated at once; the recipe's number by default, mostly 512."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Threads of the physics; 0 takes every core."""
     device: Device = "cpu"

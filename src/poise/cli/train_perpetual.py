@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,8 @@ def run(
 
         check_going_on(primitives, body)
         tracker = open_tracker(primitives.going_on)
+        if training.envs is None:
+            config = replace(config, num_envs=tracker.config.num_envs)
         config = going_on(tracker.config, config)
     imitation = begin(library, primitives, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)

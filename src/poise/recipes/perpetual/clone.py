@@ -13,6 +13,8 @@ PER_FRAME, MOST = 16, 640_000
 PER_FRAME_OF_PATHS, MOST_OF_PATHS = 60, 1_000_000
 #: From so many control steps on, more rounds are of more use than more steps in each.
 MANY = 200_000
+#: Worlds for which `CloneConfig` states its steps; in more of them fewer do.
+USUAL = 512
 
 
 def clone_for(frames: int, worlds: int, paths: bool = False) -> CloneConfig:
@@ -32,4 +34,5 @@ def clone_for(frames: int, worlds: int, paths: bool = False) -> CloneConfig:
         rounds, epochs = 5, (6, 3)
     steps = ceil(wanted / ((rounds + 1) * worlds))
     noise = (0.0, 0.5, 1.0) if paths else plain.noise
-    return CloneConfig(steps=max(plain.steps, steps), rounds=rounds, epochs=epochs, noise=noise)
+    least = ceil(plain.steps * min(1.0, USUAL / worlds))
+    return CloneConfig(steps=max(least, steps), rounds=rounds, epochs=epochs, noise=noise)
