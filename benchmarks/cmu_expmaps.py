@@ -20,9 +20,9 @@ import torch
 
 from poise.motion import Clip, Skeleton
 from poise.motion.io import read_clip, write_clip
+from poise.motion.io.guess import ASF_UNIT_M
 from poise.spatial import rotvec_to_quat
 
-UNIT = 0.0254 / 0.45
 #: Rows of the 31 joints among the 38; the others are the ends of limbs.
 ENDS = (6, 12, 19, 26, 28, 35, 37)
 ROWS = [j for j in range(38) if j not in ENDS]
@@ -46,7 +46,7 @@ def clip_of(path: Path, skeleton: Skeleton, name: str) -> Clip:
     data = np.array([r for r in rows if len(r) == 117])[1:]
     turns = -to_z_up(data[:, 3:].reshape(len(data), 38, 3)[:, ROWS])
     rot = rotvec_to_quat(torch.tensor(turns)).numpy()
-    clip = Clip(skeleton, to_z_up(data[:, :3]) * UNIT, rot, 120.0, name)
+    clip = Clip(skeleton, to_z_up(data[:, :3]) * ASF_UNIT_M, rot, 120.0, name)
     return clip.replaced(root_pos=clip.root_pos * travel(clip))
 
 
@@ -85,11 +85,11 @@ def main() -> None:
     a.out.mkdir(parents=True, exist_ok=True)
     for path in sorted(p for action in ACTIONS for p in a.data.glob(f"*/{action}/*.txt")):
         part = path.parent.parent.name
-        name = f"{part}-{path.stem}"
-        if name in NOT and path.parent.name != "walking_extra":
-            continue
         extra = "-extra" if path.parent.name == "walking_extra" else ""
-        clip = clip_of(path, skeleton, name + extra)
+        name = f"{part}-{path.stem}{extra}"
+        if name in NOT:
+            continue
+        clip = clip_of(path, skeleton, name)
         if (speed := slide(clip)) > SLIDE:
             print(f"{clip.name}: left out, its feet slide at {speed:.2f} m/s")
             continue

@@ -15,6 +15,8 @@ import contextlib
 from dataclasses import replace
 from pathlib import Path
 
+from tracker import SIXTY
+
 from poise.body import BodyConfig
 from poise.cli.beginning import beginning
 from poise.cli.perpetual_shown import training as shown
@@ -25,8 +27,6 @@ from poise.recipes.perpetual.result import RESULT
 from poise.recipes.perpetual.run import begin, clips_of, resume, train
 from poise.recipes.session import RUN_FILE
 
-#: CMU's files state 120 Hz throughout, but some were captured at 60.
-SIXTY = (("(^|-)90_", 60.0), ("salsa", 60.0))
 #: Every row adds what its name says to the one before; the last three stand for themselves.
 LADDER = {
     "plain": {"termination": "all", "multiplicative": False, "recovery": False},

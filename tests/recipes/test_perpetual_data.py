@@ -235,6 +235,21 @@ def test_feet_that_a_humanoid_turns_otherwise_stand_on_the_floor(data_dir: Path)
         assert len(heights) > 100 and abs(float(np.median(heights))) < 0.02
 
 
+def test_feet_are_turned_only_where_motion_is_simulated(data_dir: Path) -> None:
+    paths, onto = [data_dir / "cmu_amc/02/02_09.amc"], data_dir / "cmu_amc/02/02_01.amc"
+    level, plain = (
+        library_of(paths, onto=onto, config=LibraryConfig(level=x))[0].clips[0] for x in (True, False)
+    )
+    foot = plain.skeleton.index("lfoot")
+    apart = np.abs((level.rot * plain.rot).sum(-1)).clip(max=1.0)
+    # One turn for the whole clip, of the foot and of what must not follow it.
+    assert np.degrees(2 * np.arccos(apart[:, foot])).min() > 3.0
+    assert np.ptp(apart[:, foot]) < 1e-6
+    others = [j for j in range(len(plain.skeleton)) if "foot" not in plain.skeleton.names[j]]
+    others = [j for j in others if "toes" not in plain.skeleton.names[j]]
+    np.testing.assert_allclose(apart[:, others], 1.0, atol=1e-9)
+
+
 def test_a_partner_is_missed(data_dir: Path) -> None:
     path = data_dir / "cmu_bvh/acrnn_salsa/01.bvh"
     library, report = library_of([path], onto=data_dir / "cmu_amc/02/02_01.amc")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,9 @@ def library_bank(
     files = motion_files(library)
     how = None
     if onto is not None or reading is not None:
-        how = json.loads(json.dumps([onto, reading and asdict(reading)]))
+        # Nothing is simulated: feet are learned as they are.
+        reading = replace(reading or LibraryConfig(), level=False)
+        how = json.loads(json.dumps([onto, asdict(reading)]))
     key = [[str(f.relative_to(library.parent)), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
     if cache.exists():
         tensors, meta = load_checkpoint(cache)

@@ -43,7 +43,8 @@ class LibraryConfig:
     keep: regular expressions of clips that are taken whole whatever the rules say. leave_out: of clips
     that are not taken. skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
     rates: (pattern, frames per second) pairs for files that state none or a wrong one. allow_pickle:
-    pickled files that are given by name are read too.
+    pickled files that are given by name are read too. level: feet are turned to stand flat on the
+    humanoid's soles, see `level_feet`, which motion that is not simulated has no need of.
     """
 
     min_frames: int = 10
@@ -56,6 +57,7 @@ class LibraryConfig:
     skeletons: tuple[tuple[str, str], ...] = ()
     rates: tuple[tuple[str, float], ...] = ()
     allow_pickle: bool = False
+    level: bool = True
 
     def __post_init__(self) -> None:
         check_patterns((*self.keep, *self.leave_out, *(p for p, _ in (*self.skeletons, *self.rates))))
@@ -218,7 +220,8 @@ def place(
     if note.direction_deg > config.max_unlike_deg and not keep:
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
-    clip = level_feet(clip, target.table).onto(clip)
+    if config.level:
+        clip = level_feet(clip, target.table).onto(clip)
     # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
     body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
     fit = fit_heights(target.table, body.pos, body.quat, clip.fps)
