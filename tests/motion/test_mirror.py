@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.mirror import joined, mirrored, other_sides
+from poise.motion.mirror import joined, mirrored, mirrored_clip, other_sides
+from toy_human import swing
 from toy_windows import bank
 
 
@@ -43,3 +47,30 @@ def test_both_make_one_bank() -> None:
     assert torch.equal(both.first[len(of.clips) :], of.first + of.frames)
     half = both.only(lambda name: name.endswith("-mirrored"))
     assert torch.equal(half.root, mirrored(of).root)
+
+
+def test_a_clip_in_a_mirror_and_back() -> None:
+    clip = swing(1.0, speed=1.0, bend=0.8)
+    seen = mirrored_clip(clip)
+    other = other_sides(clip.skeleton.names, clip.skeleton.parents)
+    expected = clip.positions()[:, other] * [1.0, -1.0, 1.0]
+    assert np.allclose(seen.positions(), expected, atol=1e-9)
+    # It turns left, its image right.
+    assert clip.root_pos[-1, 1] > 0.1 and seen.root_pos[-1, 1] < -0.1
+    again = mirrored_clip(seen)
+    assert np.allclose(again.positions(), clip.positions())
+    assert [j for j, _ in again.skeleton.ends] == [j for j, _ in clip.skeleton.ends]
+
+
+def test_bones_of_unlike_sides_and_a_rest_that_lies_are_no_hindrance() -> None:
+    clip = swing(1.0, speed=1.0)
+    offsets = np.array(clip.skeleton.offsets)
+    offsets[clip.skeleton.index("LeftArm")] *= 1.2
+    odd = clip.replaced(skeleton=replace(clip.skeleton, offsets=offsets))
+    other = other_sides(clip.skeleton.names, clip.skeleton.parents)
+    assert np.allclose(mirrored_clip(odd).positions(), odd.positions()[:, other] * [1, -1, 1], atol=1e-9)
+    # Rest with left above right: the mirror is across y.
+    lying = np.array(clip.skeleton.offsets)[:, [0, 2, 1]]
+    flat = clip.replaced(skeleton=replace(clip.skeleton, offsets=lying))
+    seen = mirrored_clip(flat)
+    assert np.allclose(seen.positions(), flat.positions()[:, other] * [1, -1, 1], atol=1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.kin import Kinematics, fit_humanoid
+from poise.kin.coords import clip_to_qpos
 from poise.kin.ground import stance_heights
 from poise.motion import Clip, shifted, write_clip
 from poise.recipes.library import folder as perpetual_data
@@ -255,3 +257,40 @@ def test_a_partner_is_missed(data_dir: Path) -> None:
     library, report = library_of([path], onto=data_dir / "cmu_amc/02/02_01.amc")
     assert [(c.state, c.rule) for c in report.clips] == [("cut", "leaning")]
     assert library.clips[0].seconds > 10.0
+
+
+def test_every_clip_in_a_mirror_too(folder: Path) -> None:
+    plain, _ = library_of(folder)
+    both, report = library_of(folder, config=LibraryConfig(mirror=True))
+    assert both.names == tuple(n for name in plain.names for n in (name, f"{name}-mirrored"))
+    assert report.sentences()[0].startswith("4 of 7 clips")
+    assert subject_of("cmu-02-02_01-mirrored") == "cmu 02"
+    assert len(split(both, ["cmu 02"]).test) == 4
+    body = fit_humanoid(both)[0]
+    for clip, seen in zip(both.clips[::2], both.clips[1::2], strict=True):
+        assert seen.skeleton.names == clip.skeleton.names and seen.frames == clip.frames
+        left, right = (clip.skeleton.index(f"{s}Hand") for s in ("Left", "Right"))
+        apart = seen.positions()[:, left] - clip.positions()[:, right] * [1.0, -1.0, 1.0]
+        assert np.linalg.norm(apart, axis=-1).max() < 0.02
+        pose = Kinematics(body.table)(torch.tensor(clip_to_qpos(seen, body.table)))
+        assert abs(float(stance_heights(body.table, pose.pos, pose.quat, seen.fps).mean())) < 0.02
+
+
+def test_onto_a_body_that_is_there_already(folder: Path) -> None:
+    from poise.recipes.library.clips import Target
+
+    clip = swing(seconds=2.0, scale=1.1)
+    body = fit_humanoid(clip)[0]
+    target = Target(body.skeleton, clip, body.table, "the policy's body")
+    library, report = library_of(folder, target, cache=folder.parent / "cache")
+    assert all(np.array_equal(c.skeleton.offsets, clip.skeleton.offsets) for c in library)
+    assert report.onto == "the policy's body"
+    again, told = library_of(folder, target, cache=folder.parent / "cache")
+    assert told.cached and again.names == library.names
+    heavier = replace(target, table=body.table.overridden({"thigh.mass": 9.0}))
+    assert not library_of(folder, heavier, cache=folder.parent / "cache")[1].cached
+    # Going on with a library, a body only widens its ranges and lets more pairs pass.
+    grown = fit_humanoid(library, table=body.table)[0].table
+    assert [r.geoms for r in grown.rows] == [r.geoms for r in body.table.rows]
+    for new, old in zip(grown.rows, body.table.rows, strict=True):
+        assert all(a <= c and b >= d for (a, b), (c, d) in zip(new.ranges, old.ranges, strict=True))

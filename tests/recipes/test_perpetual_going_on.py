@@ -11,9 +11,11 @@ from toy_library import library, tiny
 
 from poise.errors import PoiseError
 from poise.learn import Until
+from poise.motion import ClipLibrary
 from poise.recipes.perpetual.run import Earlier, begin, going_on, train
 from poise.recipes.perpetual.stages import Course
-from poise.recipes.track.policy import export_policy, policy_of_run
+from poise.recipes.track.policy import Tracker, export_policy, load_tracker, policy_of_run
+from toy_human import swing
 
 ONE = tiny(single=True, style=None, expert=False, help_start=0.0)
 
@@ -27,15 +29,15 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "policy.safetensors"
 
 
-def test_it_begins_with_the_policys_weights_and_counts_its_cost(policy: Path, tmp_path: Path) -> None:
-    from poise.recipes.track.policy import load_tracker
+def earlier(tracker: Tracker) -> Earlier:
+    return Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
 
+
+def test_it_begins_with_the_policys_weights_and_counts_its_cost(policy: Path, tmp_path: Path) -> None:
     tracker = load_tracker(policy)
     config = going_on(tracker.config, tiny(seed=7))
     assert config.single and config.seed == 7 and not config.expert and config.paths is None
-    cost = tracker.about["samples"], tracker.about["seconds"]
-    earlier = Earlier(*cost, tracker.humanoid.identity)
-    imitation = begin(tmp_path, library(), config, earlier=earlier)
+    imitation = begin(tmp_path, library(), config, earlier=earlier(tracker))
     course = Course(
         imitation, tmp_path, Until(iterations=1), 1, tensorboard=False, trained=tracker.policy
     )
@@ -49,10 +51,24 @@ def test_it_begins_with_the_policys_weights_and_counts_its_cost(policy: Path, tm
     assert again.about["seconds"] > tracker.about["seconds"]
 
 
+def test_a_larger_library_keeps_the_policys_body(policy: Path, tmp_path: Path) -> None:
+    tracker = load_tracker(policy)
+    # Soles, ranges and all else of a body depend on the clips it is made from.
+    more = ClipLibrary.of([*library(), swing(0.7, speed=-1.0, bend=2.0, name="back")])
+    imitation = begin(tmp_path, more, going_on(tracker.config, tiny()), earlier=earlier(tracker))
+    rows = [replace(r, ranges=()) for r in imitation.humanoid.table.rows]
+    assert rows == [replace(r, ranges=()) for r in tracker.humanoid.table.rows]
+    train(imitation, tmp_path, Until(iterations=1), None, 1, False, trained=tracker.policy)
+    again = policy_of_run(tmp_path)
+    assert again.humanoid.identity == imitation.humanoid.identity
+    assert again.about["samples"] > tracker.about["samples"]
+
+
 def test_another_body_and_a_composer_are_refused(policy: Path, tmp_path: Path) -> None:
-    other = Earlier(1, 1.0, "another body")
-    with pytest.raises(PoiseError, match="moves the body 'another body'"):
-        begin(tmp_path / "run", library(), ONE, earlier=other)
+    target = load_tracker(policy).target
+    other = replace(target, skeleton=swing(0.5, scale=1.1).skeleton)
+    with pytest.raises(PoiseError, match="another skeleton than the policy's body"):
+        begin(tmp_path / "run", library(), ONE, earlier=Earlier(1, 1.0, other))
     assert not (tmp_path / "run").exists()
     with pytest.raises(PoiseError, match="primitives and a composer"):
         going_on(replace(ONE, single=False), ONE)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
 
@@ -111,6 +112,25 @@ class BodyTable:
             table = replace(table, rows=rows)
         return table
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> BodyTable:
+        """What `to_dict` gave, or JSON made of it.
+
+        Raises:
+            KeyError, TypeError: a value is missing or unknown.
+        """
+        rows = []
+        for row in data["rows"]:
+            plain = {k: _tuples(v) for k, v in row.items() if k != "geoms"}
+            geoms = tuple(Geom(**{k: _tuples(v) for k, v in geom.items()}) for geom in row["geoms"])
+            rows.append(BodyRow(**plain, geoms=geoms))
+        rest = {k: _tuples(v) for k, v in data.items() if k != "rows"}
+        return cls(tuple(rows), **rest)
+
     def describe(self) -> list[dict[str, object]]:
         """One plain dict per body, for printing: masses kg, gains N m/rad, ranges degrees."""
         return [
@@ -128,3 +148,8 @@ class BodyTable:
             }
             for r in self.rows
         ]
+
+
+def _tuples(value: Any) -> Any:
+    """Lists to tuples, all the way down, since JSON knows only lists."""
+    return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value

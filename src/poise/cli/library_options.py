@@ -32,6 +32,8 @@ class Library:
     """REGEX=FILE.asf, for AMC files of such names that have none beside them."""
     library_fps: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RE=HZ")] = ()
     """REGEX=HZ, frames per second of files of such names."""
+    mirror: bool = False
+    """Learn from every clip in a mirror, too."""
 
     def folder(self, recipe: str) -> Path:
         """The folder.
@@ -66,13 +68,14 @@ class Library:
         for _, asf in skeletons:
             if not Path(asf).is_file():
                 raise PoiseError("there is no such file", asf, "--library-skeleton names an ASF file")
-        return LibraryConfig(skeletons=tuple(skeletons), rates=tuple(rates))
+        return LibraryConfig(skeletons=tuple(skeletons), rates=tuple(rates), mirror=self.mirror)
 
     def source(self) -> list[str]:
         """What of the library's reading tells one run from another, in words."""
         said = [f"onto {self.onto.resolve()}"] if self.onto is not None else []
         said += [f"skeleton {x}" for x in self.library_skeleton]
-        return said + [f"fps {x}" for x in self.library_fps]
+        said += [f"fps {x}" for x in self.library_fps]
+        return said + (["with mirror images"] if self.mirror else [])
 
 
 def _pairs(option: str, texts: tuple[str, ...], example: str) -> list[tuple[str, str]]:

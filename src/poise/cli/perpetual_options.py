@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
+from poise.cli.library_options import Library
 from poise.cli.options import Body, Training
 from poise.errors import PoiseError
 
@@ -40,7 +41,7 @@ class Primitives:
     action: Annotated[Action, arg(metavar="NAME")] = "absolute"
     """perpetual: joint targets as in the paper, or additive ones, with settings for hours on a CPU."""
     going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
-    """perpetual: go on from a trained policy, a file or a run, with its settings and networks."""
+    """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body."""
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
@@ -85,8 +86,11 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
     return config if training.envs is None else replace(config, num_envs=training.envs)
 
 
-def check_going_on(primitives: Primitives, body: Body) -> None:
+def check_going_on(primitives: Primitives, body: Body, library: Library) -> None:
     """Refuses options whose say a policy has that training goes on from."""
+    if library.onto is not None:
+        what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
+        raise PoiseError(what, hint="Leave --onto out")
     plain = Primitives(recovery=primitives.recovery, going_on=primitives.going_on)
     names = [f.name for f in fields(plain) if getattr(primitives, f.name) != getattr(plain, f.name)]
     names += [f.name for f in fields(body) if getattr(body, f.name) != getattr(Body(), f.name)]

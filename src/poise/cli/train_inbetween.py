@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -27,8 +27,6 @@ class Network:
 
     net: Literal["transformer", "rtn"] = "transformer"
     """inbetween: the network; rtn is that of Harvey et al. 2020."""
-    mirror: bool = False
-    """inbetween: learn from every clip in a mirror, too."""
     contacts: Annotated[Contacts, arg(metavar="NAME")] = "floor"
     """inbetween: when a foot stands: floor says while it is low and slow; harvey and two-stage are the
     papers' rules, for recordings whose feet never slide."""
@@ -56,11 +54,15 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
         raise PoiseError(f"--dropout must be at least 0 and below 1, got {network.dropout:g}")
     if network.dropout and network.net == "rtn":
         raise PoiseError("the network rtn has no --dropout", hint="Leave it out")
+    reading = None
+    if library.library_fps or library.library_skeleton:
+        # Its windows are seen in a mirror, not the clips.
+        reading = replace(library.reading(), mirror=False)
     config = Inbetween(
         net=network.net, name=folder.name, seed=seed, validation=library.hold_out,
-        final=library.never or r"(?!)", contacts=network.contacts, mirror=network.mirror,
+        final=library.never or r"(?!)", contacts=network.contacts, mirror=library.mirror,
         onto=None if library.onto is None else str(library.onto.resolve()),
-        reading=library.reading() if library.library_fps or library.library_skeleton else None,
+        reading=reading,
         between_training=BetweenTraining(dropout=network.dropout),
     )  # fmt: skip
     with claimed(out):

@@ -48,7 +48,7 @@ def run(
         from poise.recipes.perpetual.run import going_on
         from poise.recipes.track.policy import open_tracker
 
-        check_going_on(primitives, body)
+        check_going_on(primitives, body, library)
         tracker = open_tracker(primitives.going_on)
         if training.envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
@@ -94,14 +94,16 @@ def begin(
     earlier = None
     if tracker is not None:
         cost = tracker.about["samples"], tracker.about["seconds"]
-        earlier = perpetual_run.Earlier(*cost, tracker.humanoid.identity)
+        earlier = perpetual_run.Earlier(*cost, tracker.target)
     if held:
         with progress.working("opening the run"):
             return perpetual_run.resume(out, config, source, training.device)
     if training.resume:
         tell(f"There was no run in {out}; a new one starts.")
-    where = (library.onto, library.reading())
-    clips, said = perpetual_run.clips_of(folder, config.body, hold_out, never, tell, *where)
+    onto = library.onto if tracker is None else tracker.target
+    clips, said = perpetual_run.clips_of(
+        folder, config.body, hold_out, never, tell, onto, library.reading()
+    )
     say(f"{len(clips)} clips, {clock(clips.seconds)}")
     notes(said)
     with claimed(out), progress.working("making the body"):

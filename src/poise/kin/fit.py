@@ -101,7 +101,10 @@ class FitReport:
 
 
 def fit_humanoid(
-    library: ClipLibrary | Clip, config: BodyConfig | None = None, rate_hz: float = 30.0
+    library: ClipLibrary | Clip,
+    config: BodyConfig | None = None,
+    rate_hz: float = 30.0,
+    table: BodyTable | None = None,
 ) -> tuple[Humanoid, list[np.ndarray], FitReport]:
     """A humanoid that can reach every frame of the library.
 
@@ -109,6 +112,8 @@ def fit_humanoid(
         library: clips of one hierarchy; the body is made from the first one's bone lengths, or read
             from `config.mjcf`, onto which the clips are then retargeted.
         config: see `BodyConfig`. rate_hz: the control rate at which the clips are sampled.
+        table: a body on the library's skeleton that stays as it is but for its hinges' ranges and for
+            pairs of bodies that never collide, both of which only grow; by default one is made.
 
     Returns:
         the humanoid, one `qpos (T, 7 + hinges)` per clip at `rate_hz` standing on the floor, and a
@@ -120,7 +125,7 @@ def fit_humanoid(
     repaired = [clean_clip(c) for c in library]
     clips = [resample(c, rate_hz) for c, _ in repaired]
     # A body of the user's own keeps its hinges as they are.
-    table = own or _choose_orders(generate_table(clips[0].skeleton, config, clips), clips)
+    table = table or own or _choose_orders(generate_table(clips[0].skeleton, config, clips), clips)
     motions = [clip_to_qpos(c, table) for c in clips]
     for clip, q in zip(clips, motions, strict=True):
         if not np.isfinite(q).all():

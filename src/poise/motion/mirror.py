@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.motion.clip import Clip
 from poise.motion.noise.kinds import side_pairs
 from poise.motion.windows import FrameBank
 
@@ -43,7 +44,7 @@ def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
         PoiseError: sides that are not named, or a rest pose that does not stand upright.
     """
     other = other_sides(bank.names, bank.parents)
-    normal = _normal(bank)
+    normal = _normal(bank.names, bank.parents, bank.offsets)
     mirror = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
     rot = bank.rot[:, other]
     rot = torch.cat((rot[..., :1], -(rot[..., 1:] @ mirror.to(rot))), -1)
@@ -53,15 +54,42 @@ def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
     return replace(bank, root=root, rot=rot, offsets=offsets, clips=names)
 
 
-def _normal(bank: FrameBank) -> Tensor:
-    """The level unit vector from the right to the left at rest, float64."""
-    rest = bank.offsets.double().clone()
+def mirrored_clip(clip: Clip) -> Clip:
+    """A clip in a mirror, on bones in a mirror; see `mirrored` for the formulas.
+
+    The mirror stands between left and right as they lie at rest, or, in a skeleton whose rest is not
+    upright, across the y axis; another mirror only changes the way that the clip goes.
+
+    Raises:
+        PoiseError: sides that are not named.
+    """
+    skeleton = clip.skeleton
+    other = other_sides(skeleton.names, skeleton.parents)
+    offsets = torch.tensor(skeleton.offsets)
+    try:
+        normal = _normal(skeleton.names, skeleton.parents, offsets[None])
+    except PoiseError:
+        normal = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    mirror = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
+    root, rot = clip.tensors()
+    rot = torch.cat((rot[:, other, :1], -(rot[:, other, 1:] @ mirror)), -1)
+    ends = tuple(
+        (int(other[j]), tuple((torch.tensor(v, dtype=torch.float64) @ mirror).tolist()))
+        for j, v in skeleton.ends
+    )
+    seen = replace(skeleton, offsets=(offsets[other] @ mirror).numpy(), ends=ends)
+    return clip.replaced(skeleton=seen, root_pos=(root @ mirror).numpy(), rot=rot.numpy())
+
+
+def _normal(names: tuple[str, ...], parents: tuple[int, ...], offsets: Tensor) -> Tensor:
+    """The level unit vector from the right to the left at rest `offsets (C, J, 3)`, float64."""
+    rest = offsets.double().clone()
     rest[:, 0] = 0.0
-    for j, parent in enumerate(bank.parents):
+    for j, parent in enumerate(parents):
         if parent >= 0:
             rest[:, j] += rest[:, parent]
     apart = torch.zeros(3, dtype=torch.float64)
-    for left, right, _ in side_pairs(bank.names):
+    for left, right, _ in side_pairs(names):
         apart = apart + (rest[:, left] - rest[:, right]).mean(0)
     level = apart * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
     if float(level.norm()) < 1e-6 or abs(float(apart[2])) > _LEVEL * float(level.norm()):

@@ -18,7 +18,7 @@ from poise.kin.clean import clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.fk import Kinematics
 from poise.kin.flight import rate_sentence
-from poise.kin.ground import fit_heights
+from poise.kin.ground import GroundFit, fit_heights
 from poise.kin.level import level_feet
 from poise.kin.retarget import retarget
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
@@ -44,7 +44,8 @@ class LibraryConfig:
     that are not taken. skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
     rates: (pattern, frames per second) pairs for files that state none or a wrong one. allow_pickle:
     pickled files that are given by name are read too. level: feet are turned to stand flat on the
-    humanoid's soles, see `level_feet`, which motion that is not simulated has no need of.
+    humanoid's soles, see `level_feet`, which motion that is not simulated has no need of. mirror: each
+    clip is taken in a mirror, too, see `library.images`.
     """
 
     min_frames: int = 10
@@ -58,6 +59,7 @@ class LibraryConfig:
     rates: tuple[tuple[str, float], ...] = ()
     allow_pickle: bool = False
     level: bool = True
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         check_patterns((*self.keep, *self.leave_out, *(p for p, _ in (*self.skeletons, *self.rates))))
@@ -153,9 +155,11 @@ def shape_of(skeleton: Skeleton) -> tuple:
 
 
 def target_of(
-    onto: Skeleton | Clip | Path | str | None, clips: Sequence[Clip], body: BodyConfig
+    onto: Skeleton | Clip | Target | Path | str | None, clips: Sequence[Clip], body: BodyConfig
 ) -> Target:
     """The skeleton that was asked for, or the one on which most of the motion is."""
+    if isinstance(onto, Target):
+        return onto
     if body.mjcf is not None and onto is None:
         onto = body.mjcf
     if isinstance(onto, str | Path):
@@ -220,18 +224,24 @@ def place(
     if note.direction_deg > config.max_unlike_deg and not keep:
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
-    if config.level:
-        clip = level_feet(clip, target.table).onto(clip)
-    # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
-    body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
-    fit = fit_heights(target.table, body.pos, body.quat, clip.fps)
-    clip, note = shifted(clip, (0.0, 0.0, fit.lift_m)), replace(note, lift_m=fit.lift_m)
+    clip, fit = set_down(clip, target, config)
+    note = replace(note, lift_m=fit.lift_m)
     # The file's own rate is what a doubt is about, at whatever rate the library is.
     doubt = rate_sentence(fit.flights, taken.fps)
     if doubt and not keep:
         reason = doubt.partition(";")[0]
         return None, replace(note, rule="rate", reason=reason[0].lower() + reason[1:])
     return _alone(clip, target, note, config, keep)
+
+
+def set_down(clip: Clip, target: Target, config: LibraryConfig) -> tuple[Clip, GroundFit]:
+    """A clip on the target's skeleton, with its feet flat on the floor."""
+    if config.level:
+        clip = level_feet(clip, target.table).onto(clip)
+    # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
+    body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
+    fit = fit_heights(target.table, body.pos, body.quat, clip.fps)
+    return shifted(clip, (0.0, 0.0, fit.lift_m)), fit
 
 
 def _alone(

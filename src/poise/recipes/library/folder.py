@@ -17,7 +17,7 @@ from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.motion.pack import pack_clips, unpack_clips
-from poise.recipes.library.clips import LibraryConfig, place, read_all, shape_of, target_of
+from poise.recipes.library.clips import LibraryConfig, Target, place, read_all, shape_of, target_of
 from poise.recipes.library.files import (
     MotionFile,
     check_patterns,
@@ -26,6 +26,7 @@ from poise.recipes.library.files import (
     motion_files_of,
     subject_of,
 )
+from poise.recipes.library.images import image
 from poise.recipes.library.report import ClipNote, LibraryReport
 
 __all__ = ["ClipNote", "LibraryConfig", "LibraryReport", "Split", "library_of", "split"]
@@ -43,7 +44,7 @@ class Split(NamedTuple):
 
 def library_of(
     sources: Path | str | Sequence[Path | str],
-    onto: Skeleton | Clip | Path | str | None = None,
+    onto: Skeleton | Clip | Target | Path | str | None = None,
     fps: float = 30.0,
     *,
     config: LibraryConfig | None = None,
@@ -60,14 +61,15 @@ def library_of(
     word in its name. The longest stretch without such a spell stays.
 
     Args:
-        onto: the skeleton, a clip on it, a motion file, or an MJCF body (`.xml`); by default the
-            skeleton on which most seconds of the library are.
+        onto: the skeleton, a clip on it, a motion file, an MJCF body (`.xml`), or a skeleton with its
+            body; by default the skeleton on which most seconds of the library are.
         fps: frames per second of all clips. body: of the humanoid whose soles are set on the floor.
         cache: a folder; a library of the same content and settings is taken from it at once.
         tell: is told how far it is.
 
     Returns:
-        the library; clips are named by folder and file ("cmu_amc-02-02_01"); and a note on every file.
+        the library; clips are named by folder and file ("cmu_amc-02-02_01"), with "-mirrored" behind it
+        where they are seen in a mirror; and a note on every file.
 
     Raises:
         PoiseError: no file can be used, or a target that is no human skeleton.
@@ -89,7 +91,8 @@ def library_of(
     for k, taken in enumerate(read, 1):
         example = examples.setdefault(shape_of(taken.clip.skeleton), taken.clip)
         made, notes[taken.file.name] = place(taken, example, target, config)
-        clips += [made] if made is not None else []
+        if made is not None:
+            clips += [made, image(made, target, config)] if config.mirror else [made]
         if k % 100 == 0:
             tell(f"{k} of {len(read)} clips placed")
     report = LibraryReport(tuple(notes[f.name] for f in files), target.words, fps)
@@ -135,7 +138,7 @@ def split(library: ClipLibrary, hold_out: Sequence[str]) -> Split:
 
 def _key(
     files: Sequence[MotionFile],
-    onto: Skeleton | Clip | Path | str | None,
+    onto: Skeleton | Clip | Target | Path | str | None,
     fps: float,
     config: LibraryConfig,
     body: BodyConfig,
@@ -147,6 +150,9 @@ def _key(
     paths += [Path(onto)] if isinstance(onto, str | Path) else []
     paths += [Path(body.mjcf)] if body.mjcf else []
     whole += [MotionFile(p, "", "") for p in paths]
+    if isinstance(onto, Target):
+        settings.append(onto.table.to_dict())
+        onto = onto.example or onto.skeleton
     if isinstance(onto, Clip):
         settings += [onto.root_pos.tobytes().hex(), onto.rot.tobytes().hex()]
     if isinstance(onto, Skeleton | Clip):

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from poise.body import BodyConfig
+from poise.body import BodyConfig, BodyTable
 from poise.errors import PoiseError
 from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint, save_checkpoint
 from poise.learn.run import interruptible
@@ -25,6 +25,7 @@ from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
+from poise.recipes.library.clips import Target, shape_of
 from poise.recipes.library.folder import LibraryConfig, library_of, split
 from poise.recipes.perpetual.config import from_json, to_json
 from poise.recipes.perpetual.progress import Progress, Stage
@@ -36,11 +37,11 @@ from poise.recipes.session import FINAL, RUN_FILE
 
 @dataclass(frozen=True)
 class Earlier:
-    """What a policy has cost that a run goes on from, and the identity of the body it moves."""
+    """What a policy has cost that a run goes on from, and the body it moves (`Tracker.target`)."""
 
     samples: int
     seconds: float
-    character: str
+    target: Target
 
 
 def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
@@ -66,14 +67,15 @@ def clips_of(
     hold_out: Sequence[str] = (),
     leave_out: Sequence[str] = (),
     tell: Callable[[str], None] = lambda _: None,
-    onto: Path | None = None,
+    onto: Path | Target | None = None,
     config: LibraryConfig | None = None,
 ) -> tuple[ClipLibrary, tuple[str, ...]]:
     """The clips of a folder on one skeleton, see `library_of`, and sentences on what became of them.
 
     hold_out: clips and performers that are not learned from, see `split`. leave_out: regular expressions
     of clips that are not even read. onto: a motion file or an MJCF body whose skeleton all clips come
-    onto; by default that on which most of the library is. config: how files are read.
+    onto, or the body of a policy; by default that on which most of the library is. config: how files
+    are read.
     """
     config = replace(config or LibraryConfig(), leave_out=tuple(leave_out))
     library, report = library_of(folder, onto, config=config, body=body, tell=tell)
@@ -98,7 +100,8 @@ def begin(
     goes on from.
 
     Raises:
-        PoiseError: a single clip, another run in the folder, or not enough memory.
+        PoiseError: a single clip, another run in the folder, a library on another skeleton than the
+            policy's body, or not enough memory.
     """
     if len(library) < 2:
         raise PoiseError(
@@ -116,20 +119,23 @@ def begin(
                 folder,
                 "Give the library it was begun with, or choose another folder",
             )
-    imitation = build(library, config)
+    table = None
+    if earlier is not None:
+        table = earlier.target.table
+        if shape_of(library.clips[0].skeleton) != shape_of(earlier.target.skeleton):
+            raise PoiseError(
+                "the clips are on another skeleton than the policy's body",
+                hint="Bring them onto it: library_of(folder, tracker.target)",
+            )
+    imitation = build(library, config, table)
     imitation.check_room(config.num_envs, device)
-    own = imitation.humanoid.identity
-    if earlier is not None and earlier.character != own:
-        raise PoiseError(
-            f"the policy moves the body '{earlier.character}', and that of the library is '{own}'",
-            hint="Give --onto the clip that the policy's library was brought onto, and its --mass",
-        )
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         meta = {"kind": "run", "recipe": RECIPE["name"], "config": said, "clips": notes}
-        meta |= {"source": source, "character": own}
+        meta |= {"source": source, "character": imitation.humanoid.identity}
         if earlier is not None:
             meta["earlier"] = {"samples": earlier.samples, "seconds": earlier.seconds}
+            meta["table"] = earlier.target.table.to_dict()
         save_checkpoint(path, tensors, meta)
     return imitation
 
@@ -186,7 +192,8 @@ def reopen(folder: Path) -> Imitation:
 def _rebuilt(folder: Path) -> Imitation:
     tensors, meta = load_checkpoint(folder / RUN_FILE)
     library = ClipLibrary(tuple(unpack_clips(tensors, meta["clips"])))
-    return build(library, from_json(meta["config"]))
+    table = BodyTable.from_dict(meta["table"]) if "table" in meta else None
+    return build(library, from_json(meta["config"]), table)
 
 
 def _knows_recovery(folder: Path) -> bool:

@@ -28,7 +28,7 @@ from dataclasses import replace
 
 import torch
 
-from poise.body import Humanoid
+from poise.body import BodyTable, Humanoid
 from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
 from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskConfig
 from poise.env.terms import done, phc_obs, phc_reward, reward
@@ -121,12 +121,17 @@ def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:
     return PDTargets("absolute", range_scale(ranges))
 
 
-def build(library: ClipLibrary | Clip, config: Perpetual | None = None) -> Imitation:
-    """Body, reference and task for a library of one skeleton; train it with `perpetual.run.train`."""
+def build(
+    library: ClipLibrary | Clip, config: Perpetual | None = None, table: BodyTable | None = None
+) -> Imitation:
+    """Body, reference and task for a library of one skeleton; train it with `perpetual.run.train`.
+
+    table: the body of a policy that goes on to learn, see `fit_humanoid`; by default one is made.
+    """
     config = config or Perpetual()
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     library, _ = on_own_body(library, config.body)
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
+    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     built = Imitation(library, humanoid, reference, report, config, task(config, humanoid))

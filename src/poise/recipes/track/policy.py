@@ -9,7 +9,6 @@ it was trained; the body stands in it with every number, so that no clip of the 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,12 @@ from torch import Tensor
 from poise import __version__
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
-from poise.body.table import BodyRow, Geom
 from poise.errors import PoiseError
 from poise.learn import PolicyBundle, load_checkpoint, save_checkpoint
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.imitation import Imitation
+from poise.recipes.library.clips import Target
 from poise.recipes.perpetual import RECIPE, Perpetual
 from poise.recipes.perpetual import run as perpetual_run
 from poise.recipes.session import FINAL, RUN_FILE, trained_policy
@@ -57,6 +56,11 @@ class Tracker:
     example: Clip
     config: Perpetual
     about: Mapping[str, Any]
+
+    @property
+    def target(self) -> Target:
+        """The body as what a library is brought onto, see `library_of`."""
+        return Target(self.humanoid.skeleton, self.example, self.humanoid.table, "the policy's body")
 
 
 def open_tracker(path: Path | None = None) -> Tracker:
@@ -140,7 +144,7 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
         "tracker": VERSION,
         "recipe": RECIPE["name"],
         "config": perpetual_run.to_json(tracker.config),
-        "table": dataclasses.asdict(tracker.humanoid.table),
+        "table": tracker.humanoid.table.to_dict(),
         "example": clip[0],
         "about": dict(tracker.about),
         **tracker.policy.identity(tracker.humanoid.identity),
@@ -166,7 +170,7 @@ def load_tracker(path: Path) -> Tracker:
         raise foreign
     try:
         config = perpetual_run.from_json(meta["config"])
-        table = _table(meta["table"])
+        table = BodyTable.from_dict(meta["table"])
         wide = {k.removeprefix(_EXAMPLE): v.double() for k, v in tensors.items() if _EXAMPLE in k}
         example = unpack_clips(wide, [meta["example"]])[0]
         humanoid = make_humanoid(example.skeleton, table)
@@ -206,18 +210,3 @@ def _halved(name: str, value: Tensor) -> Tensor:
     if not name.startswith("policy/") or value.ndim < 2 or not value.is_floating_point():
         return value
     return value.half() if float(value.abs().max()) < _HALF_MAX else value
-
-
-def _table(data: Mapping[str, Any]) -> BodyTable:
-    """The body's numbers from JSON, which knows only lists."""
-    rows = []
-    for row in data["rows"]:
-        plain = {k: _tuples(v) for k, v in row.items() if k != "geoms"}
-        geoms = tuple(Geom(**{k: _tuples(v) for k, v in geom.items()}) for geom in row["geoms"])
-        rows.append(BodyRow(**plain, geoms=geoms))
-    rest = {k: _tuples(v) for k, v in data.items() if k != "rows"}
-    return BodyTable(tuple(rows), **rest)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value

@@ -1,0 +1,29 @@
+"""Clips of a library as a mirror shows them: whoever turns left learns to turn right."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from poise.kin.retarget import retarget
+from poise.motion import Clip
+from poise.motion.mirror import mirrored_clip
+from poise.recipes.library.clips import LibraryConfig, Target, set_down
+
+#: m by which bones may differ from those of the other side and pass for the same.
+_SAME_M = 1e-6
+
+
+def image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
+    """A placed clip in a mirror, on the target again, whose sides differ a little in bones and soles.
+
+    Raises:
+        PoiseError: no joint's name tells a side.
+    """
+    seen = mirrored_clip(clip)
+    if np.allclose(seen.skeleton.offsets[1:], clip.skeleton.offsets[1:], rtol=0.0, atol=_SAME_M):
+        seen = seen.replaced(skeleton=clip.skeleton)
+    else:
+        example = None if target.example is None else mirrored_clip(target.example)
+        seen, _ = retarget(seen, target.example or target.skeleton, example=example)
+    seen, _ = set_down(seen, target, config)
+    return seen.replaced(skeleton=clip.skeleton, name=f"{clip.name}-mirrored", cyclic=clip.cyclic)
