@@ -276,6 +276,16 @@ def test_every_clip_in_a_mirror_too(folder: Path) -> None:
         assert abs(float(stance_heights(body.table, pose.pos, pose.quat, seen.fps).mean())) < 0.02
 
 
+def test_clips_taken_backwards(folder: Path) -> None:
+    library, _ = library_of(folder, config=LibraryConfig(mirror=True, backwards=("02_02", "cmu 07")))
+    named = {c.name: c for c in library}
+    back = [n for n in library.names if n.endswith("-backwards")]
+    assert [subject_of(n) for n in back] == ["cmu 02"] * 2 + ["cmu 07"] * 4
+    for name in back:
+        there = named[name.removesuffix("-backwards")]
+        assert np.array_equal(named[name].positions(), there.positions()[::-1])
+
+
 def test_onto_a_body_that_is_there_already(folder: Path) -> None:
     from poise.recipes.library.clips import Target
 

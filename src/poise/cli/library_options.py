@@ -34,6 +34,8 @@ class Library:
     """REGEX=HZ, frames per second of files of such names."""
     mirror: bool = False
     """Learn from every clip in a mirror, too."""
+    backwards: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
+    """perpetual: learn clips whose names match backwards, too."""
 
     def folder(self, recipe: str) -> Path:
         """The folder.
@@ -44,7 +46,11 @@ class Library:
         if self.library is None:
             hint = f"Write poise train {recipe} --library DIR -o RUNDIR"
             raise PoiseError(f"the recipe {recipe} needs --library", hint=hint)
-        for name, text in (("hold-out", self.hold_out), ("never", self.never)):
+        for name, text in (
+            ("hold-out", self.hold_out),
+            ("never", self.never),
+            ("backwards", self.backwards),
+        ):
             try:
                 re.compile(text or "")
             except re.error as problem:
@@ -68,14 +74,18 @@ class Library:
         for _, asf in skeletons:
             if not Path(asf).is_file():
                 raise PoiseError("there is no such file", asf, "--library-skeleton names an ASF file")
-        return LibraryConfig(skeletons=tuple(skeletons), rates=tuple(rates), mirror=self.mirror)
+        back = () if self.backwards is None else (self.backwards,)
+        return LibraryConfig(
+            skeletons=tuple(skeletons), rates=tuple(rates), mirror=self.mirror, backwards=back
+        )
 
     def source(self) -> list[str]:
         """What of the library's reading tells one run from another, in words."""
         said = [f"onto {self.onto.resolve()}"] if self.onto is not None else []
         said += [f"skeleton {x}" for x in self.library_skeleton]
         said += [f"fps {x}" for x in self.library_fps]
-        return said + (["with mirror images"] if self.mirror else [])
+        said += ["with mirror images"] if self.mirror else []
+        return said + ([f"backwards {self.backwards}"] if self.backwards else [])
 
 
 def _pairs(option: str, texts: tuple[str, ...], example: str) -> list[tuple[str, str]]:

@@ -57,7 +57,7 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
     reading = None
     if library.library_fps or library.library_skeleton:
         # Its windows are seen in a mirror, not the clips.
-        reading = replace(library.reading(), mirror=False)
+        reading = replace(library.reading(), mirror=False, backwards=())
     config = Inbetween(
         net=network.net, name=folder.name, seed=seed, validation=library.hold_out,
         final=library.never or r"(?!)", contacts=network.contacts, mirror=library.mirror,

@@ -1,4 +1,4 @@
-"""Clips made from clips: another rate, a part, a shift. None changes its argument."""
+"""Clips made from clips: another rate, a part, a shift, backwards. None changes its argument."""
 
 from __future__ import annotations
 
@@ -48,3 +48,12 @@ def shifted(clip: Clip, offset: np.ndarray | tuple[float, float, float]) -> Clip
 def ground_shift(clip: Clip, height: float) -> Clip:
     """The clip lifted by `height` m along +Z."""
     return shifted(clip, (0.0, 0.0, height))
+
+
+def backwards(clip: Clip) -> Clip:
+    """The clip from its last frame to its first.
+
+    Accelerations, and with them the forces of muscles and floor, are the same at every pose, so that a
+    motion that can be done can be done backwards; only what hits the floor hard cannot.
+    """
+    return clip.replaced(root_pos=clip.root_pos[::-1], rot=clip.rot[::-1])

@@ -45,7 +45,7 @@ class LibraryConfig:
     rates: (pattern, frames per second) pairs for files that state none or a wrong one. allow_pickle:
     pickled files that are given by name are read too. level: feet are turned to stand flat on the
     humanoid's soles, see `level_feet`, which motion that is not simulated has no need of. mirror: each
-    clip is taken in a mirror, too, see `library.images`.
+    clip is taken in a mirror, too. backwards: of clips that are taken backwards, too; see `images`.
     """
 
     min_frames: int = 10
@@ -60,9 +60,11 @@ class LibraryConfig:
     allow_pickle: bool = False
     level: bool = True
     mirror: bool = False
+    backwards: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_patterns((*self.keep, *self.leave_out, *(p for p, _ in (*self.skeletons, *self.rates))))
+        taken = (*self.keep, *self.leave_out, *self.backwards)
+        check_patterns((*taken, *(p for p, _ in (*self.skeletons, *self.rates))))
         if self.min_frames < 3:
             raise PoiseError(f"min_frames must be at least 3, got {self.min_frames}")
 

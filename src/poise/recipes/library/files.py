@@ -85,7 +85,7 @@ def subject_of(name: str) -> str:
     "cmu 02" for a take such as `02_01` below a folder whose name has "cmu" in it, "subject 1" where the
     name says so, else the folders before the last "-".
     """
-    name = name.removesuffix("-mirrored")
+    name = name.removesuffix("-backwards").removesuffix("-mirrored")
     take = _CMU_TAKE.search(name)
     if take and "cmu" in name[: take.start()].lower():
         return f"cmu {int(take[1]):02d}"

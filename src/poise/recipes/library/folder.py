@@ -26,7 +26,7 @@ from poise.recipes.library.files import (
     motion_files_of,
     subject_of,
 )
-from poise.recipes.library.images import image
+from poise.recipes.library.images import images
 from poise.recipes.library.report import ClipNote, LibraryReport
 
 __all__ = ["ClipNote", "LibraryConfig", "LibraryReport", "Split", "library_of", "split"]
@@ -68,8 +68,8 @@ def library_of(
         tell: is told how far it is.
 
     Returns:
-        the library; clips are named by folder and file ("cmu_amc-02-02_01"), with "-mirrored" behind it
-        where they are seen in a mirror; and a note on every file.
+        the library; clips are named by folder and file ("cmu_amc-02-02_01"), and what they are
+        taken as besides ("-mirrored", "-backwards"); and a note on every file.
 
     Raises:
         PoiseError: no file can be used, or a target that is no human skeleton.
@@ -91,8 +91,7 @@ def library_of(
     for k, taken in enumerate(read, 1):
         example = examples.setdefault(shape_of(taken.clip.skeleton), taken.clip)
         made, notes[taken.file.name] = place(taken, example, target, config)
-        if made is not None:
-            clips += [made, image(made, target, config)] if config.mirror else [made]
+        clips += [] if made is None else images(made, target, config)
         if k % 100 == 0:
             tell(f"{k} of {len(read)} clips placed")
     report = LibraryReport(tuple(notes[f.name] for f in files), target.words, fps)

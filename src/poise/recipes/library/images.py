@@ -1,4 +1,4 @@
-"""Clips of a library as a mirror shows them: whoever turns left learns to turn right."""
+"""Clips of a library in a mirror and backwards: who turns left learns to turn right, too."""
 
 from __future__ import annotations
 
@@ -6,14 +6,28 @@ import numpy as np
 
 from poise.kin.retarget import retarget
 from poise.motion import Clip
+from poise.motion.edits import backwards
 from poise.motion.mirror import mirrored_clip
 from poise.recipes.library.clips import LibraryConfig, Target, set_down
+from poise.recipes.library.files import matches, subject_of
 
 #: m by which bones may differ from those of the other side and pass for the same.
 _SAME_M = 1e-6
 
 
-def image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
+def images(clip: Clip, target: Target, config: LibraryConfig) -> list[Clip]:
+    """A placed clip, and as what else the library takes it.
+
+    Raises:
+        PoiseError: no joint's name tells a side.
+    """
+    both = [clip, mirror_image(clip, target, config)] if config.mirror else [clip]
+    if matches(config.backwards, clip.name, subject_of(clip.name)):
+        both += [backwards(c).replaced(name=f"{c.name}-backwards") for c in both]
+    return both
+
+
+def mirror_image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
     """A placed clip in a mirror, on the target again, whose sides differ a little in bones and soles.
 
     Raises:

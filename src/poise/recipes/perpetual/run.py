@@ -97,13 +97,13 @@ def begin(
     """Builds the task and writes the run file; a folder that holds another run is refused.
 
     source: where the clips are from, by which `resume` knows them. earlier: the training that the run
-    goes on from.
+    goes on from; a single clip will do for that.
 
     Raises:
         PoiseError: a single clip, another run in the folder, a library on another skeleton than the
             policy's body, or not enough memory.
     """
-    if len(library) < 2:
+    if len(library) < 2 and earlier is None:
         raise PoiseError(
             f"a library needs at least 2 clips, and there is only '{library.names[0]}'",
             hint="Use poise imitate for a single clip",
