@@ -56,6 +56,39 @@ def test_motion_score_and_report(
     np.testing.assert_allclose(made.skeleton.offsets, source.skeleton.offsets, atol=1e-5)
 
 
+def test_a_motion_that_is_lost_is_learned(
+    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from poise.recipes.track.policy import open_tracker
+
+    out = tmp_path / "made.bvh"
+    argv = ["track", str(short), "--policy", str(file), "-o", str(out), "--threads", "1", "--learn"]
+    before = file.read_bytes()
+    assert main([*argv, "0.02"]) == 0
+    said = capsys.readouterr()
+    assert "loses the motion at" in said.err and "minutes at most" in said.err
+    assert "it gets to" in said.err and "Learned 0:0" in said.err
+    assert out.exists() and (tmp_path / "made/learned/policy.safetensors").exists()
+    assert file.read_bytes() == before
+    score = json.loads((tmp_path / "made/score.json").read_text())
+    about = open_tracker(tmp_path / "made/learned").about
+    assert score["samples"] == about["samples"] > open_tracker(file).about["samples"]
+    # A tiny network does not learn it in a second; more minutes go on.
+    assert "--learn 0.04" in said.out
+    assert main([*argv, "0.04"]) == 0
+    assert open_tracker(tmp_path / "made/learned").about["samples"] > about["samples"]
+
+
+def test_what_cannot_be_learned_is_refused(
+    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["track", str(short), "--policy", str(file), "-o", str(tmp_path / "o.bvh"), "--learn"]
+    assert main([*argv, "-1"]) == 2 and "minutes of at least 0" in capsys.readouterr().err
+    assert main([*argv, "1", "--noise", "jitter:1"]) == 2
+    assert "without errors" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
 def test_another_skeleton_with_noise_and_resets(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

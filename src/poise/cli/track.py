@@ -1,4 +1,4 @@
-"""`poise track`: a motion in, the same motion done by a trained policy out, without any training."""
+"""`poise track`: a motion in, the same motion done by a trained policy out."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.console import notes, say
+from poise.cli.console import notes, say, tell
 from poise.cli.options import Reading
 from poise.cli.output import claimed
-from poise.cli.progress import working
+from poise.cli.progress import clock, showing, working
 from poise.cli.results import print_card
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
+    from poise.recipes.perpetual.progress import Progress
     from poise.recipes.track import Tracked
+    from poise.recipes.track.policy import Tracker
 
 #: Failures that are named one by one.
 NAMED = 8
@@ -27,8 +29,8 @@ NAMED = 8
 
 @dataclass(frozen=True)
 class Options:
-    """Let a trained policy do a motion that it need not know, without training and without help: write
-    the motion, score.json and report.html."""
+    """Let a trained policy do a motion that it need not know, without help and without training: write
+    the motion, score.json and report.html. A motion that it loses it can --learn."""
 
     clip: Annotated[Positional[Path], arg(metavar="FILE")]
     """The motion file: a clip of any human skeleton, or keypoints."""
@@ -38,6 +40,11 @@ class Options:
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
     Poise."""
+    learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
+    """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
+    it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
+    threads: Annotated[int, arg(metavar="N")] = 0
+    """Cores for --learn; 0 is all."""
     reset_on_fail: bool = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
     count: Annotated[int, arg(metavar="N")] = 1
@@ -60,6 +67,13 @@ def run(options: Options, argv: Sequence[str]) -> int:
         raise PoiseError(f"--count must lie in 1 to 64, got {o.count}")
     if not 0 <= o.seed < 2**31:
         raise PoiseError(f"--seed must be a whole number of at least 0, got {o.seed}")
+    if not 0 <= o.learn <= 100_000:
+        raise PoiseError(f"--learn needs minutes of at least 0, got {o.learn:g}")
+    if o.learn and o.noise:
+        what = "--learn learns the motion without errors, and --noise adds some"
+        raise PoiseError(what, hint="Leave one out")
+    if o.threads < 0:
+        raise PoiseError(f"--threads must be at least 0, got {o.threads}")
     out, motion = places(o.clip, o.out)
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
@@ -74,15 +88,55 @@ def run(options: Options, argv: Sequence[str]) -> int:
     with claimed(out), working("tracking"):
         config = TrackConfig(noise, o.seed, o.reset_on_fail, o.reading.smooth, o.count)
         tracked = track(tracker, given, config)
+    if o.learn and tracked.failures:
+        if (learned := practise(o, tracker, tracked, out / "learned")) is None:
+            return 130
+        tracked = track(learned, given, config)
+    with working("writing"):
         done = write(tracked, out, motion, o.hold_feet)
         if o.save_policy is not None:
-            save_tracker(tracker, o.save_policy)
+            save_tracker(tracked.tracker, o.save_policy)
     print_card(done.card)
     notes((*tracked.notes, *done.notes))
     say(outcome(tracked, o.reset_on_fail))
+    if tracked.failures:
+        say(advice(o))
     for path in (*done.paths.values(), *((o.save_policy,) if o.save_policy else ())):
         say(str(path))
     return 0
+
+
+def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
+    """The policy after it has learned the motion; None where Ctrl-C ended that."""
+    from poise.cli.perpetual_shown import times
+    from poise.recipes.track.learning import learn
+
+    o, when, rate = options, tracked.failures[0][1], tracker.config.sim.control_hz
+    tell(f"The policy loses the motion at {when:.1f} s and learns it now, {o.learn:g} minutes at most.")
+    with showing("learning") as bar:
+
+        def show(p: Progress) -> None:
+            bar(p.share, f"{times(p)}  {p.stats.samples_per_s:,.0f} samples/s")
+            if p.results is not None:
+                came, whole = (float(x) / rate for x in (p.results.tracked, p.results.frames))
+                tell(f"{clock(p.stats.seconds)}  it gets to {came:.1f} of {whole:.1f} s")
+
+        learned = learn(tracker, tracked.placed, folder, o.learn, show, o.threads, o.seed)
+    if learned.result.interrupted:
+        tell("Stopped; what was learned is saved. The same command goes on.")
+        return None
+    if learned.result.last is not None:
+        stats = learned.result.last.stats
+        tell(f"Learned {clock(stats.seconds)}, {stats.samples:,} samples.")
+    return learned.tracker
+
+
+def advice(options: Options) -> str:
+    """What to do about a motion that was lost."""
+    if not options.learn:
+        return "With --learn 10 the policy first learns this motion, for 10 minutes at most."
+    more = 2 * options.learn
+    return f"The same command with more minutes goes on learning: --learn {more:g}."
 
 
 def outcome(tracked: Tracked, reset: bool) -> str:

@@ -124,6 +124,15 @@ class PolicyBundle:
         """An independent copy, which later training does not change."""
         return copy.deepcopy(self)
 
+    def first_actions(self, count: int) -> PolicyBundle:
+        """The same policy without its later actions, such as those of a force that helps no more."""
+        out = PolicyBundle.rebuild(self.num_obs, count, self.shape)
+        wanted = out.state()
+        out.load_state(
+            {k: v if v.shape == wanted[k].shape else v[:count] for k, v in self.state().items()}
+        )
+        return out
+
     def state(self) -> State:
         """Copies of all tensors, under "norm/" and "policy/"."""
         return prefixed("norm", self.norm.state_dict()) | prefixed("policy", self.policy.state_dict())

@@ -8,6 +8,9 @@ import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
 
+#: Bones that differ by less (m) are the same; files round their numbers.
+SAME_M = 1e-4
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -121,6 +124,13 @@ class Skeleton:
             return self.names.index(name)
         except ValueError:
             raise PoiseError(f"there is no joint '{name}'. {did_you_mean(name, self.names)}") from None
+
+    def same_bones(self, other: Skeleton, atol: float = SAME_M) -> bool:
+        """Whether the other skeleton has the same joints and bones, to within `atol` m."""
+        if (self.names, self.parents) != (other.names, other.parents):
+            return False
+        # The root's offset is no bone.
+        return bool(np.allclose(self.offsets[1:], other.offsets[1:], rtol=0.0, atol=atol))
 
     def children(self, joint: int) -> tuple[int, ...]:
         """Indices of the joints whose parent is `joint`."""

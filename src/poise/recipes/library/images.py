@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from poise.kin.retarget import retarget
 from poise.motion import Clip
 from poise.motion.edits import backwards
 from poise.motion.mirror import mirrored_clip
 from poise.recipes.library.clips import LibraryConfig, Target, set_down
 from poise.recipes.library.files import matches, subject_of
-
-#: m by which bones may differ from those of the other side and pass for the same.
-_SAME_M = 1e-6
 
 
 def images(clip: Clip, target: Target, config: LibraryConfig) -> list[Clip]:
@@ -34,7 +29,7 @@ def mirror_image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
         PoiseError: no joint's name tells a side.
     """
     seen = mirrored_clip(clip)
-    if np.allclose(seen.skeleton.offsets[1:], clip.skeleton.offsets[1:], rtol=0.0, atol=_SAME_M):
+    if seen.skeleton.same_bones(clip.skeleton):
         seen = seen.replaced(skeleton=clip.skeleton)
     else:
         example = None if target.example is None else mirrored_clip(target.example)

@@ -52,9 +52,11 @@ def begin_first(
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
-    if trained is not None:
-        return stage, WarmStart(trained.copy())
     own = staged(imitation, stage)
+    if trained is not None:
+        env = own.env(1, threads=1)
+        env.close()
+        return stage, WarmStart(trained.first_actions(env.num_actions))
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None
     start = None

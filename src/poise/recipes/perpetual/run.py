@@ -25,7 +25,7 @@ from poise.motion import ClipLibrary
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
-from poise.recipes.library.clips import Target, shape_of
+from poise.recipes.library.clips import Target
 from poise.recipes.library.folder import LibraryConfig, library_of, split
 from poise.recipes.perpetual.config import from_json, to_json
 from poise.recipes.perpetual.progress import Progress, Stage
@@ -122,7 +122,7 @@ def begin(
     table = None
     if earlier is not None:
         table = earlier.target.table
-        if shape_of(library.clips[0].skeleton) != shape_of(earlier.target.skeleton):
+        if not library.clips[0].skeleton.same_bones(earlier.target.skeleton):
             raise PoiseError(
                 "the clips are on another skeleton than the policy's body",
                 hint="Bring them onto it: library_of(folder, tracker.target)",

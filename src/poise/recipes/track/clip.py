@@ -16,13 +16,11 @@ from poise.kin.coords import clip_to_qpos
 from poise.kin.ground import GroundFit, clip_flights, fit_ground
 from poise.kin.hinges import within_turns
 from poise.kin.level import Levelled, level_feet
-from poise.motion import Clip, Skeleton, resample
+from poise.motion import Clip, resample
 
 if TYPE_CHECKING:
     from poise.recipes.track.policy import Tracker
 
-#: Bones that differ by less (m) are the same; files round their numbers.
-SAME_M = 1e-4
 #: Angles (rad) beyond a joint's range that are worth a sentence.
 BEYOND = math.radians(1.0)
 
@@ -56,7 +54,7 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     clip = clip.replaced(cyclic=False)
     known = clip.skeleton.source.ground_m is not None
     made, moved = clip, None
-    if not same_skeleton(clip.skeleton, humanoid.skeleton):
+    if not clip.skeleton.same_bones(humanoid.skeleton):
         made, moved = retarget(clip, tracker.example)
     mended, found = clean_clip(made)
     table = humanoid.table
@@ -89,14 +87,6 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
     frames = min(back.frames, placed.source.frames)
     rot[:frames, own] = placed.source.rot[:frames, own]
     return back.replaced(rot=rot, name=placed.source.name)
-
-
-def same_skeleton(a: Skeleton, b: Skeleton) -> bool:
-    """Whether two skeletons have the same joints and bones."""
-    if (a.names, a.parents) != (b.names, b.parents):
-        return False
-    # The root's offset is no bone.
-    return bool(np.allclose(a.offsets[1:], b.offsets[1:], rtol=0.0, atol=SAME_M))
 
 
 def _report(
