@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from poise.recipes.track import Keeper, TrackConfig, check_fits, imitation_of, t
 from poise.recipes.track.clip import home, place
 from poise.recipes.track.points import points_of
 from poise.recipes.track.policy import Tracker, policy_of_run
+from poise.spatial import quat_mul
 from toy_human import swing
 from toy_policy import toy_run, walk
 
@@ -225,3 +227,20 @@ def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:
     env = imitation_of(tracker, [place(walk(0, 20), tracker)]).env(1, threads=1)
     check_fits(tracker, env)
     env.close()
+
+
+def test_a_joint_beyond_its_range_is_no_blow(tracker: Tracker) -> None:
+    """Who is put down outside a joint's range must not be thrown back into it."""
+    clip = walk(0, 40)
+    knee = clip.skeleton.index("LeftLeg")
+    turned = quat_mul(
+        torch.tensor(clip.rot[:, knee]), torch.tensor([math.cos(0.8), 0.0, -math.sin(0.8), 0.0])
+    )
+    rot = np.array(clip.rot)
+    rot[:, knee] = turned.numpy()
+    placed = place(clip.replaced(rot=rot), tracker)
+    body = imitation_of(tracker, [placed]).humanoid
+    ranges = body.model.jnt_range[1:]
+    assert (placed.qpos[:, 7:] >= ranges[:, 0]).all() and (placed.qpos[:, 7:] <= ranges[:, 1]).all()
+    assert any("which is widened" in n for n in placed.notes)
+    assert imitation_of(tracker, [place(clip, tracker)]).humanoid is tracker.humanoid

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -136,7 +137,7 @@ def fit_humanoid(
         _join(q, hinges, table) if c.cyclic else (q, None) for c, q in zip(clips, motions, strict=True)
     ]
     motions, cycles = [q for q, _ in joined], tuple(c for _, c in joined)
-    table, widened = _widen(table, motions, config.margin)
+    table, widened = widen(table, motions, config.margin)
     closed = [c is not None and c.closed for c in cycles]
     known = [c.skeleton.source.ground_m is not None for c in clips]
     fits = [
@@ -200,10 +201,11 @@ def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
     return replace(table, rows=tuple(rows))
 
 
-def _widen(
-    table: BodyTable, motions: list[np.ndarray], margin: float
+def widen(
+    table: BodyTable, motions: Sequence[np.ndarray], margin: float
 ) -> tuple[BodyTable, tuple[tuple[str, float], ...]]:
-    """Ranges grown to hold the motion plus `margin` rad."""
+    """Ranges grown to hold motions `qpos (T, 7 + hinges)` plus `margin` rad; and what grew, by how many
+    degrees."""
     low = np.min([q[:, 7:].min(0) for q in motions], 0) - margin
     high = np.max([q[:, 7:].max(0) for q in motions], 0) + margin
     rows, widened, at = [], [], 0

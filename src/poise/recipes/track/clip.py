@@ -117,7 +117,7 @@ def _notes(qpos: np.ndarray, humanoid: Humanoid, moved: RetargetReport | None) -
         worst, many = int(over.argmax()), int((over > BEYOND).sum())
         which = f"{many} joints go" if many > 1 else "One joint goes"
         out.append(
-            f"{which} beyond the range of the policy's body, most "
+            f"{which} beyond the range of the policy's body, which is widened, most "
             f"{humanoid.hinges[worst]} by {math.degrees(over[worst]):.0f} degrees."
         )
     return tuple(out)

@@ -9,11 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body.humanoid import make_humanoid
 from poise.env import ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval import run_episodes, score_rollouts
 from poise.eval.episodes import Acts
 from poise.eval.judged import judge
+from poise.kin.fit import widen
 from poise.metrics import mpjpe_global, success_rule
 from poise.motion import Clip, ClipLibrary
 from poise.motion.keypoints import Keypoints
@@ -164,8 +166,17 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
 
 
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
-    """Motions on the tracker's body as one task; the report is that of the first."""
+    """Motions on the tracker's body as one task; the report is that of the first.
+
+    Hinges whose range a motion leaves are widened: no policy sees the ranges, and whoever begins beyond
+    one would be thrown back into it.
+    """
     humanoid, config = tracker.humanoid, tracker.config
+    motions = [p.qpos for p in placed]
+    if widen(humanoid.table, motions, 0.0)[1]:
+        table, _ = widen(humanoid.table, motions, config.body.margin)
+        humanoid = make_humanoid(humanoid.skeleton, table)
+        config.sim.apply(humanoid.model)
     library = ClipLibrary(tuple(p.clip for p in placed), (1.0,) * len(placed))
     names = [p.clip.name for p in placed]
     reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)
