@@ -36,6 +36,7 @@ from perpetual_measure import (
     held_out,
     library_task,
     owners,
+    recorded,
     recovery,
     recovery_kinds,
     subjects,
@@ -82,8 +83,13 @@ class Measurement:
             out["held_out_subjects"] = subjects(clips.names)
             task = library_task(run, clips)
             out["held_out"] = table(task, run.policy, "held-out clips", run.name, threads).to_dict()
-        library = table(run.imitation, run.policy, "training library", run.name, threads)
-        bodies = by_body(run.imitation, library)
+        own, made = recorded(run.imitation.library.names)
+        how = run.imitation, run.policy
+        library = table(*how, "training library", run.name, threads, own)
+        if made:
+            said = "the same mirrored and backwards"
+            out["library_made"] = table(*how, said, run.name, threads, made).to_dict()
+        bodies = [] if made else by_body(run.imitation, library)
         return out | {"library": library.to_dict()} | ({"bodies": bodies} if bodies else {})
 
     def _recovery(self) -> None:

@@ -171,13 +171,28 @@ def library_task(run: Run, clips: ClipLibrary) -> Imitation:
     return imitation_of(run.tracker, [place(c, run.tracker) for c in clips])
 
 
+def recorded(names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Indices of clips as they were recorded, and of those that were made of them."""
+    made = [i for i, n in enumerate(names) if n.endswith(("-mirrored", "-backwards"))]
+    return [i for i in range(len(names)) if i not in set(made)], made
+
+
 # --- (a) the field's table ----------------------------------------------------------------------
 
 
-def table(task: Imitation, policy: PolicyBundle, data: str, method: str, threads: int) -> FieldTable:
-    """Every clip from its first frame, without help."""
+def table(
+    task: Imitation,
+    policy: PolicyBundle,
+    data: str,
+    method: str,
+    threads: int,
+    clips: Sequence[int] | None = None,
+) -> FieldTable:
+    """Every clip, or those of these indices, from its first frame, without help."""
     length, at_once = task.reference.length, []
+    wanted = set(range(len(length)) if clips is None else clips)
     order, rows, longest = length.argsort(stable=True).tolist(), [], 0
+    order = [c for c in order if c in wanted]
     for c in order:
         longest = int(length[c])
         if rows and (len(rows) + 1) * longest > AT_ONCE:

@@ -100,7 +100,8 @@ def side_by_side(runs: Mapping[str, Any]) -> str:
 
 
 def _table(part: Mapping[str, Any]) -> list[str]:
-    tables = [FieldTable.from_dict(part[k]) for k in ("held_out", "library") if part.get(k)]
+    kinds = ("held_out", "library", "library_made")
+    tables = [FieldTable.from_dict(part[k]) for k in kinds if part.get(k)]
     paper = paper_rows("AMASS-Train", "AMASS-Test")
     out = ["### Tracking, without help", "", markdown(tables, paper, WORST).rstrip(), "", DIFFERENCE]
     if part.get("held_out_subjects"):

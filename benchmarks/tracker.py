@@ -28,12 +28,17 @@ from poise.recipes.perpetual.run import begin, clips_of, resume, train
 HELD_OUT = ("cmu 05$", "cmu 11$", "cmu 14$")
 #: One take in two files.
 TWINS = (r"fairmotion.*01_01", r"135_06")
+#: Walks, which backwards are steps back.
+BACKWARDS = ("expmaps.*walking", "02_0[12]", "131_0[12]")
 #: CMU's files state 120 Hz throughout, but some were captured at 60.
 SIXTY = (("(^|-)90_", 60.0), ("salsa", 60.0))
 
 
 def config(seed: int) -> Perpetual:
-    """A single network without help, motion prior and recovery, that adds to the reference's angles."""
+    """A single network without help, motion prior and recovery, that adds to the reference's angles.
+
+    In the end the steps become smaller: large ones learn hard moments, and lose some of them again.
+    """
     plain = Perpetual.additive()
     return replace(
         plain,
@@ -41,6 +46,7 @@ def config(seed: int) -> Perpetual:
         single_hidden=(1024, 512),
         recovery=False,
         help_start=0.0,
+        cooling=0.4,
         paths=PathConfig(),
         convergence=ConvergenceConfig(patience=1000),
         ppo=replace(plain.ppo, std=0.04, kl_target=None),
@@ -62,7 +68,7 @@ def main() -> None:
     if a.resume:
         imitation = resume(a.out, settings, source)
     else:
-        how = LibraryConfig(rates=SIXTY)
+        how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
         held = (HELD_OUT, TWINS, print, a.onto, how)
         library, notes = clips_of(a.library, BodyConfig(), *held)
         print(*notes, sep="\n")

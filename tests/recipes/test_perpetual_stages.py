@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from toy_library import Script, Scripted, library, tiny
+from toy_library import PPO, Script, Scripted, library, tiny
 
-from poise.learn import LATEST, IterationStats, Trainer, Until, load_policy
+from poise.errors import PoiseError
+from poise.learn import LATEST, ConvergenceConfig, IterationStats, Trainer, Until, load_policy
 from poise.learn.progressive import primitive
 from poise.nets import Composer
 from poise.recipes.imitation import Imitation
@@ -194,3 +196,16 @@ def test_a_simulation_that_always_goes_bad_ends_it(
     monkeypatch.setattr(Trainer, "iterate", bad)
     with pytest.raises(UnstableError):
         watched(tmp_path, tiny(max_primitives=1, expert=False), 4)
+
+
+def test_steps_become_smaller_towards_the_end_of_a_stage(tmp_path: Path, scripted) -> None:
+    scripted(lambda kind, columns, scale, clip: False)
+    fixed = replace(PPO, kl_target=None, policy_lr=1e-3)
+    plain = {"single": True, "expert": False, "convergence": ConvergenceConfig(patience=100)}
+    config = tiny(ppo=fixed, cooling=0.5, **plain)
+    _, shown, _ = watched(tmp_path, config, 20)
+    lr = [p.stats.update.policy_lr for p in shown]
+    assert lr[:10] == [1e-3] * 10 and lr[-1] == pytest.approx(1e-4)
+    assert lr[10:] == sorted(lr[10:], reverse=True) and lr[14] == pytest.approx(0.6e-3)
+    with pytest.raises(PoiseError, match="cooling is for steps of a fixed size"):
+        replace(config, ppo=replace(fixed, kl_target=0.05))

@@ -97,7 +97,8 @@ def _training(a: Mapping[str, Any], parts: Mapping[str, Any], image: str) -> lis
 def _figures(parts: Mapping[str, Any]) -> list[str]:
     out = ["## Figures", ""]
     table = parts.get("table", {})
-    tables = [FieldTable.from_dict(table[k]) for k in ("held_out", "library") if table.get(k)]
+    kinds = ("held_out", "library", "library_made")
+    tables = [FieldTable.from_dict(table[k]) for k in kinds if table.get(k)]
     if tables:
         said = "The paper's rows are on other data, another body and another simulator."
         paper = [r for r in paper_rows("AMASS-Train", "AMASS-Test") if r.method.startswith("PHC")]

@@ -305,6 +305,11 @@ class PPO:
             last.weight.mul_(std / norm.std)
             last.bias.mul_(std).add_(mean - norm.shift).div_(norm.std)
 
+    def scale_lr(self, factor: float) -> None:
+        """Sets the policy's lr to a share of the configured one, unless it adapts itself."""
+        if self.config.kl_target is None:
+            self.optimizer.param_groups[0]["lr"] = self.config.policy_lr * factor
+
     def _adapt_lr(self, kl: float) -> None:
         """Moves the policy's lr so that the KL of an update stays near its target."""
         target, (low, high) = self.config.kl_target, self.config.lr_range

@@ -82,7 +82,9 @@ class Perpetual:
     shares: where in the training the first and the last primitive end at the latest; with recovery, of
     what `recovering.share` leaves.
     evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of the
-    control steps. mining, convergence: what fails is trained more; when a stage has learned what it can.
+    control steps. cooling: share of a stage's longest time, at its end, in which the policy's step size
+    falls evenly to a tenth; for steps of a fixed size, `ppo.kl_target=None`.
+    mining, convergence: what fails is trained more; when a stage has learned what it can.
     """
 
     goal: Literal["rotations", "keypoints"] = "rotations"
@@ -117,6 +119,7 @@ class Perpetual:
     residual_std: float = 0.3
     shares: tuple[float, float] = (0.5, 0.8)
     evaluate_every: int = 0
+    cooling: float = 0.0
     num_envs: int = 512
     horizon: int = 300
     seed: int = 0
@@ -152,6 +155,11 @@ class Perpetual:
         if not 0 <= self.hard_starts <= 1:
             what = f"hard_starts must lie in [0, 1], got {self.hard_starts}"
             raise PoiseError(what, "Perpetual")
+        if not 0 <= self.cooling <= 1:
+            raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")
+        if self.cooling and self.ppo.kl_target is not None:
+            what = "cooling is for steps of a fixed size, and kl_target adapts them"
+            raise PoiseError(what, "Perpetual", "Set kl_target=None, or leave cooling out")
         if self.paths is not None and self.shapes.count > 1:
             what = "paths are searched for one body, and there are several shapes"
             raise PoiseError(what, "Perpetual", "Leave one of the two out")

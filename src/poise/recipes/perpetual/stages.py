@@ -49,6 +49,9 @@ from poise.recipes.perpetual.recovery import check_falls
 from poise.recipes.perpetual.task import Perpetual
 from poise.recipes.perpetual.trouble import Troubles
 
+#: What is left of the policy's step size at the end of a stage that cools.
+COLD = 0.1
+
 
 class Course:
     """A library's training in a run folder; begins it, or goes on from its checkpoint.
@@ -147,6 +150,7 @@ class Course:
         """One iteration, with the evaluation, the next stage and the checkpoint that are due."""
         stage, judged, follows = self.stage, None, None
         self._limit_help()
+        self._cool()
         stats, trouble = self.troubles.iterate(self.trainer, self._go_back)
         self._limit_help()
         iteration, share, help_n = self.iteration, self.share, self.help * self.config.help_start
@@ -187,6 +191,13 @@ class Course:
         if most == 0.0:
             self.env.help.schedule = None
         self.env.help.cap(most)
+
+    def _cool(self) -> None:
+        """Smaller steps towards the stage's end, see `Perpetual.cooling`."""
+        cooling, end = self.config.cooling, ends(self.config, self.stage, self.began)
+        if cooling and end > self.began:
+            left = (end - self.share) / (end - self.began)
+            self.trainer.ppo.scale_lr(min(1.0, max(left / cooling, COLD)))
 
     def _judge(self, over: bool) -> Judged:
         """Evaluates the present policy. over: the stage's time is."""

@@ -44,7 +44,7 @@ def settings(policy: Perpetual, seed: int = 0) -> Perpetual:
     ppo = replace(config.ppo, minibatch=MINIBATCH)
     # One motion is lost or not: that is no curve by which to tell that nothing is gained any more.
     convergence = replace(config.convergence, patience=NEVER)
-    return replace(config, evaluate_every=EVERY, ppo=ppo, convergence=convergence)
+    return replace(config, evaluate_every=EVERY, cooling=0.0, ppo=ppo, convergence=convergence)
 
 
 def learn(
