@@ -12,7 +12,6 @@ from tiny_clips import deepmimic, put
 
 from poise.cli.main import main
 from poise.motion import read_clip, trim, write_clip
-from poise.recipes.track import policy as track_policy
 from toy_policy import WALK, toy_run
 
 
@@ -115,8 +114,6 @@ def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.Capture
 def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, refused) -> None:
     out = str(tmp_path / "out")
     given = ("--policy", file, "-o", out)
-    if not track_policy.SHIPPED.exists():
-        refused("track", short, "-o", out, words=("no policy comes with", "poise train perpetual"))
     refused("track", short, "--policy", tmp_path / "absent", "-o", out, words=("no such policy",))
     weights = run / "policy.safetensors"
     refused("track", short, "--policy", weights, "-o", out, words=("without the body", str(run)))

@@ -85,17 +85,18 @@ def run(options: Options, argv: Sequence[str]) -> int:
     given = read(o.clip, o.reading)
     with working("opening the policy"):
         tracker = open_tracker(o.policy)
-    with claimed(out), working("tracking"):
-        config = TrackConfig(noise, o.seed, o.reset_on_fail, o.reading.smooth, o.count)
-        tracked = track(tracker, given, config)
-    if o.learn and tracked.failures:
-        if (learned := practise(o, tracker, tracked, out / "learned")) is None:
-            return 130
-        tracked = track(learned, given, config)
-    with working("writing"):
-        done = write(tracked, out, motion, o.hold_feet)
-        if o.save_policy is not None:
-            save_tracker(tracked.tracker, o.save_policy)
+    config = TrackConfig(noise, o.seed, o.reset_on_fail, o.reading.smooth, o.count)
+    with claimed(out):
+        with working("tracking"):
+            tracked = track(tracker, given, config)
+        if o.learn and tracked.failures:
+            if (learned := practise(o, tracker, tracked, out / "learned")) is None:
+                return 130
+            tracked = track(learned, given, config)
+        with working("writing"):
+            done = write(tracked, out, motion, o.hold_feet)
+            if o.save_policy is not None:
+                save_tracker(tracked.tracker, o.save_policy)
     print_card(done.card)
     notes((*tracked.notes, *done.notes))
     say(outcome(tracked, o.reset_on_fail))

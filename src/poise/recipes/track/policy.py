@@ -32,7 +32,7 @@ from poise.recipes.session import FINAL, RUN_FILE, trained_policy
 
 #: What a policy file calls itself, and the version of what stands in it.
 KIND, VERSION = "tracker", 1
-#: The policy that comes with Poise lies here once there is one.
+#: The policy that comes with Poise.
 SHIPPED = Path(__file__).parents[2] / "data/tracker.safetensors"
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300
@@ -67,14 +67,9 @@ def open_tracker(path: Path | None = None) -> Tracker:
     """The policy in a file or a run folder; without a path the one that comes with Poise.
 
     Raises:
-        PoiseError: there is none, or it cannot be used.
+        PoiseError: it is not there, or it cannot be used.
     """
     if path is None:
-        if not SHIPPED.exists():
-            raise PoiseError(
-                "no policy comes with this version of Poise yet",
-                hint="Train one with poise train perpetual --library DIR -o RUN and give --policy RUN",
-            )
         path = SHIPPED
     if not path.exists():
         raise PoiseError(
