@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from poise.env import Reference
 from poise.kin.clean import clean_clip
 from poise.learn import Until
 from poise.motion import ClipLibrary
@@ -21,7 +22,7 @@ from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual.progress import Progress
 from poise.recipes.perpetual.result import PerpetualResult
 from poise.recipes.perpetual.run import Earlier, begin, going_on, train
-from poise.recipes.track.clip import Placed
+from poise.recipes.track.clip import Placed, place
 from poise.recipes.track.policy import Tracker, tracker_of
 
 #: Worlds, samples of a gradient step, and iterations from one evaluation to the next: a motion of
@@ -69,6 +70,10 @@ def learn(
     earlier = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
     config = settings(tracker.config, seed)
     imitation = begin(folder, ClipLibrary.of(clip), config, clip.name, earlier=earlier)
+    # Exactly what `track` will ask of the policy, on the same body.
+    body, rate = imitation.humanoid, config.sim.control_hz
+    qpos = place(placed.source, replace(tracker, humanoid=body)).qpos
+    imitation = replace(imitation, reference=Reference(body, [qpos], rate, imitation.library.names))
     result = train(
         imitation, folder, Until(minutes=minutes), on_iteration, threads, False, trained=tracker.policy
     )
