@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from poise.motion import ClipLibrary
 from poise.recipes.perpetual.run import Earlier, begin, going_on, train
 from poise.recipes.perpetual.stages import Course
 from poise.recipes.track.policy import Tracker, export_policy, load_tracker, policy_of_run
+from poise.spatial import quat_mul
 from toy_human import swing
 
 ONE = tiny(single=True, style=None, expert=False, help_start=0.0)
@@ -54,9 +56,21 @@ def test_it_begins_with_the_policys_weights_and_counts_its_cost(policy: Path, tm
 def test_a_larger_library_keeps_the_policys_body(policy: Path, tmp_path: Path) -> None:
     tracker = load_tracker(policy)
     # Soles, ranges and all else of a body depend on the clips it is made from.
-    more = ClipLibrary.of([*library(), swing(0.7, speed=-1.0, bend=2.0, name="back")])
+    back = swing(0.7, speed=-1.0, bend=2.0, name="back")
+    rot = torch.tensor(back.rot)
+    knee = back.skeleton.index("LeftLeg")
+    # A knee that bends the wrong way.
+    rot[:, knee] = quat_mul(
+        rot[:, knee], torch.tensor([math.cos(0.8), 0.0, -math.sin(0.8), 0.0]).double()
+    )
+    more = ClipLibrary.of([*library(), back.replaced(rot=rot.numpy())])
     imitation = begin(tmp_path, more, going_on(tracker.config, tiny()), earlier=earlier(tracker))
-    rows = [replace(r, ranges=()) for r in imitation.humanoid.table.rows]
+    assert imitation.humanoid.table.rows == tracker.humanoid.table.rows
+    # Additive actions are in radians, so that ranges may grow with the clips.
+    added = replace(going_on(tracker.config, tiny()), action="additive")
+    wide = begin(tmp_path / "added", more, added, earlier=earlier(tracker)).humanoid.table.rows
+    assert wide != tracker.humanoid.table.rows
+    rows = [replace(r, ranges=()) for r in wide]
     assert rows == [replace(r, ranges=()) for r in tracker.humanoid.table.rows]
     train(imitation, tmp_path, Until(iterations=1), None, 1, False, trained=tracker.policy)
     again = policy_of_run(tmp_path)

@@ -238,7 +238,14 @@ def test_a_joint_beyond_its_range_is_no_blow(tracker: Tracker) -> None:
     )
     rot = np.array(clip.rot)
     rot[:, knee] = turned.numpy()
-    placed = place(clip.replaced(rot=rot), tracker)
+    bent = clip.replaced(rot=rot)
+    # Absolute targets are shares of the ranges, which must stay as they were trained.
+    assert tracker.config.action == "absolute"
+    placed = place(bent, tracker)
+    assert imitation_of(tracker, [placed]).humanoid is tracker.humanoid
+    assert any("beyond the range" in n and "widened" not in n for n in placed.notes)
+    tracker = replace(tracker, config=replace(tracker.config, action="additive"))
+    placed = place(bent, tracker)
     body = imitation_of(tracker, [placed]).humanoid
     ranges = body.model.jnt_range[1:]
     assert (placed.qpos[:, 7:] >= ranges[:, 0]).all() and (placed.qpos[:, 7:] <= ranges[:, 1]).all()

@@ -46,6 +46,8 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
     from poise.recipes.inbetween import RUN_FILE, Inbetween, begin, train
 
     folder = library.folder("inbetween")
+    if library.backwards:
+        raise PoiseError("the recipe inbetween has no --backwards", hint="Leave it out")
     if (out / RUN_FILE).exists() and not resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -57,7 +59,7 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
     reading = None
     if library.library_fps or library.library_skeleton:
         # Its windows are seen in a mirror, not the clips.
-        reading = replace(library.reading(), mirror=False, backwards=())
+        reading = replace(library.reading(), mirror=False)
     config = Inbetween(
         net=network.net, name=folder.name, seed=seed, validation=library.hold_out,
         final=library.never or r"(?!)", contacts=network.contacts, mirror=library.mirror,

@@ -106,6 +106,7 @@ def fit_humanoid(
     config: BodyConfig | None = None,
     rate_hz: float = 30.0,
     table: BodyTable | None = None,
+    widens: bool = True,
 ) -> tuple[Humanoid, list[np.ndarray], FitReport]:
     """A humanoid that can reach every frame of the library.
 
@@ -115,6 +116,7 @@ def fit_humanoid(
         config: see `BodyConfig`. rate_hz: the control rate at which the clips are sampled.
         table: a body on the library's skeleton that stays as it is but for its hinges' ranges and for
             pairs of bodies that never collide, both of which only grow; by default one is made.
+        widens: whether ranges grow to hold the motion.
 
     Returns:
         the humanoid, one `qpos (T, 7 + hinges)` per clip at `rate_hz` standing on the floor, and a
@@ -137,7 +139,7 @@ def fit_humanoid(
         _join(q, hinges, table) if c.cyclic else (q, None) for c, q in zip(clips, motions, strict=True)
     ]
     motions, cycles = [q for q, _ in joined], tuple(c for _, c in joined)
-    table, widened = widen(table, motions, config.margin)
+    table, widened = widen(table, motions, config.margin) if widens else (table, ())
     closed = [c is not None and c.closed for c in cycles]
     known = [c.skeleton.source.ground_m is not None for c in clips]
     fits = [

@@ -198,6 +198,11 @@ class Perpetual:
         return cls(action="additive", **(own | changes))
 
     @property
+    def widens(self) -> bool:
+        """Whether ranges of hinges may grow after training: absolute targets are shares of them."""
+        return self.action == "additive"
+
+    @property
     def method(self) -> str:
         """What a score card calls it."""
         kinds = {"single": self.single, "plain": not self.multiplicative, "joint": not self.progressive}

@@ -131,7 +131,8 @@ def build(
     config = config or Perpetual()
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     library, _ = on_own_body(library, config.body)
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table)
+    widens = table is None or config.widens
+    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     built = Imitation(library, humanoid, reference, report, config, task(config, humanoid))

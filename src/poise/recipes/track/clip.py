@@ -62,7 +62,8 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     qpos = within_turns(clip_to_qpos(resample(level.onto(mended), rate), table), humanoid)
     qpos, ground = fit_ground(qpos, table, rate, known=known)
     report = _report(made, qpos, humanoid, rate, found, ground)
-    return Placed(clip, made, qpos, report, moved, level, _notes(qpos, humanoid, moved))
+    notes = _notes(qpos, humanoid, moved, tracker.config.widens)
+    return Placed(clip, made, qpos, report, moved, level, notes)
 
 
 def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
@@ -104,7 +105,9 @@ def _report(
     return FitReport(*one, (error,), (), (), fastest)
 
 
-def _notes(qpos: np.ndarray, humanoid: Humanoid, moved: RetargetReport | None) -> tuple[str, ...]:
+def _notes(
+    qpos: np.ndarray, humanoid: Humanoid, moved: RetargetReport | None, widens: bool
+) -> tuple[str, ...]:
     out = []
     if moved is not None:
         out.append(
@@ -116,8 +119,9 @@ def _notes(qpos: np.ndarray, humanoid: Humanoid, moved: RetargetReport | None) -
     if (over > BEYOND).any():
         worst, many = int(over.argmax()), int((over > BEYOND).sum())
         which = f"{many} joints go" if many > 1 else "One joint goes"
+        fate = ", which is widened" if widens else ""
         out.append(
-            f"{which} beyond the range of the policy's body, which is widened, most "
+            f"{which} beyond the range of the policy's body{fate}, most "
             f"{humanoid.hinges[worst]} by {math.degrees(over[worst]):.0f} degrees."
         )
     return tuple(out)

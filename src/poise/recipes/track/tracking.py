@@ -168,12 +168,12 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
     """Motions on the tracker's body as one task; the report is that of the first.
 
-    Hinges whose range a motion leaves are widened: no policy sees the ranges, and whoever begins beyond
-    one would be thrown back into it.
+    Hinges whose range a motion leaves are widened where no action is measured by the ranges: whoever
+    begins beyond one would be thrown back into it.
     """
     humanoid, config = tracker.humanoid, tracker.config
     motions = [p.qpos for p in placed]
-    if widen(humanoid.table, motions, 0.0)[1]:
+    if config.widens and widen(humanoid.table, motions, 0.0)[1]:
         table, _ = widen(humanoid.table, motions, config.body.margin)
         humanoid = make_humanoid(humanoid.skeleton, table)
         config.sim.apply(humanoid.model)
