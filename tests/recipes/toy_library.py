@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
-from poise.motion import ClipLibrary
+from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
 from poise.recipes.perpetual.eval import ClipResults
@@ -42,7 +43,16 @@ def tiny(**changes: object) -> Perpetual:
         "seed": 1,
         "clone": CloneConfig(steps=4, rounds=1, critic_steps=4),
         "recovery": False,
-        "recovering": RecoveryPlan(share=0.3, falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2)),
+        "recovering": RecoveryPlan(
+            share=0.3,
+            falls=4,
+            trials=2,
+            final_trials=2,
+            seconds=(0.1, 0.2),
+            ways=4,
+            way_samples=64,
+            taught=CloneConfig(steps=4, rounds=1, critic_steps=0),
+        ),
         "convergence": ConvergenceConfig(patience=1),
         "style": STYLE,
         "ppo": PPO,
@@ -74,3 +84,15 @@ class Scripted:
         frames = length[clips]
         error = torch.where(won, 20.0, 200.0).double()
         return ClipResults(clips, won, frames, torch.where(won, frames, frames // 2), error, error)
+
+
+def rises(name: str = "rises") -> Clip:
+    """Somebody who lies on the back for a moment, gets up within a second, and stands."""
+    clip = swing(2.4, name=name)
+    up = torch.linspace(0, 2.4, clip.frames).sub(0.5).clamp(0, 1)
+    lean = -math.pi / 2 * (1 - up)
+    rot, pos = clip.rot.copy(), clip.root_pos.copy()
+    rot[:] = rot[-1]
+    rot[:, 0] = torch.stack((torch.cos(lean / 2), 0 * up, torch.sin(lean / 2), 0 * up), -1).numpy()
+    pos[:, 2] *= (0.15 + 0.85 * up).numpy()
+    return clip.replaced(rot=rot, root_pos=pos)

@@ -41,7 +41,8 @@ class Primitives:
     action: Annotated[Action, arg(metavar="NAME")] = "absolute"
     """perpetual: joint targets as in the paper, or additive ones, with settings for hours on a CPU."""
     going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
-    """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body."""
+    """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body;
+    with recovery it stays as it is, beside a primitive that recovers (--single: one network)."""
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
@@ -91,7 +92,8 @@ def check_going_on(primitives: Primitives, body: Body, library: Library) -> None
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    plain = Primitives(recovery=primitives.recovery, going_on=primitives.going_on)
+    own = {name: getattr(primitives, name) for name in ("recovery", "single", "going_on")}
+    plain = Primitives(**own)
     names = [f.name for f in fields(plain) if getattr(primitives, f.name) != getattr(plain, f.name)]
     names += [f.name for f in fields(body) if getattr(body, f.name) != getattr(Body(), f.name)]
     if names:

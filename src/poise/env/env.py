@@ -9,7 +9,7 @@ from poise.control import Wrench
 from poise.env.acting import Acting
 from poise.env.bodies import Bodies
 from poise.env.budget import HelpBudget
-from poise.env.frame import Frame, Pose, placed
+from poise.env.frame import Frame, ObsTerm, Pose, placed
 from poise.env.means import Means
 from poise.env.moments import Hardness
 from poise.env.recoveries import Recoveries
@@ -91,7 +91,7 @@ class ImitationEnv:
                 # Falls are those of the first body, which all worlds still have.
                 _ = self.recoveries.falls
             self._bodies = Bodies(backend, reference.bodies, reference.body)
-        self._no_table = torch.zeros(n, 0, device=here)
+        self._no_table, self._every = torch.zeros(n, 0, device=here), torch.arange(n, device=here)
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         self._terms = Terms(*terms, placed(task.style, here), self._frame_of, self._ends, here, fused)
         self.reset_to(self.clip, self.frame)
@@ -197,9 +197,10 @@ class ImitationEnv:
         row, moments = self._goal_rows, self.reference.moments
         group = moments.of[row] if self._by_moment else self.clip
         help_left = self.help.at(group)
-        self.wrench = self._acting.apply(
-            self.action, self.reference.hinges, row, help_left, self.help.now > 0
-        )
+        targets, rows = self.reference.hinges, row
+        if self.recoveries is not None and self.task.pd.mode == "additive":
+            targets, rows = self.recoveries.targets(targets[row]), self._every
+        self.wrench = self._acting.apply(self.action, targets, rows, help_left, self.help.now > 0)
         (self._guard or self.backend).step(self.substeps)
         self._counts += 1
         ref, held = self._goal, None if self.recoveries is None else self.recoveries.tick(self.frame)
@@ -256,6 +257,19 @@ class ImitationEnv:
         return failed, terminated, (seen.age >= self.task.horizon) & ~terminated
 
     # --- views --------------------------------------------------------------------------------
+
+    def next_hinges(self) -> Tensor:
+        """`(N, n)` rad, the reference's hinges after the next step, to which additive actions add."""
+        return self.reference.hinges[self._goal_rows]
+
+    def frame_now(self) -> Frame:
+        """What terms see of all worlds as they stand."""
+        return self._frame()
+
+    @property
+    def observed(self) -> tuple[ObsTerm, ...]:
+        """The terms of the observation, on this device."""
+        return self._terms.obs
 
     def pose(self) -> Pose:
         """The simulated characters now."""

@@ -85,7 +85,7 @@ def standing_height(humanoid: Humanoid) -> float:
     """Height of the root, m, of a character that stands on the floor with its hinges at zero."""
     upright = torch.zeros(1, humanoid.model.nq, dtype=torch.float64)
     upright[:, 3] = 1.0
-    upright[:, 7:] = _rest(humanoid)
+    upright[:, 7:] = rest_angles(humanoid)
     return -float(_lowest(humanoid, upright))
 
 
@@ -110,7 +110,7 @@ def _dropped(
     hinges, rounds = len(humanoid.hinges), -(-drop.steps // HELD)
     start = torch.zeros(count, backend.model.nq, dtype=torch.float64)
     start[:, 3:7] = normalize(torch.randn(count, 4, dtype=torch.float64, generator=rng))
-    start[:, 7:] = _rest(humanoid)
+    start[:, 7:] = rest_angles(humanoid)
     # Arms and head may reach below the feet of one that stands, so nobody begins in the floor.
     start[:, 2] = torch.maximum(torch.tensor(height), -_lowest(humanoid, start)) + CLEAR
     times = rounds if drop.by == "torques" else 1
@@ -154,7 +154,7 @@ def _still(backend: Backend) -> Tensor:
     return torch.zeros(backend.num_envs, backend.model.nv, dtype=torch.float64, device=backend.device)
 
 
-def _rest(humanoid: Humanoid) -> Tensor:
+def rest_angles(humanoid: Humanoid) -> Tensor:
     """Hinges at zero, or at the nearest angle that they can take, rad `(n,)`."""
     model = humanoid.model
     low, high = torch.tensor(model.jnt_range[1:]).unbind(-1)

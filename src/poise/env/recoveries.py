@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import PDTargets
-from poise.env.falls import fall_states
+from poise.env.falls import fall_states, rest_angles
 from poise.env.recovery import CONTINUED, FALLEN, FAR, Recovery
 from poise.sim import Backend
 
@@ -30,6 +30,7 @@ class Recoveries:
         self, config: Recovery, backend: Backend, humanoid: Humanoid, pd: PDTargets, seed: int = 0
     ):
         self.config, self.seed = config, seed
+        self._rest = rest_angles(humanoid).float().to(backend.device)
         self._made_with = backend, humanoid, pd
         self.table = torch.zeros(backend.num_envs, 4, device=backend.device)
         self.grace, self.spare, self.before, self._kind = self.table.unbind(1)
@@ -55,6 +56,12 @@ class Recoveries:
     def held(self) -> Tensor:
         """`(N,)` bool: whose reference waits. One that failed first reaches the frame it made for."""
         return (self.grace > 0) & (self.grace <= self.config.grace)
+
+    def targets(self, hinges: Tensor) -> Tensor:
+        """What additive actions add to, rad `(N, n)`: the reference's `hinges (N, n)`, or the body at
+        rest where the goal is a point, which tells nothing of the reference's."""
+        far = self.before > self.config.switch
+        return torch.where(far.unsqueeze(-1), self._rest.to(hinges), hinges)
 
     # --- starts -------------------------------------------------------------------------------
 

@@ -16,7 +16,8 @@ before the root has come as near as `switch` and stayed for `settle` steps, with
 **Point goal** (Eq. 3): as long as the root is farther than `switch` from its reference, of the goal
 nothing is told but where the reference's root is and how it is turned: see `toward`. This and the
 rewards that count (`RewardTerm.when`) depend on that distance alone, also in tracked episodes and while
-evaluating, so that a policy sees the same in all of them.
+evaluating, so that a policy sees the same in all of them. Additive actions there add to the body at
+rest, since the reference's angles are not told either.
 """
 
 from __future__ import annotations

@@ -133,6 +133,13 @@ class PolicyBundle:
         )
         return out
 
+    def clipped(self, at: float) -> PolicyBundle:
+        """The same policy with observations clipped so many deviations from their means."""
+        out = self.copy()
+        out.norm.clip = at
+        out.shape = {**out.shape, "obs_clip": at}
+        return out
+
     def state(self) -> State:
         """Copies of all tensors, under "norm/" and "policy/"."""
         return prefixed("norm", self.norm.state_dict()) | prefixed("policy", self.policy.state_dict())

@@ -15,6 +15,9 @@ from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig,
 from poise.recipes.perpetual.shapes import BodyShapes
 from poise.sim import SimConfig
 
+#: Deviations from the mean at which observations are clipped where who lies must be told from who leans.
+WIDE = 30.0
+
 
 @dataclass(frozen=True)
 class RecoveryPlan:
@@ -22,6 +25,9 @@ class RecoveryPlan:
 
     share: of the whole training, what the recovery primitive has at least; of a single network it is
     taken from the part without recovery. falls: different fallen characters to begin from.
+    ways: demonstrations of coming back, made of the library's own clips, by which the primitive is
+    taught where somebody gets up in it and somebody walks, see `env.way_back`; 0 does without.
+    way_samples: control steps in which they are learned first. taught: how the primitive is cloned then.
     trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
     final_trials: with the finished policy. seconds: within which who is back is counted; the last one
     decides. enough: share of all trials with which recovery is learned.
@@ -29,6 +35,13 @@ class RecoveryPlan:
 
     share: float = 0.15
     falls: int = 512
+    ways: int = 768
+    way_samples: int = 6_000_000
+    taught: CloneConfig = field(
+        default_factory=lambda: CloneConfig(
+            steps=100, rounds=7, epochs=(6, 4), noise=(0.0, 0.5, 1.5), minibatch=4096, critic_steps=0
+        )
+    )
     trials: int = 32
     final_trials: int = 100
     seconds: tuple[float, ...] = (5.0, 10.0)
@@ -40,6 +53,9 @@ class RecoveryPlan:
             raise PoiseError(what, "RecoveryPlan")
         if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
             raise PoiseError("recovery needs falls, trials and seconds", "RecoveryPlan")
+        if self.ways < 0 or self.way_samples < 1:
+            what = f"ways must be at least 0 and way_samples 1, got {self.ways} and {self.way_samples}"
+            raise PoiseError(what, "RecoveryPlan")
 
 
 @dataclass(frozen=True)
@@ -187,10 +203,12 @@ class Perpetual:
         that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
         stage has more evaluations before it counts as learned. Many worlds make large batches: what one
         hard moment of many tells is lost in small ones, with steps large enough to learn it. Half of
-        the episodes begin before hard moments, those of the whole library, and the others anywhere."""
+        the episodes begin before hard moments, those of the whole library, and the others anywhere.
+        Observations are clipped far out, since who lies on the floor is far from the mean of walks."""
         ppo = replace(
-            cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3
-        )
+            cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3,
+            obs_clip=WIDE,
+        )  # fmt: skip
         own = {
             "ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None, "num_envs": 2048,
             "hard_over": "library", "mining": MiningConfig(rule="uniform"),

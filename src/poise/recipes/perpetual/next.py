@@ -32,6 +32,7 @@ from poise.recipes.perpetual.paths import find_paths
 from poise.recipes.perpetual.plan import first_stage
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import walking_clips
+from poise.recipes.perpetual.returning import learn_returning
 from poise.recipes.perpetual.task import Perpetual, stage_task
 from poise.sim import UnstableError
 
@@ -56,7 +57,12 @@ def begin_first(
     if trained is not None:
         env = own.env(1, threads=1)
         env.close()
-        return stage, WarmStart(trained.first_actions(env.num_actions))
+        start = WarmStart(trained.first_actions(env.num_actions).clipped(own.ppo().obs_clip))
+        if stage.kind != "primitive":
+            return stage, start
+        # What is trained already is the first primitive, and recovery comes next.
+        known = replace(start, policy=columns_of(start.policy, config.lateral))
+        return Stage("recovery", 2), begin_recovery(known, imitation, 2, threads, folder, tell)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None
     start = None
@@ -99,15 +105,18 @@ def _joint(sized: Imitation) -> PolicyBundle:
 
 def begin_stage(
     before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
-    dumps: Path | None, tell: Beginning,
+    folder: Path, tell: Beginning,
 ) -> WarmStart:  # fmt: skip
     """What a later stage starts from: one primitive more, a composer, or the same network.
 
     before: what the last stage learned, with its critic, which goes on. owner: see `begin_composer`.
+    folder: of the run.
     """
     if stage.kind == "composer":
-        return begin_composer(before, staged(imitation, stage), owner, threads, dumps, tell)
-    if stage.kind in ("primitive", "recovery"):
+        return begin_composer(before, staged(imitation, stage), owner, threads, folder / DUMPS, tell)
+    if stage.kind == "recovery":
+        return begin_recovery(before, imitation, stage.number, threads, folder, tell)
+    if stage.kind == "primitive":
         return begin_primitive(before, imitation.config, stage.number)
     return before
 
@@ -123,6 +132,20 @@ def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmSt
     """One primitive more; the critic goes on, as in the paper."""
     rng = make_generator(config.seed, f"primitive {number}")
     return replace(before, policy=next_column(before.policy, config.start, generator=rng))
+
+
+def begin_recovery(
+    before: WarmStart, imitation: Imitation, number: int, threads: int, folder: Path, tell: Beginning
+) -> WarmStart:
+    """The recovery primitive: taught ways back where the library has any, or as the one before it."""
+    start = begin_primitive(before, imitation.config, number)
+    own = replace(imitation, task=stage_task(imitation.config, imitation.humanoid, "primitive"))
+    try:
+        return learn_returning(start, own, folder, threads, tell)
+    except UnstableError as problem:
+        if tell.failed is not None:
+            tell.failed(str(problem))
+        return start
 
 
 def begin_composer(

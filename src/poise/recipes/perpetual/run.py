@@ -27,12 +27,15 @@ from poise.recipes.expert import Beginning
 from poise.recipes.imitation import Imitation
 from poise.recipes.library.clips import Target
 from poise.recipes.library.folder import LibraryConfig, library_of, split
-from poise.recipes.perpetual.config import from_json, to_json
+from poise.recipes.perpetual.config import WIDE, from_json, to_json
 from poise.recipes.perpetual.progress import Progress, Stage
 from poise.recipes.perpetual.result import RESULT, PerpetualResult, finish
 from poise.recipes.perpetual.stages import Course
 from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
 from poise.recipes.session import FINAL, RUN_FILE
+
+#: Least step size of a network that begins anew beside a policy that is done.
+ANEW = 1e-4
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,9 @@ class Earlier:
 
 def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    who learns, with which seed, and whether recovery is learned.
+    who learns, with which seed, and whether recovery is learned. Where it is, the policy stays as it
+    is, the first primitive of more, unless one network is to learn both. Observations are clipped no
+    nearer than at `WIDE` deviations.
 
     Raises:
         PoiseError: the policy is made of primitives.
@@ -58,7 +63,14 @@ def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
         )
     done = {"expert": False, "paths": None, "help_start": 0.0}
     asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery")}
-    return replace(policy, **done, **asked)
+    ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
+    if wanted.recovery and not wanted.single:
+        # Primitives have the sizes of the network that becomes the first of them.
+        asked |= {"single": False, "multiplicative": True, "progressive": True}
+        hidden = policy.single_hidden if policy.single else ppo.policy_hidden
+        # What the policy ended with is too careful for who begins.
+        ppo = replace(ppo, policy_hidden=hidden, policy_lr=max(ppo.policy_lr, ANEW))
+    return replace(policy, ppo=ppo, **done, **asked)
 
 
 def clips_of(

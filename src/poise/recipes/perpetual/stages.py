@@ -88,6 +88,8 @@ class Course:
             check_falls(imitation)
             stage, start = begin_first(imitation, threads, folder, self.tell, trained)
             warm = start is not None and (start.critic is not None or trained is not None)
+            if stage.kind == "recovery":
+                self.ledger.begin(members_of(stage, torch.zeros(0), imitation))
             self._enter(stage, start, warm, 1.0)
             # What the clone has cost is no time with help.
             self.begun = self.trainer.samples, self.trainer.seconds
@@ -223,7 +225,7 @@ class Course:
             self.finished = True
             return None
         before = WarmStart(policy, critic_of(t), t.samples, t.seconds)
-        where = (self.threads, self.dumps, self.tell)
+        where = (self.threads, self.folder, self.tell)
         start = begin_stage(before, self.imitation, follows, ledger.owner, *where)
         # A composer and what recovers learn without help; a primitive's clips keep what they have.
         scale = self.helps if follows.kind == "primitive" else 0.0

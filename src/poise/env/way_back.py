@@ -1,0 +1,132 @@
+"""Ways back: from where characters lie, up and over to a place, made of a library's own clips.
+
+Getting up is hard to find by trial, and easy to learn from a clip of it. Of what a library knows of
+coming back (`env.ways`) a way is made for any start:
+
+    lying -> blended (`env.rising`) -> a clip that gets up -> at ease -> the walk, steered -> at ease
+
+It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
+track such ways (`recipes.perpetual.returning`) finds what physics allows.
+
+Turning follows a unicycle: the heading turns toward the place at no more than `TURN` rad/s, and the
+walk's stride shortens by the cosine of what is left to turn.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.env.rising import Rising, blend, mixed, smooth
+from poise.env.ways import Ways
+from poise.spatial import quat_mul
+from poise.spatial.turns import facing, heading_angle, yaw_quat
+
+#: rad/s, m and rad: how fast is turned, and how near has come back.
+TURN, HERE, FACING = 2.0, 0.08, 0.1
+#: Of a walk's pace: what is gained and lost in a step, and where all of the walk is seen; steps on the
+#: spot while turning.
+FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
+#: s: at ease after getting up, and at the end.
+EASE_S, STAY_S = 0.5, 1.0
+#: Steps after which a walk gives up.
+LONGEST = 600
+
+
+def way_back(
+    rising: Rising, start: Tensor, place: Tensor, which: int = 0, phase: float = 0.0, lies: bool = False
+) -> Tensor:
+    """The frames `(T, 7 + n)` from `start (7 + n)` to standing at ease at `place (7 + n)`.
+
+    rising: how this library gets up, and what else it knows. which: of the walks and of the clips that
+    get up. phase: 0 to 1, where in its cycle the walk begins. lies: whether `start` lies and gets up
+    first; else it stands at ease already.
+    """
+    parts, ways, rate = [], rising.ways, rising.rate_hz
+    if lies:
+        body = rising.up(start, which, 1.0 if phase < 0.5 else -1.0)
+        start = facing(ways.ease, heading_angle(body[-1, 3:7]))
+        start[:2] = body[-1, :2]
+        parts += [body, blend(body[-1], start, round(EASE_S * rate))[1:]]
+    return torch.cat((*parts, _walk(ways, start, place, rate, which, phase)))
+
+
+def return_motions(rising: Rising, falls: Tensor, far: float, count: int, seed: int) -> list[np.ndarray]:
+    """`count` ways back to standing at ease at the origin: every other one from lying, of which two
+    fifths are away, too, and the rest from standing up to `far` m away. falls: `(K, 7 + n)`."""
+    rng, ways = torch.Generator().manual_seed(seed), rising.ways
+    place = facing(ways.ease, heading_angle(ways.ease[3:7]))
+    motions: list[np.ndarray] = []
+    for i, u in enumerate(torch.rand(count, 6, dtype=torch.float64, generator=rng).tolist()):
+        lies = i % 2 == 1
+        away = far * u[0] ** 0.7 if not lies or u[1] < 0.4 else 0.0
+        bearing = 2 * math.pi * u[2]
+        start = falls[i // 2 % len(falls)].clone() if lies else facing(ways.ease, 2 * math.pi * u[3])
+        start[0], start[1] = away * math.cos(bearing), away * math.sin(bearing)
+        which = int(u[5] * 1000)
+        motions.append(way_back(rising, start, place, which, u[4], lies).numpy())
+    return motions
+
+
+def names_of(count: int) -> list[str]:
+    """Of what `return_motions` gives."""
+    return [f"{'fallen' if i % 2 else 'far'}-{i // 2}" for i in range(count)]
+
+
+def _walk(ways: Ways, start: Tensor, place: Tensor, rate_hz: float, which: int, phase: float) -> Tensor:
+    """From standing at `start` to standing at `place`, by one of the walks."""
+    cycle = ways.walks[which % len(ways.walks)]
+    walk, count = cycle.numpy(), len(cycle) - 1
+    length = float(walk[-1, 0])
+    speed, faces = length * rate_hz / count, heading_angle(cycle[:-1, 3:7])
+    at, goal, psi, aim = start[:2].numpy().copy(), place[:2].numpy(), heading_angle(start[3:7]), 0.0
+    to, here, pace, stayed, k = phase * count, False, 0.0, 0, 0
+    path, seen = [], []
+    while stayed < STAY_S * rate_hz and k < LONGEST:
+        left = goal - at
+        apart = math.hypot(*left)
+        here = here or apart < HERE
+        want = heading_angle(place[3:7]) if here else math.atan2(left[1], left[0]) + faces
+        error = math.remainder(want - psi, 2 * math.pi)
+        turn = max(-TURN, min(TURN, 4 * error))
+        psi += turn / rate_hz
+        stride = 0.0 if here else max(0.0, math.cos(error)) * min(1.0, max(0.15, 2 * apart / speed))
+        done = here and abs(error) < FACING
+        aim = 0.0 if done else max(stride, ON_SPOT * min(1.0, abs(turn) / TURN))
+        pace += max(-SLOWER, min(FASTER, aim - pace))
+        forward = (_along(walk, to + pace) - _along(walk, to)) * (
+            stride / max(aim, 1e-9) if aim else 0.0
+        )
+        to += pace
+        heading = psi - faces
+        at = at + forward * np.array([math.cos(heading), math.sin(heading)])
+        path.append((*at, heading, psi))
+        seen.append((to, pace))
+        stayed, k = stayed + (pace <= 1e-9 and done), k + 1
+    return _laid(ways.ease, cycle, torch.tensor(path), torch.tensor(seen))
+
+
+def _along(walk: np.ndarray, to: float) -> float:
+    """m that a walk has come after `to` frames."""
+    count = len(walk) - 1
+    cycle, rest = divmod(to, count)
+    i = min(int(rest), count - 1)
+    return cycle * walk[-1, 0] + walk[i, 0] + (rest - i) * (walk[i + 1, 0] - walk[i, 0])
+
+
+def _laid(ease: Tensor, cycle: Tensor, path: Tensor, seen: Tensor) -> Tensor:
+    """A walk's poses on a path (x, y, its direction, the heading), fading from and to standing."""
+    (to, pace), count = seen.double().unbind(-1), len(cycle) - 1
+    rest = to % count
+    i = rest.long().clamp(max=count - 1)
+    pose = mixed(cycle[i], cycle[i + 1], rest - i)
+    x, y, direction, psi = path.double().unbind(-1)
+    pose[:, 3:7] = quat_mul(yaw_quat(direction), pose[:, 3:7])
+    pose[:, 0], pose[:, 1] = x - direction.sin() * pose[:, 1], y + direction.cos() * pose[:, 1]
+    stand = ease.expand(len(pose), -1).clone()
+    stand[:, 3:7] = quat_mul(yaw_quat(psi - heading_angle(ease[3:7])), stand[:, 3:7])
+    stand[:, 0], stand[:, 1] = x, y
+    return mixed(stand, pose, smooth((pace / WHOLE).clamp(max=1.0)))

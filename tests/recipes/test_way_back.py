@@ -1,0 +1,131 @@
+"""Ways back made of a library's own clips: what they are made of, where they lead, how they move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from toy_library import rises, tiny
+
+from poise.env import Reference
+from poise.env.rising import LIFT, Rising
+from poise.env.way_back import names_of, return_motions, way_back
+from poise.env.ways import find_ways
+from poise.kin import Kinematics
+from poise.motion import ClipLibrary
+from poise.recipes.perpetual import Perpetual, build
+from poise.recipes.perpetual.recovery import standing, walking_clips
+from poise.spatial import quat_angle, quat_between
+from poise.spatial.turns import facing, heading_angle, turned, yaw_quat
+from toy_human import swing
+
+Built = tuple[Reference, Rising]
+
+
+@pytest.fixture(scope="module")
+def built() -> Built:
+    made = build(ClipLibrary.of([swing(1.2, speed=1.0, name="walk"), rises("rises")]), tiny())
+    reference = made.reference
+    ways = find_ways(reference, standing(reference), walking_clips(reference))
+    assert ways is not None
+    return reference, Rising(ways, reference.humanoid.table, reference.rate_hz)
+
+
+def test_a_library_knows_a_walk_and_how_to_get_up(built: Built) -> None:
+    ways = built[1].ways
+    (walk,), (up,) = ways.walks, ways.ups
+    # One cycle along +X, closed: its last frame is its first one farther on.
+    assert walk[0, 0] == 0 and walk[-1, 0] == pytest.approx(1.2, abs=0.15)
+    assert torch.allclose(walk[-1, 7:], walk[0, 7:], atol=1e-9)
+    assert float(walk[-1, 1] - walk[0, 1]) == pytest.approx(0.0, abs=1e-9)
+    height = float(ways.ease[2])
+    assert up[0, 2] < 0.4 * height and up[-1, 2] > 0.9 * height
+    assert len(ways.lows) > 5 and ways.lows[:, 2].max() < 0.6 * height
+
+
+def test_nobody_walks_or_nobody_gets_up() -> None:
+    for clips in (
+        [swing(1.2, speed=1.0, name="walk"), swing(1.2, name="calm")],
+        [swing(1.2, name="calm"), rises("rises")],
+    ):
+        reference = build(ClipLibrary.of(clips), tiny()).reference
+        assert find_ways(reference, standing(reference), walking_clips(reference)) is None
+
+
+@pytest.mark.parametrize("bearing", [0.3, 2.0, -2.9])
+def test_a_walk_leads_from_anywhere_to_a_place(built: Built, bearing: float) -> None:
+    reference, rising = built
+    ways = rising.ways
+    start, place = facing(ways.ease, bearing), facing(ways.ease, 0.5)
+    start[0], start[1] = 2.0, -1.0
+    way = way_back(rising, start, place)
+    assert (way[0, :2] - start[:2]).norm() < 0.05
+    assert turned_by(way[0], start) < 0.1
+    assert way[-1, :2].norm() < 0.1
+    assert turned_by(way[-1], place) < 0.15
+    # Nobody runs, and at the end a second is stood.
+    pace = (way[1:, :2] - way[:-1, :2]).norm(dim=-1) * reference.rate_hz
+    assert pace.max() < 1.5 and pace[-20:].max() < 1e-6
+
+
+@pytest.mark.parametrize("side", [0.0, math.pi])
+def test_who_lies_gets_up_whichever_side_is_up(built: Built, side: float) -> None:
+    reference, rising = built
+    ways = rising.ways
+    table, place = reference.humanoid.table, facing(ways.ease, 0.0)
+    lying = turned(ways.ups[0][:1], 1.0, ways.ups[0][0, :2], torch.tensor([1.0, 1.0]))[0]
+    lying[3:7] = rolled(lying[3:7], side)
+    way = way_back(rising, lying, place, lies=True)
+    assert torch.allclose(way[0, 3:], lying[3:], atol=1e-6) and torch.equal(way[0, :2], lying[:2])
+    assert way[-1, :2].norm() < 0.1 and way[-1, 2] > 0.9 * ways.ease[2]
+    body = Kinematics(table)(way, torch.zeros(len(way), way.shape[1] - 1, dtype=way.dtype))
+    speed = (body.pos[1:] - body.pos[:-1]).norm(dim=-1) * reference.rate_hz
+    assert speed.max() < 8.0
+    # Rolling over is no flight: before it gets up the root stays low.
+    up = int((way[:, 2] > 0.5 * ways.ease[2]).nonzero()[0])
+    assert up > reference.rate_hz * (0.4 if side == 0 else 1.0)
+    assert way[:up, 2].max() < float(lying[2]) + LIFT + 0.3
+
+
+def test_as_many_as_asked_for_of_both_kinds_and_by_seed(built: Built) -> None:
+    reference, rising = built
+    ways = rising.ways
+    falls = ways.ups[0][:3]
+    how = rising, falls, 3.0, 6
+    first, again, other = (return_motions(*how, seed) for seed in (0, 0, 1))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert any(a.shape != b.shape or not np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+    assert [q[0, 2] < 0.5 for q in first] == [False, True] * 3
+    assert names_of(4) == ["far-0", "fallen-0", "far-1", "fallen-1"]
+    assert Reference(reference.humanoid, first, 30, names_of(6)).length.min() > 30
+
+
+def test_turns_about_the_vertical() -> None:
+    pose = torch.tensor([1.0, 2.0, 0.9, *yaw_quat(torch.tensor(0.4)), 0.3], dtype=torch.float64)
+    assert heading_angle(pose[3:7]) == pytest.approx(0.4)
+    east = facing(pose, 0.0)
+    assert torch.allclose(east[:3], torch.tensor([0.0, 0.0, 0.9]).double())
+    assert heading_angle(east[3:7]) == pytest.approx(0.0) and east[7] == 0.3
+
+
+def turned_by(a: Tensor, b: Tensor) -> float:
+    return float(quat_angle(quat_between(a[3:7], b[3:7])))
+
+
+def rolled(quat: Tensor, angle: float) -> Tensor:
+    """Turned about the body's own long axis."""
+    from poise.spatial import quat_mul
+
+    half = 0.5 * angle
+    return quat_mul(quat, torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)], dtype=torch.float64))
+
+
+def test_settings_refuse_what_makes_no_sense() -> None:
+    from poise.errors import PoiseError
+
+    with pytest.raises(PoiseError, match="way_samples"):
+        replace(Perpetual().recovering, way_samples=0)
