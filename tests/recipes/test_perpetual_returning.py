@@ -133,17 +133,18 @@ def test_killed_while_ways_are_learned_goes_on_with_them(
     rng = torch.Generator().manual_seed(0)
     first = first_column(env.num_obs, env.num_actions, (16,), std=0.05, generator=rng)
     start = WarmStart(next_column(first, generator=rng))
-    whole = learn_returning(start, own, tmp_path / "whole", 1, Beginning())
+    pupil = next_column(first, "random", generator=rng)
+    whole = learn_returning(start, pupil, own, tmp_path / "whole", 1, Beginning())
 
     def killed(stats: IterationStats, of: int) -> None:
         assert stats.samples < of
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        learn_returning(start, own, tmp_path / "cut", 1, Beginning(way=killed))
+        learn_returning(start, pupil, own, tmp_path / "cut", 1, Beginning(way=killed))
     seen: list[int] = []
     tell = Beginning(way=lambda stats, of: seen.append(stats.samples))
-    again = learn_returning(start, own, tmp_path / "cut", 1, tell)
+    again = learn_returning(start, pupil, own, tmp_path / "cut", 1, tell)
     assert seen == [64] and whole.samples == again.samples > 64
     other = again.policy.state()
     assert all(torch.equal(v, other[k]) for k, v in whole.policy.state().items())

@@ -140,8 +140,11 @@ def begin_recovery(
     """The recovery primitive: taught ways back where the library has any, or as the one before it."""
     start = begin_primitive(before, imitation.config, number)
     own = replace(imitation, task=stage_task(imitation.config, imitation.humanoid, "primitive"))
+    rng = make_generator(imitation.config.seed, f"recovery {number}")
+    # What is told to who recovers is so unlike a frame to track that a copy learns it later.
+    pupil = next_column(before.policy, "random", generator=rng)
     try:
-        return learn_returning(start, own, folder, threads, tell)
+        return learn_returning(start, pupil, own, folder, threads, tell)
     except UnstableError as problem:
         if tell.failed is not None:
             tell.failed(str(problem))

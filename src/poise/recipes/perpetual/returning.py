@@ -42,12 +42,18 @@ SAVE_S = 30.0
 
 
 def learn_returning(
-    start: WarmStart, imitation: Imitation, folder: Path, threads: int, tell: Beginning
+    start: WarmStart,
+    pupil: PolicyBundle,
+    imitation: Imitation,
+    folder: Path,
+    threads: int,
+    tell: Beginning,
 ) -> WarmStart:
-    """The recovery primitive `start`, taught ways back; as it is where the library knows none.
+    """The recovery primitive: `pupil`, taught ways back, or `start` where the library knows none.
 
-    imitation: with the task of the recovery primitive. folder: of the run, where the tracker is kept, so
-    that a killed run goes on with it.
+    start: what tracks already, which becomes the tracker of ways. imitation: with the task of the
+    recovery primitive. folder: of the run, where the tracker is kept, so that a killed run goes on with
+    it.
     """
     config: Perpetual = imitation.config
     ways = demonstrations(imitation)
@@ -60,7 +66,7 @@ def learn_returning(
     assert imitation.task.recovery is not None
     blind = Blindfold(env, imitation.task.recovery)
     try:
-        how = config.recovering.taught, imitation.ppo(), config.seed, tell.round, start.policy
+        how = config.recovering.taught, imitation.ppo(), config.seed, tell.round, pupil
         taught, _ = clone(cast(VecEnv, blind), Guide(blind, tracker.policy), *how)
     finally:
         blind.close()
