@@ -146,6 +146,11 @@ def test_killed_while_ways_are_learned_goes_on_with_them(
     tell = Beginning(way=lambda stats, of: seen.append(stats.samples))
     again = learn_returning(start, pupil, own, tmp_path / "cut", 1, tell)
     assert seen == [64] and whole.samples == again.samples > 64
+    # And no longer than the time allows.
+    short = learn_returning(
+        start, pupil, own, tmp_path / "short", 1, Beginning(), lambda samples, _: samples >= 32
+    )
+    assert whole.samples - short.samples == 32
     other = again.policy.state()
     assert all(torch.equal(v, other[k]) for k, v in whole.policy.state().items())
 

@@ -27,7 +27,8 @@ class RecoveryPlan:
     taken from the part without recovery. falls: different fallen characters to begin from.
     ways: demonstrations of coming back, made of the library's own clips, by which the primitive is
     taught where somebody gets up in it and somebody walks, see `env.way_back`; 0 does without.
-    way_samples: control steps in which they are learned first. taught: how the primitive is cloned then.
+    way_samples: control steps in which they are learned first, in half of the stage's time at most.
+    taught: how the primitive is cloned then.
     trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
     final_trials: with the finished policy. seconds: within which who is back is counted; the last one
     decides. enough: share of all trials with which recovery is learned.

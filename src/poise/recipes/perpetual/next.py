@@ -32,12 +32,14 @@ from poise.recipes.perpetual.paths import find_paths
 from poise.recipes.perpetual.plan import first_stage
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import walking_clips
-from poise.recipes.perpetual.returning import learn_returning
+from poise.recipes.perpetual.returning import Enough, learn_returning, never
 from poise.recipes.perpetual.task import Perpetual, stage_task
 from poise.sim import UnstableError
 
 #: The folder in a run folder with worlds that went bad.
 DUMPS = "dumps"
+#: What follows a policy that training goes on from, where recovery is learned.
+SECOND = Stage("recovery", 2)
 
 
 def begin_first(
@@ -46,10 +48,12 @@ def begin_first(
     folder: Path,
     tell: Beginning,
     trained: PolicyBundle | None = None,
+    enough: Enough = never,
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
     folder: of the run, where the search for paths is kept. trained: a single network that goes on.
+    enough: see `learn_returning`.
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
@@ -62,7 +66,7 @@ def begin_first(
             return stage, start
         # What is trained already is the first primitive, and recovery comes next.
         known = replace(start, policy=columns_of(start.policy, config.lateral))
-        return Stage("recovery", 2), begin_recovery(known, imitation, 2, threads, folder, tell)
+        return SECOND, begin_recovery(known, imitation, 2, threads, folder, tell, enough)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None
     start = None
@@ -105,17 +109,17 @@ def _joint(sized: Imitation) -> PolicyBundle:
 
 def begin_stage(
     before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
-    folder: Path, tell: Beginning,
+    folder: Path, tell: Beginning, enough: Enough = never,
 ) -> WarmStart:  # fmt: skip
     """What a later stage starts from: one primitive more, a composer, or the same network.
 
     before: what the last stage learned, with its critic, which goes on. owner: see `begin_composer`.
-    folder: of the run.
+    folder: of the run. enough: see `learn_returning`.
     """
     if stage.kind == "composer":
         return begin_composer(before, staged(imitation, stage), owner, threads, folder / DUMPS, tell)
     if stage.kind == "recovery":
-        return begin_recovery(before, imitation, stage.number, threads, folder, tell)
+        return begin_recovery(before, imitation, stage.number, threads, folder, tell, enough)
     if stage.kind == "primitive":
         return begin_primitive(before, imitation.config, stage.number)
     return before
@@ -135,8 +139,9 @@ def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmSt
 
 
 def begin_recovery(
-    before: WarmStart, imitation: Imitation, number: int, threads: int, folder: Path, tell: Beginning
-) -> WarmStart:
+    before: WarmStart, imitation: Imitation, number: int, threads: int, folder: Path, tell: Beginning,
+    enough: Enough = never,
+) -> WarmStart:  # fmt: skip
     """The recovery primitive: taught ways back where the library has any, or as the one before it."""
     start = begin_primitive(before, imitation.config, number)
     own = replace(imitation, task=stage_task(imitation.config, imitation.humanoid, "primitive"))
@@ -144,7 +149,7 @@ def begin_recovery(
     # What is told to who recovers is so unlike a frame to track that a copy learns it later.
     pupil = next_column(before.policy, "random", generator=rng)
     try:
-        return learn_returning(start, pupil, own, folder, threads, tell)
+        return learn_returning(start, pupil, own, folder, threads, tell, enough)
     except UnstableError as problem:
         if tell.failed is not None:
             tell.failed(str(problem))

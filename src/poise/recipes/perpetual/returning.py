@@ -10,6 +10,7 @@ tracker where it goes itself (DAgger), and learns on by Eq. 4 from there.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -31,6 +32,7 @@ from poise.recipes.expert import CLONE_WORLDS, Beginning, finetuning
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual
 from poise.recipes.perpetual.recovery import standing, walking_clips
+from poise.recipes.perpetual.task import stage_task
 from poise.sim import make_backend
 
 #: The file of a run folder with the tracker of ways back, as far as it is trained.
@@ -41,6 +43,15 @@ FAR = 5.0
 SAVE_S = 30.0
 
 
+#: Whether so many control steps and seconds of the whole training are enough.
+Enough = Callable[[int, float], bool]
+
+
+def never(samples: int, seconds: float) -> bool:
+    """Nothing is."""
+    return False
+
+
 def learn_returning(
     start: WarmStart,
     pupil: PolicyBundle,
@@ -48,18 +59,20 @@ def learn_returning(
     folder: Path,
     threads: int,
     tell: Beginning,
+    enough: Enough = never,
 ) -> WarmStart:
     """The recovery primitive: `pupil`, taught ways back, or `start` where the library knows none.
 
     start: what tracks already, which becomes the tracker of ways. imitation: with the task of the
     recovery primitive. folder: of the run, where the tracker is kept, so that a killed run goes on with
-    it.
+    it. enough: whether so many control steps and seconds are all that ways are worth; `way_samples` are
+    in any case.
     """
     config: Perpetual = imitation.config
     ways = demonstrations(imitation)
     if ways is None:
         return start
-    tracker = _track(start, ways, folder, threads, tell)
+    tracker = _track(start, ways, folder, threads, tell, enough)
     env = ways.env(min(config.num_envs, CLONE_WORLDS), threads=threads)
     env.help.set(0.0)
     env.weights = ways.reference.length.double()
@@ -93,19 +106,14 @@ def demonstrations(imitation: Imitation) -> Imitation | None:
     rate = reference.rate_hz
     rising = Rising(found, humanoid.table, rate)
     motions = return_motions(rising, falls, FAR, plan.ways, int(config.seed))
-    task = replace(imitation.task, recovery=None, rewards=_tracking(imitation), help=None)
+    task = replace(stage_task(config, humanoid, None), help=None)
     shown = Reference(humanoid, motions, rate, names_of(plan.ways))
     return replace(imitation, reference=shown, task=task)
 
 
-def _tracking(imitation: Imitation) -> tuple:
-    """The rewards of tracking, of a task that recovers."""
-    from poise.recipes.perpetual.task import stage_task
-
-    return stage_task(imitation.config, imitation.humanoid, None).rewards
-
-
-def _track(start: WarmStart, ways: Imitation, folder: Path, threads: int, tell: Beginning) -> WarmStart:
+def _track(
+    start: WarmStart, ways: Imitation, folder: Path, threads: int, tell: Beginning, enough: Enough
+) -> WarmStart:
     """A tracker of the demonstrations that begins as the primitive; goes on with that of the folder."""
     config: Perpetual = ways.config
     trainer: Trainer = ways.trainer(
@@ -118,9 +126,11 @@ def _track(start: WarmStart, ways: Imitation, folder: Path, threads: int, tell: 
         if path.exists():
             trainer.load(path)
         until, saved = start.samples + config.recovering.way_samples, time.monotonic()
-        while trainer.samples < until:
+        done = trainer.samples >= until or enough(trainer.samples, trainer.seconds)
+        while not done:
             stats = trainer.iterate()
-            if time.monotonic() - saved > SAVE_S or trainer.samples >= until:
+            done = trainer.samples >= until or enough(trainer.samples, trainer.seconds)
+            if done or time.monotonic() - saved > SAVE_S:
                 folder.mkdir(parents=True, exist_ok=True)
                 trainer.save(path)
                 saved = time.monotonic()
