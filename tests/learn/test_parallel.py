@@ -82,6 +82,13 @@ def test_both_hold_the_same_weights_and_different_noise(two: Path) -> None:
     assert load_policy(two / LATEST, character="point").num_obs == 4
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are listed on Linux")
+def test_no_thread_of_the_group_outlives_it(two: Path) -> None:
+    """One that still held a tensor while Python ends would abort the process."""
+    for rank in (0, 1):
+        assert not [t for t in (two / f"threads{rank}.txt").read_text().split() if "gloo" in t]
+
+
 def test_a_resumed_pair_is_bit_exact(two: Path, tmp_path: Path) -> None:
     pair(tmp_path / "parts", 2)
     pair(tmp_path / "parts", 5)

@@ -95,6 +95,8 @@ def spawned(rank: int, size: int, port: int, folder: str, iterations: int, bad_r
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(size), "LOCAL_WORLD_SIZE": str(size)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     train(Path(folder), iterations, bad_rank)
+    threads = [t.read_text().strip() for t in Path("/proc/self/task").glob("*/comm")]
+    (Path(folder) / f"threads{rank}.txt").write_text("\n".join(threads))
 
 
 if __name__ == "__main__":

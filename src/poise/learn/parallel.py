@@ -104,6 +104,11 @@ def joined() -> Iterator[Comm]:
     if any(name not in os.environ for name in LAUNCHED) or os.environ["WORLD_SIZE"] == "1":
         yield ALONE
         return
+    # Its functions have the group that there is when it is imported as a default argument. Imported by
+    # an optimizer while there is one, they keep that group and its threads beyond the group's end, and
+    # such a thread that gives back a tensor while Python ends aborts the process.
+    import torch.distributed.nn  # noqa: F401
+
     dist, cuda = torch.distributed, torch.cuda.is_available()
     if cuda:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
