@@ -1,4 +1,4 @@
-"""Recovery that is taught: what who is taught sees, how it acts, and that a killed run goes on."""
+"""Ways back are learned as clips are, the policy stays what it was, and a killed run goes on."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import pytest
 import torch
 from toy_library import library, rises, tiny
 
-from poise.env import ImitationEnv
-from poise.env.recovery import FALLEN
-from poise.learn import IterationStats, Until, WarmStart, first_column, load_policy, next_column
+from poise.errors import PoiseError
+from poise.learn import Until, load_policy
 from poise.motion import ClipLibrary
 from poise.nets import Composer
-from poise.recipes.expert import Beginning
-from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, build, returning
+from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.config import WIDE
-from poise.recipes.perpetual.next import staged
+from poise.recipes.perpetual.next import Owners, staged
 from poise.recipes.perpetual.progress import Progress, Stage
-from poise.recipes.perpetual.returning import WAYS, Blindfold, demonstrations, learn_returning
-from poise.recipes.perpetual.run import Earlier, begin, going_on, resume, train
-from poise.recipes.track.policy import Tracker, policy_of_run
+from poise.recipes.perpetual.recovery import try_recovery
+from poise.recipes.perpetual.returning import demonstrations, odds, practised
+from poise.recipes.perpetual.run import Earlier, begin, going_on, reopen, resume, train
+from poise.recipes.track import TrackConfig, track
+from poise.recipes.track.policy import Tracker, load_tracker, policy_of_run, save_tracker
 from toy_human import swing
 
 PLAIN = {"style": None, "help_start": 0.0, "expert": False}
+RECOVERY, COMPOSER = Stage("recovery", 2), Stage("composer", 3, mixed=True)
 
 
 def lively() -> ClipLibrary:
@@ -33,53 +33,36 @@ def lively() -> ClipLibrary:
     return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
 
 
-def recovering(**changes: object) -> Imitation:
-    made = build(lively(), tiny(recovery=True, **(PLAIN | changes)))
-    return staged(made, Stage("recovery", 2))
+def test_ways_are_clips_of_the_stages_that_recover() -> None:
+    made = build(lively(), tiny(recovery=True, **PLAIN))
+    assert made.ways is not None and made.task.recovery is None
+    own, ways = len(made.library), demonstrations(made)
+    assert len(ways.names) == 4 and ways.qpos.shape[1] == made.reference.qpos.shape[1]
+    assert practised(made, Stage("primitive")) is made
+    assert practised(made, RECOVERY).reference.names == ways.names
+    both = practised(made, COMPOSER).reference
+    assert both.names == (*made.reference.names, *ways.names)
+    # Joined, every clip is what it was, also beyond its end.
+    for ref, first in ((made.reference, 0), (ways, own)):
+        clip = torch.arange(len(ref.names)).repeat_interleave(3)
+        frame = torch.tensor([0, 5, 10_000]).repeat(len(ref.names))
+        assert torch.equal(ref.gather_packed(clip, frame), both.gather_packed(clip + first, frame))
+        rows = ref.rows(clip, frame)
+        a = ref.follow(rows, clip, frame)[1]
+        assert torch.equal(a, both.follow(both.rows(clip + first, frame), clip + first, frame)[1])
+    # Of all episodes the share that the settings say are ways, however the library is drawn.
+    drawn = odds(made, COMPOSER, torch.tensor([3.0, 1, 0, 0, 0]).double(), both.length)
+    assert drawn[own:].sum() == pytest.approx(made.config.recovering.way_share)
+    assert drawn[0] == pytest.approx(3 * float(drawn[1])) and not drawn[2:own].any()
+    assert {r.when for r in staged(made, COMPOSER).task.rewards} == {"always"}
 
 
-@pytest.mark.parametrize("action", ["additive", "absolute"])
-def test_who_is_blindfolded_sees_and_does_as_who_recovers(action: str) -> None:
-    """The same state, the same goal: the same observation, and the same actions move it alike."""
-    own = recovering(action=action)
-    shown = demonstrations(own)
-    assert shown is not None and len(shown.reference.names) == 4
-    demo = shown.env(4, threads=1)
-    recovery = own.task.recovery
-    assert recovery is not None
-    blind = Blindfold(demo, recovery)
-    seen = blind.reset()
-    # The ends of the demonstrations as the references of who recovers.
-    other = replace(own, reference=shown.reference)
-    env: ImitationEnv = other.env(4, auto_reset=False, threads=1)
-    last = shown.reference.length - 1
-    env.reset_to(demo.clip, last[demo.clip], torch.full((4,), FALLEN))
-    s = demo.backend.state
-    env.backend.write(None, s.qpos.clone().double(), s.qvel.clone().double())
-    apart = (s.qpos[:, :3] - shown.reference.qpos[shown.reference.start + last][demo.clip, :3]).norm(
-        dim=-1
-    )
-    assert env.recoveries is not None
-    env.recoveries.before.copy_(apart)
-    assert torch.allclose(env._observe(), seen, atol=1e-4)
-    acts = 0.1 * torch.randn(4, demo.num_actions, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(blind.shifted(blind.shifted(acts), -1.0), acts, atol=1e-6)
-    env.step(acts)
-    before = demo.backend.state.qpos.clone()
-    done = blind.step(acts)
-    moved = ~(done.terminated | done.truncated)
-    assert bool(moved.any()) and not torch.equal(before, demo.backend.state.qpos)
-    there, here = env.backend.state.qpos[moved], demo.backend.state.qpos[moved]
-    assert torch.allclose(there, here, atol=1e-4)
-    blind.close()
-    env.close()
-
-
-def test_a_library_without_getting_up_has_nothing_to_show() -> None:
+def test_a_library_without_getting_up_comes_back_to_a_point() -> None:
     made = build(library(), tiny(recovery=True, **PLAIN))
-    assert demonstrations(staged(made, Stage("recovery", 2))) is None
-    none = recovering(recovering=replace(tiny().recovering, ways=0))
-    assert demonstrations(none) is None
+    assert made.ways is None and made.task.recovery is not None
+    none = replace(tiny().recovering, ways=0)
+    assert build(lively(), tiny(recovery=True, recovering=none, **PLAIN)).ways is None
+    assert build(lively(), tiny(recovery=False, **PLAIN)).ways is None
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +86,9 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
     whole, until = tmp_path / "whole", Until(iterations=8)
     went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
     own = begin(whole, lively(), config, earlier=went)
-    train(own, whole, until, show, 1, False, trained=tracker.policy)
+    done = train(own, whole, until, show, 1, False, trained=tracker.policy)
     assert list(dict.fromkeys(told)) == [("recovery", 2), ("composer", 3)]
-    assert (whole / WAYS).exists() and (whole / "recovery.safetensors").exists()
+    assert done.recovery is not None and (whole / "recovery.safetensors").exists()
     # The policy that was given is the first primitive, to the bit.
     after, before = load_policy(whole / "policy.safetensors"), tracker.policy
     assert isinstance(after.policy, Composer)
@@ -121,41 +104,54 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
         train(again, parts, until, cut, 1, False, trained=tracker.policy)
     other = load_policy(parts / "policy.safetensors").state()
     assert all(torch.equal(v, other[k]) for k, v in after.state().items())
-
-
-def test_killed_while_ways_are_learned_goes_on_with_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(returning, "SAVE_S", 0.0)
-    own = recovering(action="additive")
-    env = own.env(1, threads=1)
+    # On ways the last primitive is the composer's teacher.
+    env = staged(practised(own, COMPOSER), COMPOSER).env(2, threads=1)
+    owner = Owners(env, after, torch.zeros(len(own.library), dtype=torch.long)).owner
+    assert owner.tolist() == [0] * len(own.library) + [1] * 4
     env.close()
-    rng = torch.Generator().manual_seed(0)
-    first = first_column(env.num_obs, env.num_actions, (16,), std=0.05, generator=rng)
-    start = WarmStart(next_column(first, generator=rng))
-    pupil = next_column(first, "random", generator=rng)
-    whole = learn_returning(start, pupil, own, tmp_path / "whole", 1, Beginning())
-
-    def killed(stats: IterationStats, of: int) -> None:
-        assert stats.samples < of
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        learn_returning(start, pupil, own, tmp_path / "cut", 1, Beginning(way=killed))
-    seen: list[int] = []
-    tell = Beginning(way=lambda stats, of: seen.append(stats.samples))
-    again = learn_returning(start, pupil, own, tmp_path / "cut", 1, tell)
-    assert seen == [64] and whole.samples == again.samples > 64
-    # And no longer than the time allows.
-    short = learn_returning(
-        start, pupil, own, tmp_path / "short", 1, Beginning(), lambda samples, _: samples >= 32
-    )
-    assert whole.samples - short.samples == 32
-    other = again.policy.state()
-    assert all(torch.equal(v, other[k]) for k, v in whole.policy.state().items())
 
 
-def test_one_network_can_learn_both(tracker: Tracker) -> None:
-    config = going_on(tracker.config, replace(Perpetual(), recovery=True, single=True))
-    assert config.single and config.recovery
+def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
     assert going_on(tracker.config, Perpetual(recovery=False)).single
+    config = going_on(tracker.config, replace(tiny(recovery=True), single=True))
+    assert config.single and config.recovery
+    run, told = tmp_path / "run", []
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(run, lively(), config, earlier=went)
+    show = lambda p: told.append(p.stage.name)  # noqa: E731
+    done = train(own, run, Until(iterations=2), show, 1, False, trained=tracker.policy)
+    assert set(told) == {"single with recovery"} and done.recovery is not None
+    assert {r.kind for r in done.recovery.rows} == {"fallen", "far", "fallen and far"}
+    # What it knows of coming back goes with it.
+    learned = policy_of_run(run)
+    save_tracker(learned, tmp_path / "p.safetensors")
+    kept = load_tracker(tmp_path / "p.safetensors").ways
+    assert learned.ways is not None and kept is not None
+    for name, value in learned.ways.state().items():
+        assert torch.allclose(kept.state()[name], value, atol=1e-6)
+    again = try_recovery(reopen(run), learned.policy, 2, 1)
+    assert again.rows == try_recovery(reopen(run), learned.policy, 2, 1).rows
+
+
+def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:
+    """With a policy that hardly stands, so that it is lost; what comes out holds together."""
+    config = TrackConfig(recover=True)
+    with pytest.raises(PoiseError, match="has not learned to come back"):
+        track(tracker, swing(4.0, name="long"), config)
+    made = build(lively(), tiny(recovery=True, **PLAIN))
+    able = replace(tracker, ways=made.ways)
+    clip = swing(4.0, name="long")
+    done = track(able, clip, config)
+    again = track(able, clip, config)
+    assert (done.evaluation.recordings[0].qpos == again.evaluation.recordings[0].qpos).all()
+    assert done.losses is not None and done.failures[0] == (0, done.losses.lost[0])
+    frames = len(done.evaluation.recordings[0].qpos)
+    assert frames == int(done.imitation.reference.length[0]) == len(done.placed.qpos)
+    # Up to where it was lost everything is as without.
+    plain = track(able, clip)
+    upto = round(done.losses.lost[0] * 30)
+    a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
+    assert abs(a - b).max() < 1e-9
+    assert "lost the motion" in done.losses.sentence()
+    with pytest.raises(PoiseError, match="a single character"):
+        TrackConfig(recover=True, count=2)

@@ -50,8 +50,6 @@ def tiny(**changes: object) -> Perpetual:
             final_trials=2,
             seconds=(0.1, 0.2),
             ways=4,
-            way_samples=64,
-            taught=CloneConfig(steps=4, rounds=1, critic_steps=0),
         ),
         "convergence": ConvergenceConfig(patience=1),
         "style": STYLE,

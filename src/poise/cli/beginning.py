@@ -12,7 +12,7 @@ from poise.cli.progress import clock
 if TYPE_CHECKING:
     from poise.env import PathStats
     from poise.eval import ScoreCard
-    from poise.learn import CloneStats, IterationStats, PolicyBundle, WarmStart
+    from poise.learn import CloneStats, PolicyBundle, WarmStart
     from poise.recipes.expert import Beginning
     from poise.recipes.imitation import Imitation
 
@@ -39,14 +39,7 @@ def beginning(first: First | None = None) -> Beginning:
             f"help {s.help_n:.0f} N, {100 * s.unhelped:.0f} % without, {left} to go"
         )
 
-    def way(s: IterationStats, of: int) -> None:
-        left = clock(s.seconds / max(s.samples, 1) * (of - s.samples))
-        tell(
-            f"{clock(s.seconds)}  ways back: {s.samples:,} of {of:,} samples, {s.samples_per_s:,.0f} a "
-            f"second, {100 * s.failure_rate:.0f} % of the episodes fail, {left} to go"
-        )
-
-    return Beginning(expert, cloned_round, first, failed, path, way)
+    return Beginning(expert, cloned_round, first, failed, path)
 
 
 def first_delivery(

@@ -47,6 +47,8 @@ class Options:
     """Cores for --learn; 0 is all."""
     reset_on_fail: bool = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
+    recover: bool = False
+    """A character that is 0.5 m off gets up, walks back and goes on where the motion waits for it."""
     count: Annotated[int, arg(metavar="N")] = 1
     """Characters who do the motion side by side in one world, where they may collide."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
@@ -85,7 +87,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
     given = read(o.clip, o.reading)
     with working("opening the policy"):
         tracker = open_tracker(o.policy)
-    config = TrackConfig(noise, o.seed, o.reset_on_fail, o.reading.smooth, o.count)
+    config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
     with claimed(out):
         with working("tracking"):
             tracked = track(tracker, given, config)
@@ -149,6 +151,8 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         first = f", the first at {tracked.failures[0][1]:.1f} s" if fell else ""
         again = f"; they were put back {len(tracked.failures)} times" if fell and reset else ""
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
+    if tracked.losses is not None:
+        return tracked.losses.sentence()
     if not times:
         return f"Tracked to its end, {seconds:.1f} s, without help."
     if not reset:

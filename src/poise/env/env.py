@@ -9,7 +9,7 @@ from poise.control import Wrench
 from poise.env.acting import Acting
 from poise.env.bodies import Bodies
 from poise.env.budget import HelpBudget
-from poise.env.frame import Frame, ObsTerm, Pose, placed
+from poise.env.frame import Frame, Pose, placed
 from poise.env.means import Means
 from poise.env.moments import Hardness
 from poise.env.recoveries import Recoveries
@@ -152,6 +152,15 @@ class ImitationEnv:
         self._aim()
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
+    def take_up(self, reference: Reference, clip: Tensor, frame: Tensor) -> Tensor:
+        """Goes on with other motions of the same body, world i at `frame[i]` of `clip[i]`, both `(N,)`,
+        wherever it stands; returns observations. For environments without automatic restarts."""
+        self.reference = reference.to(self.device)
+        self.clip.copy_(clip)
+        self.frame.copy_(frame)
+        self._aim()
+        return self._observe()
+
     def _restart(self, ids: Tensor) -> None:
         odds = None if self.hardness is None else self.hardness.odds
         pick, frame = (x.to(self.device) for x in self._starts.draw(len(ids), odds))
@@ -257,19 +266,6 @@ class ImitationEnv:
         return failed, terminated, (seen.age >= self.task.horizon) & ~terminated
 
     # --- views --------------------------------------------------------------------------------
-
-    def next_hinges(self) -> Tensor:
-        """`(N, n)` rad, the reference's hinges after the next step, to which additive actions add."""
-        return self.reference.hinges[self._goal_rows]
-
-    def frame_now(self) -> Frame:
-        """What terms see of all worlds as they stand."""
-        return self._frame()
-
-    @property
-    def observed(self) -> tuple[ObsTerm, ...]:
-        """The terms of the observation, on this device."""
-        return self._terms.obs
 
     def pose(self) -> Pose:
         """The simulated characters now."""

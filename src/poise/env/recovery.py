@@ -45,8 +45,9 @@ class Recovery:
     continues: probability that a failed episode goes on. grace: control steps for which the reference
     waits then and for those who begin fallen. distance: m, from and to which characters begin far.
     by_area: that distance is uniform over the ring on the floor, not over the length. switch: m between
-    the roots, beyond which the goal is a point. reach: m, no point is told to be farther. settle:
-    control steps near the reference after which failures count again. drop: how the fallen fell.
+    the roots, beyond which the goal is a point; inf: it never is. reach: m, no point is told to be
+    farther. settle: control steps near the reference after which failures count again. drop: how the
+    fallen fell.
     """
 
     fallen: float = 0.3
@@ -71,7 +72,7 @@ class Recovery:
         low, high = self.distance
         if not 0 <= low <= high < math.inf:
             raise PoiseError(f"distance must rise from 0 or more, got {low:g} to {high:g}", "Recovery")
-        if not 0 < self.switch < self.reach:
+        if not 0 < self.switch < self.reach and self.switch < math.inf:
             raise PoiseError(
                 f"switch must lie above 0 and below reach, got {self.switch:g} and {self.reach:g} m",
                 "Recovery",

@@ -21,6 +21,11 @@ from poise.spatial import heading_quat, quat_mul, quat_rotate
 
 #: The fields of a pose in the order in which they are packed.
 FIELDS = tuple(f.name for f in fields(Pose))
+# What references have one of for each clip or each frame.
+_JOINED = (
+    "qpos", "qvel", "hinges", "length", "cyclic", "min_height", "cycle_turn", "cycle_travel", "body",
+    "_place", "_packed",
+)  # fmt: skip
 
 
 class Place(NamedTuple):
@@ -115,6 +120,20 @@ class Reference:
         there.moments = self.moments.to(device)
         there._fast = Kinematics(self.humanoid.table, torch.float32, device)
         return there
+
+    def joined(self, *others: Reference) -> Reference:
+        """The clips of this one and then those of others, which are for the same body and rate."""
+        parts, out = (self, *others), copy.copy(self)
+        for name in _JOINED:
+            setattr(out, name, torch.cat([getattr(p, name) for p in parts]))
+        out.names = tuple(name for p in parts for name in p.names)
+        out.start = torch.cumsum(out.length, 0) - out.length
+        out.any_cyclic = any(p.any_cyclic for p in parts)
+        rows = torch.tensor([0, *(len(p.qpos) for p in parts)]).cumsum(0).tolist()
+        out._after = torch.cat([p._after + row for p, row in zip(parts, rows, strict=False)])
+        cut = Moments.cut(out.length.cpu(), out.cyclic.cpu(), self.rate_hz)
+        out.moments = cut.to(self.qpos.device)
+        return out
 
     def _poses(self, qpos: Tensor, qvel: Tensor, body: Tensor) -> Pose:
         """The poses of frames, of which each is one of the body `body (F,)`."""

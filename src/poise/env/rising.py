@@ -1,110 +1,72 @@
-"""From lying to standing: by which poses, and how these follow one another."""
+"""From lying to standing: by which of a library's clips, and from which of its frames on."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.env.ways import LIES, Ways
+from poise.env.ways import Ways
 from poise.kin import Kinematics, lowest_height
-from poise.spatial import quat_conj, quat_distance, quat_mul, quat_rotate, slerp
+from poise.spatial import quat_distance, quat_mul, quat_rotate, slerp
 from poise.spatial.turns import turned, yaw_quat
 
 #: s that a blend takes, and m of the distance between poses that are blended in a second more.
 BLEND_S, BLEND_SPEED = 0.4, 1.0
 #: m: no limb that would reach into the floor lifts who is blended higher.
 LIFT = 0.12
-#: s of rolling over, m that who rolls moves for each rad, m^2 that it counts where ways are compared.
-ROLL_S, ROLLS, TOPPLES = 1.2, 0.15, 0.16
-#: m that a rad of the bodies' rotations counts, where poses are compared.
-TURNED = 0.3
+#: m that a rad of the bodies' rotations counts, and a s that is up later, where poses are compared.
+TURNED, LATER = 0.3, 0.1
+#: Of the height of who stands: where the root is no higher above its lowest, somebody still lies.
+ENTERS = 0.1
 
 
 class Rising:
     """How the characters of a library get up from anywhere.
 
-    A clip that gets up is entered at the frame that is nearest to how somebody lies. Where none is near,
-    as for who lies prone and knows only how to get up from the back, it goes up to a low pose of the
-    library, such as on hands and knees, topples over to a side from there, which takes little more
-    than gravity, and rolls on to where the clip is near.
+    Of all clips that get up, the one is taken that has the frame nearest to how somebody lies, from
+    there on. A library needs one from the back and one from the belly.
     """
 
     def __init__(self, ways: Ways, table: BodyTable, rate_hz: float):
         self.ways, self.table, self.rate_hz = ways, table, rate_hz
         self._ups = [Poses(table, clip) for clip in ways.ups]
-        self._lows = Poses(table, ways.lows) if len(ways.lows) else None
-        # A clip is entered while it lies: what comes later needs what came before.
+        # A clip is entered while its root lies: what comes later needs what came before.
         for up in self._ups:
-            up.keep(up.pos[..., 2].amax(-1) < LIES * float(ways.ease[2]))
-        over = self._on_floor(self._rolled(ways.lows, math.pi))
-        self._over = [Poses(table, over).apart(up) ** 2 if len(over) else None for up in self._ups]
+            height = up.pos[:, 0, 2]
+            up.keep(height <= height.min() + ENTERS * float(ways.ease[2]))
 
-    def up(self, start: Tensor, which: int = 0, side: float = 1.0) -> Tensor:
-        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of the clip `which` that gets up.
+    def up(self, start: Tensor) -> Tensor:
+        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up."""
+        lying, clips = Poses(self.table, start[None]), self.ways.ups
+        costs = [
+            # Of two frames alike the later one is up sooner.
+            lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
+            for up, clip in zip(self._ups, clips, strict=True)
+        ]
+        which = min(range(len(clips)), key=lambda k: float(costs[k].min()))
+        entry = int(self._ups[which].rows[int(costs[which].argmin())])
+        clip = self._laid(start, clips[which][entry:])
+        return torch.cat((self._lifted(self.blend(start, clip[0]))[:-1], clip))
 
-        side: 1 or -1, over which side is rolled, where that is needed.
-        """
-        which %= len(self.ways.ups)
-        clip, over = self.ways.ups[which], self._over[which]
-        lying = Poses(self.table, start[None])
-        direct, parts = lying.apart(self._ups[which])[0] ** 2, []
-        entry, at = int(direct.argmin()), start
-        if self._lows is not None and over is not None:
-            through = lying.apart(self._lows)[0, :, None] ** 2 + TOPPLES + over
-            if float(through.min()) < float(direct.min()):
-                via, entry = divmod(int(through.argmin()), through.shape[1])
-                low = self._laid(start, self.ways.lows[via : via + 1])[0]
-                roll = self._roll(low, side)
-                parts, at = [self._blend(start, low)[:-1], roll[:-1]], roll[-1]
-        clip = self._laid(at, clip[int(self._ups[which].rows[entry]) :])
-        frames = torch.cat((*parts, self._blend(at, clip[0])))
-        return torch.cat((self._on_floor(frames, LIFT)[:-1], clip))
+    def blend(self, a: Tensor, b: Tensor) -> Tensor:
+        """`(T, 7 + n)` from one pose to another, the longer the farther they are apart."""
+        gap = float(Poses(self.table, a[None]).apart(Poses(self.table, b[None])))
+        count = round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)) + 1
+        share = smooth(torch.linspace(0, 1, count, dtype=torch.float64))
+        return mixed(a.expand(count, -1), b.expand(count, -1), share)
 
-    def _roll(self, low: Tensor, side: float) -> Tensor:
-        """From a low pose over a side until what was up is down."""
-        count = round(self.rate_hz * ROLL_S)
-        angle = side * math.pi * smooth(torch.linspace(0, 1, count + 1, dtype=torch.float64))
-        frames = low.expand(count + 1, -1).clone()
-        frames = self._rolled(frames, angle)
-        axis = quat_rotate(low[3:7], self._along)
-        # It rolls to where what is up goes: w x Z.
-        frames[:, 0] += ROLLS * angle * axis[1]
-        frames[:, 1] -= ROLLS * angle * axis[0]
-        return self._on_floor(frames)
-
-    @property
-    def _along(self) -> Tensor:
-        """The body's long axis, as the root has it: what is up in who stands."""
-        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        return quat_rotate(quat_conj(self.ways.ease[3:7]), up)
-
-    def _rolled(self, qpos: Tensor, angle: Tensor | float) -> Tensor:
-        """Frames turned about their long axes by `angle` rad."""
-        half = 0.5 * torch.as_tensor(angle, dtype=torch.float64).expand(len(qpos)).unsqueeze(-1)
-        turn = torch.cat((half.cos(), half.sin() * self._along), -1)
-        out = qpos.clone()
-        out[:, 3:7] = quat_mul(qpos[:, 3:7], turn)
-        return out
-
-    def _on_floor(self, frames: Tensor, most: float = math.inf) -> Tensor:
-        """Frames raised or lowered until they touch the floor, by no more than `most` m up."""
+    def _lifted(self, frames: Tensor) -> Tensor:
+        """Frames raised or lowered until they touch the floor, by no more than `LIFT` m up."""
         body, out = Kinematics(self.table)(frames), frames.clone()
-        if len(frames):
-            lift = -lowest_height(self.table, body.pos, body.quat).amin(-1)
-            out[:, 2] += lift.clamp(max=most)
+        lift = -lowest_height(self.table, body.pos, body.quat).amin(-1)
+        out[:, 2] += lift.clamp(max=LIFT)
         return out
 
     def _laid(self, onto: Tensor, frames: Tensor) -> Tensor:
         """Frames moved and turned so that the first lies on the pose `onto`."""
         own, there = (Poses(self.table, q[None]) for q in (frames[0], onto))
         return turned(frames, float(there.turn(own)), own.centre[0], there.centre[0])
-
-    def _blend(self, a: Tensor, b: Tensor) -> Tensor:
-        gap = float(Poses(self.table, a[None]).apart(Poses(self.table, b[None])))
-        return blend(a, b, round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)))
 
 
 class Poses:
@@ -142,12 +104,6 @@ class Poses:
             faces = quat_distance(quat_mul(yaw, other.quat), self.quat[i].expand_as(yaw))
             out[i] = (far + TURNED * faces).mean(-1)
         return out
-
-
-def blend(a: Tensor, b: Tensor, frames: int) -> Tensor:
-    """`(frames + 1, 7 + n)` from one pose to another."""
-    share = smooth(torch.linspace(0, 1, frames + 1, dtype=torch.float64))
-    return mixed(a.expand(frames + 1, -1), b.expand(frames + 1, -1), share)
 
 
 def mixed(a: Tensor, b: Tensor, share: Tensor) -> Tensor:

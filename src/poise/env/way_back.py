@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.rising import Rising, blend, mixed, smooth
+from poise.env.rising import Rising, mixed, smooth
 from poise.env.ways import Ways
 from poise.spatial import quat_mul
 from poise.spatial.turns import facing, heading_angle, yaw_quat
@@ -30,50 +30,46 @@ TURN, HERE, FACING = 2.0, 0.08, 0.1
 #: Of a walk's pace: what is gained and lost in a step, and where all of the walk is seen; steps on the
 #: spot while turning.
 FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
-#: s: at ease after getting up, and at the end.
-EASE_S, STAY_S = 0.5, 1.0
+#: Share of the height of who stands at ease, below which the root of who must get up is.
+DOWN = 0.6
+#: s: at ease at the end.
+STAY_S = 1.0
 #: Steps after which a walk gives up.
 LONGEST = 600
 
 
-def way_back(
-    rising: Rising, start: Tensor, place: Tensor, which: int = 0, phase: float = 0.0, lies: bool = False
-) -> Tensor:
+def way_back(rising: Rising, start: Tensor, place: Tensor, which: int = 0, phase: float = 0.0) -> Tensor:
     """The frames `(T, 7 + n)` from `start (7 + n)` to standing at ease at `place (7 + n)`.
 
-    rising: how this library gets up, and what else it knows. which: of the walks and of the clips that
-    get up. phase: 0 to 1, where in its cycle the walk begins. lies: whether `start` lies and gets up
-    first; else it stands at ease already.
+    rising: how this library gets up, and what else it knows. which: of the walks. phase: 0 to 1, where
+    in its cycle the walk begins.
     """
-    parts, ways, rate = [], rising.ways, rising.rate_hz
-    if lies:
-        body = rising.up(start, which, 1.0 if phase < 0.5 else -1.0)
-        start = facing(ways.ease, heading_angle(body[-1, 3:7]))
-        start[:2] = body[-1, :2]
-        parts += [body, blend(body[-1], start, round(EASE_S * rate))[1:]]
-    return torch.cat((*parts, _walk(ways, start, place, rate, which, phase)))
+    ways, body = rising.ways, start[None]
+    if float(start[2]) < DOWN * float(ways.ease[2]):
+        body = rising.up(start)
+    stand = facing(ways.ease, heading_angle(body[-1, 3:7]))
+    stand[:2] = body[-1, :2]
+    walk = _walk(ways, stand, place, rising.rate_hz, which, phase)
+    return torch.cat((body[:-1], rising.blend(body[-1], stand), walk))
 
 
-def return_motions(rising: Rising, falls: Tensor, far: float, count: int, seed: int) -> list[np.ndarray]:
-    """`count` ways back to standing at ease at the origin: every other one from lying, of which two
-    fifths are away, too, and the rest from standing up to `far` m away. falls: `(K, 7 + n)`."""
+def return_motions(
+    rising: Rising, falls: Tensor, far: float, count: int, seed: int
+) -> dict[str, np.ndarray]:
+    """`count` ways back to standing at ease at the origin by name: every other one from lying, of which
+    two fifths are away, too, and the rest from standing up to `far` m away. falls: `(K, 7 + n)`."""
     rng, ways = torch.Generator().manual_seed(seed), rising.ways
     place = facing(ways.ease, heading_angle(ways.ease[3:7]))
-    motions: list[np.ndarray] = []
+    motions: dict[str, np.ndarray] = {}
     for i, u in enumerate(torch.rand(count, 6, dtype=torch.float64, generator=rng).tolist()):
         lies = i % 2 == 1
         away = far * u[0] ** 0.7 if not lies or u[1] < 0.4 else 0.0
         bearing = 2 * math.pi * u[2]
         start = falls[i // 2 % len(falls)].clone() if lies else facing(ways.ease, 2 * math.pi * u[3])
         start[0], start[1] = away * math.cos(bearing), away * math.sin(bearing)
-        which = int(u[5] * 1000)
-        motions.append(way_back(rising, start, place, which, u[4], lies).numpy())
+        way = way_back(rising, start, place, int(u[5] * 1000), u[4])
+        motions[f"{'fallen' if lies else 'far'}-{i // 2}"] = way.numpy()
     return motions
-
-
-def names_of(count: int) -> list[str]:
-    """Of what `return_motions` gives."""
-    return [f"{'fallen' if i % 2 else 'far'}-{i // 2}" for i in range(count)]
 
 
 def _walk(ways: Ways, start: Tensor, place: Tensor, rate_hz: float, which: int, phase: float) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -11,32 +12,42 @@ from torch import Tensor
 from poise.env.reference import Reference
 from poise.kin import close_cycle
 from poise.spatial import heading_quat, into_heading, quat_angle, quat_between
-from poise.spatial.turns import turned
+from poise.spatial.turns import heading_angle, turned
 
 #: Shares of the height of who stands: lower lies, at least so high stands again.
 LIES, STANDS = 0.5, 0.9
-#: Of that height, where the root of who is on hands and knees may be; so many such poses are enough.
-LOW, LOWS = (0.3, 0.6), 1000
 #: m/s: no part of who lies moves faster, on average; s: no longer is got up.
 STILL, UP_S = 0.6, 6.0
 #: s of a walk's cycle, m/s of its travel, rad that it may turn.
-CYCLE_S, TRAVEL, STRAIGHT = (0.8, 1.5), (0.7, 1.6), 0.35
-#: What a m/s counts beside a m, where two frames of a cycle are compared.
-SPEED_COUNTS = 0.1
+CYCLE_S, TRAVEL, STRAIGHT = (0.8, 1.5), (0.7, 1.4), 0.35
+#: What a m/s counts beside a m, where two frames of a cycle are compared, and m within which it closes.
+SPEED_COUNTS, CLOSES = 0.1, 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Ways:
     """What a library knows of coming back, coordinates `(F, 7 + n)` float64.
 
-    ease: `(7 + n)`, a body that stands. lows: `(V, 7 + n)`, poses between lying and standing of who
-    hardly moves. walks: each a closed cycle along +X. ups: from lying to standing.
+    ease: `(7 + n)`, a body that stands. walks: each a closed cycle along +X. ups: from lying to
+    standing.
     """
 
     ease: Tensor
-    lows: Tensor
     walks: tuple[Tensor, ...]
     ups: tuple[Tensor, ...]
+
+    def state(self) -> dict[str, Tensor]:
+        """All of it by name, for `of`."""
+        named = {f"walk {k:03}": q for k, q in enumerate(self.walks)}
+        return {"ease": self.ease, **named, **{f"up {k:03}": q for k, q in enumerate(self.ups)}}
+
+    @classmethod
+    def of(cls, state: Mapping[str, Tensor]) -> Ways:
+        """From `state()`."""
+        walks, ups = (
+            tuple(state[k] for k in sorted(state) if k.startswith(kind)) for kind in ("walk ", "up ")
+        )
+        return cls(state["ease"], walks, ups)
 
 
 def find_ways(
@@ -44,21 +55,21 @@ def find_ways(
 ) -> Ways | None:
     """The ways of a library; None if nobody walks steadily in it or nobody gets up.
 
-    ease: (clip, frame) of who stands. walking: `(C,)` bool, clips that walk or stand. most: walks, and
-    clips that get up, of the best of each.
+    ease: (clip, frame) of who stands. walking: `(C,)` bool, clips that walk or stand. most: walks, the
+    fastest of those that close and face as walks mostly do, which leaves out who walks backwards.
     """
     clip, frame = ease
     stand = reference.qpos[int(reference.start[clip]) + frame].cpu()
     walks = [found for c in walking.nonzero().squeeze(-1).tolist() if (found := _cycle(reference, c))]
-    ups = [found for c in range(len(reference.length)) if (found := _gets_up(reference, c, stand))]
+    clips = range(len(reference.length))
+    ups = [up for c in clips if (up := _gets_up(reference, c, stand)) is not None]
     if not walks or not ups:
         return None
-    return Ways(
-        stand,
-        _lows(reference, stand),
-        tuple(q for _, q in walks[:most]),
-        tuple(q for _, q in ups[:most]),
-    )
+    faces = [heading_angle(q[:, 3:7]) for _, q in walks]
+    usual = math.atan2(sum(map(math.sin, faces)), sum(map(math.cos, faces)))
+    ahead = [w for w, face in zip(walks, faces, strict=True) if math.cos(face - usual) > 0]
+    ahead.sort(key=lambda w: (max(w[0], CLOSES), -float(w[1][-1, 0]) / len(w[1])))
+    return Ways(stand, tuple(q for _, q in ahead[:most]), tuple(ups))
 
 
 def _cycle(reference: Reference, clip: int) -> tuple[float, Tensor] | None:
@@ -88,8 +99,8 @@ def _cycle(reference: Reference, clip: int) -> tuple[float, Tensor] | None:
     return gap, _along_x(closed)
 
 
-def _gets_up(reference: Reference, clip: int, stand: Tensor) -> tuple[float, Tensor] | None:
-    """How fast a clip lies, m/s, and its frames from there until it stands; None if it never does."""
+def _gets_up(reference: Reference, clip: int, stand: Tensor) -> Tensor | None:
+    """A clip's frames from where it lies most still until it stands; None if it never does."""
     rows, rate = _rows(reference, clip), reference.rate_hz
     pos, vel = reference.pose.pos[rows].cpu(), reference.pose.linvel[rows].cpu()
     top, height = pos[..., 2].amax(-1), float(stand[2])
@@ -104,16 +115,7 @@ def _gets_up(reference: Reference, clip: int, stand: Tensor) -> tuple[float, Ten
         return None
     # Until it stands still, or the clip ends.
     end = best[2] + int(speed[best[2] : best[2] + round(rate)].argmin())
-    return best[0], reference.qpos[rows][best[1] : end + 1].cpu()
-
-
-def _lows(reference: Reference, stand: Tensor) -> Tensor:
-    """Frames that are low and slow, no more than `LOWS` of them, evenly spread."""
-    height = reference.pose.pos[:, 0, 2].cpu() / float(stand[2])
-    low = (height > LOW[0]) & (height < LOW[1])
-    slow = reference.pose.linvel.cpu().norm(dim=-1).mean(-1) < STILL
-    rows = (low & slow).nonzero().squeeze(-1)
-    return reference.qpos.cpu()[rows[:: max(1, -(-len(rows) // LOWS))]]
+    return reference.qpos[rows][best[1] : end + 1].cpu()
 
 
 def _rows(reference: Reference, clip: int) -> slice:

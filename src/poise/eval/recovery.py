@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, Recovery, TaskConfig
+from poise.env.guide import Guide
 from poise.env.recovery import FALLEN, FAR
+from poise.env.ways import Ways
 from poise.errors import PoiseError
 from poise.eval.episodes import Acts
 from poise.eval.field_paper import PHC_RECOVERY
@@ -92,15 +94,20 @@ class RecoveryCard:
         )
 
 
-def trial_task(task: TaskConfig, distance: float = 3.0, falls: int = 1000) -> TaskConfig:
+def trial_task(
+    task: TaskConfig, distance: float = 3.0, falls: int = 1000, guided: bool = False
+) -> TaskConfig:
     """The task in which recovery is tried: far is exactly `distance` m, and nothing ends or begins anew.
 
-    falls: different fallen characters. The rest of `task.recovery` stays: a policy must see a point goal
-    where it learned to; a task without recovery gets the paper's.
+    falls: different fallen characters. guided: by ways, so that no goal is a point and no reference
+    waits. The rest of `task.recovery` stays: a policy must see a point goal where it learned to; a task
+    without recovery gets the paper's.
     """
     recovery = task.recovery or Recovery.phc()
     drop = replace(recovery.drop, count=falls)
     recovery = replace(recovery, distance=(distance, distance), by_area=False, drop=drop)
+    if guided:
+        recovery = replace(recovery, switch=math.inf, grace=0)
     return replace(task, auto_reset=False, recovery=recovery)
 
 
@@ -118,6 +125,7 @@ def recovery_card(
     held: float = 0.5,
     seed: int = 4242,
     at_once: int = 250,
+    ways: Ways | None = None,
 ) -> RecoveryCard:
     """Trials of every kind with a deterministic policy.
 
@@ -127,6 +135,8 @@ def recovery_card(
             before the trials goes on standing on its last frame. It waits for the fallen as in training.
         near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
         at_once: trials that are simulated side by side.
+        ways: leads the policy back by them (`env.guide`), where the task is for that; by default it is
+            told a point.
 
     Raises:
         PoiseError: a kind that there is not, a clip that there is not, or a task without recovery.
@@ -148,7 +158,8 @@ def recovery_card(
         steps = math.ceil(max(seconds) * rate) + stay - 1
         for kind in kinds:
             parts = -(-trials // env.num_envs)
-            apart = [_trial(env, policy, clip, frame, KINDS[kind], steps) for _ in range(parts)]
+            trial = (clip, frame, KINDS[kind], steps, ways)
+            apart = [_trial(env, policy, *trial) for _ in range(parts)]
             back = back_after(torch.cat(apart)[:trials] < near, stay) / rate
             rows.append(_row(kind, back, seconds))
         name, distance = env.reference.names[clip], env.recoveries.config.distance
@@ -173,15 +184,22 @@ def back_after(near: Tensor, stay: int) -> Tensor:
     return torch.where(runs.any(1), first.double(), math.inf)
 
 
-def _trial(env: ImitationEnv, policy: Acts, clip: int, frame: int, kind: int, steps: int) -> Tensor:
+def _trial(
+    env: ImitationEnv, policy: Acts, clip: int, frame: int, kind: int, steps: int, ways: Ways | None
+) -> Tensor:
     """Mean distance of the bodies from their reference after each step, m `(N, steps)` on the CPU."""
-    many = env.clip.new_ones(env.num_envs)
+    many, reference, guide = env.clip.new_ones(env.num_envs), env.reference, None
     obs = env.reset_to(clip * many, frame * many, kind * many)
+    if ways is not None:
+        policy = guide = Guide(env, policy, ways)
+        obs = guide.lead(torch.arange(env.num_envs))
     apart = []
     for _ in range(steps):
         obs = env.step(policy.act(obs)).final_obs
-        ref = env.reference.gather(env.clip, env.frame)
+        ref = reference.gather(clip * many, env.frame if guide is None else guide.frame)
         apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+    if guide is not None:
+        env.take_up(reference, clip * many, frame * many)
     return torch.stack(apart, 1)
 
 

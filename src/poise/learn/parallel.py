@@ -107,7 +107,7 @@ def joined() -> Iterator[Comm]:
     # Its functions have the group that there is when it is imported as a default argument. Imported by
     # an optimizer while there is one, they keep that group and its threads beyond the group's end, and
     # such a thread that gives back a tensor while Python ends aborts the process.
-    import torch.distributed.nn  # noqa: F401
+    import torch.distributed.nn
 
     dist, cuda = torch.distributed, torch.cuda.is_available()
     if cuda:

@@ -20,7 +20,6 @@ from poise.learn import (
     LATEST,
     CloneConfig,
     CloneStats,
-    IterationStats,
     PolicyBundle,
     PPOConfig,
     Trainer,
@@ -45,7 +44,7 @@ class Beginning:
 
     expert: the expert's own score. round: each round of cloning. cloned: the clone, once it is saved.
     failed: why the run begins without an expert. path: each iteration of a search for paths, and of how
-    many it is one. way: each iteration in which ways back are learned, and of how many control steps.
+    many it is one.
     """
 
     expert: Callable[[ScoreCard], None] | None = None
@@ -53,7 +52,6 @@ class Beginning:
     cloned: Callable[[PolicyBundle, WarmStart], None] | None = None
     failed: Callable[[str], None] | None = None
     path: Callable[[PathStats, int], None] | None = None
-    way: Callable[[IterationStats, int], None] | None = None
 
 
 def begin_training(

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
+from poise.env.ways import Ways
 from poise.errors import PoiseError
 from poise.kin import FitReport
 from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, VecEnv, WarmStart
@@ -24,6 +25,7 @@ class Imitation:
     """A library with a body, ready to be learned.
 
     config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
+    ways: what the library knows of coming back, where that is learned by it.
     """
 
     library: ClipLibrary
@@ -32,6 +34,7 @@ class Imitation:
     report: FitReport
     config: Any
     task: TaskConfig
+    ways: Ways | None = None
 
     def env(
         self,

@@ -16,6 +16,8 @@ from poise.motion.io.text import read_head
 
 #: Files that hold part of a motion beside them: its skeleton, its numbers.
 COMPANIONS = (".asf", ".bin")
+#: Ends of the names of clips that are a recording's image, the later one first.
+BACKWARDS, MIRRORED = "-backwards", "-mirrored"
 #: Suffixes that other files than motions have too, so that their content must tell.
 _COMMON = (".txt", ".json", ".csv", ".npz")
 _CMU_TAKE = re.compile(r"-(\d{1,3})_\d{1,3}(?!\d)")
@@ -85,7 +87,7 @@ def subject_of(name: str) -> str:
     "cmu 02" for a take such as `02_01` below a folder whose name has "cmu" in it, "subject 1" where the
     name says so, else the folders before the last "-".
     """
-    name = name.removesuffix("-backwards").removesuffix("-mirrored")
+    name = name.removesuffix(BACKWARDS).removesuffix(MIRRORED)
     take = _CMU_TAKE.search(name)
     if take and "cmu" in name[: take.start()].lower():
         return f"cmu {int(take[1]):02d}"

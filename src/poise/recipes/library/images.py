@@ -7,7 +7,7 @@ from poise.motion import Clip
 from poise.motion.edits import backwards
 from poise.motion.mirror import mirrored_clip
 from poise.recipes.library.clips import LibraryConfig, Target, set_down
-from poise.recipes.library.files import matches, subject_of
+from poise.recipes.library.files import BACKWARDS, MIRRORED, matches, subject_of
 
 
 def images(clip: Clip, target: Target, config: LibraryConfig) -> list[Clip]:
@@ -18,7 +18,7 @@ def images(clip: Clip, target: Target, config: LibraryConfig) -> list[Clip]:
     """
     both = [clip, mirror_image(clip, target, config)] if config.mirror else [clip]
     if matches(config.backwards, clip.name, subject_of(clip.name)):
-        both += [backwards(c).replaced(name=f"{c.name}-backwards") for c in both]
+        both += [backwards(c).replaced(name=c.name + BACKWARDS) for c in both]
     return both
 
 
@@ -35,4 +35,4 @@ def mirror_image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
         example = None if target.example is None else mirrored_clip(target.example)
         seen, _ = retarget(seen, target.example or target.skeleton, example=example)
     seen, _ = set_down(seen, target, config)
-    return seen.replaced(skeleton=clip.skeleton, name=f"{clip.name}-mirrored", cyclic=clip.cyclic)
+    return seen.replaced(skeleton=clip.skeleton, name=clip.name + MIRRORED, cyclic=clip.cyclic)

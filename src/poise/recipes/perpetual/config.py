@@ -25,10 +25,9 @@ class RecoveryPlan:
 
     share: of the whole training, what the recovery primitive has at least; of a single network it is
     taken from the part without recovery. falls: different fallen characters to begin from.
-    ways: demonstrations of coming back, made of the library's own clips, by which the primitive is
-    taught where somebody gets up in it and somebody walks, see `env.way_back`; 0 does without.
-    way_samples: control steps in which they are learned first, in half of the stage's time at most.
-    taught: how the primitive is cloned then.
+    ways: demonstrations of coming back, made of the library's own clips where somebody gets up in it and
+    somebody walks, see `env.guide`; 0 learns to come back to a point, as the paper does. way_share: of
+    the episodes of who tracks and recovers, how many are of them.
     trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
     final_trials: with the finished policy. seconds: within which who is back is counted; the last one
     decides. enough: share of all trials with which recovery is learned.
@@ -37,12 +36,7 @@ class RecoveryPlan:
     share: float = 0.15
     falls: int = 512
     ways: int = 768
-    way_samples: int = 6_000_000
-    taught: CloneConfig = field(
-        default_factory=lambda: CloneConfig(
-            steps=100, rounds=7, epochs=(6, 4), noise=(0.0, 0.5, 1.5), minibatch=4096, critic_steps=0
-        )
-    )
+    way_share: float = 0.5
     trials: int = 32
     final_trials: int = 100
     seconds: tuple[float, ...] = (5.0, 10.0)
@@ -54,9 +48,9 @@ class RecoveryPlan:
             raise PoiseError(what, "RecoveryPlan")
         if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
             raise PoiseError("recovery needs falls, trials and seconds", "RecoveryPlan")
-        if self.ways < 0 or self.way_samples < 1:
-            what = f"ways must be at least 0 and way_samples 1, got {self.ways} and {self.way_samples}"
-            raise PoiseError(what, "RecoveryPlan")
+        if self.ways < 0 or not 0 < self.way_share < 1:
+            what = f"got {self.ways} ways and a way_share of {self.way_share:g}"
+            raise PoiseError(what, "RecoveryPlan", "None or more, and a share between 0 and 1")
 
 
 @dataclass(frozen=True)

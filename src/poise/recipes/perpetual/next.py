@@ -32,14 +32,14 @@ from poise.recipes.perpetual.paths import find_paths
 from poise.recipes.perpetual.plan import first_stage
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import walking_clips
-from poise.recipes.perpetual.returning import Enough, learn_returning, never
+from poise.recipes.perpetual.returning import odds, practised
 from poise.recipes.perpetual.task import Perpetual, stage_task
 from poise.sim import UnstableError
 
 #: The folder in a run folder with worlds that went bad.
 DUMPS = "dumps"
-#: What follows a policy that training goes on from, where recovery is learned.
-SECOND = Stage("recovery", 2)
+#: What follows a policy that training goes on from, where recovery is learned by primitives or not.
+SECOND = {"primitive": Stage("recovery", 2), "single": Stage("single", 2, mixed=True)}
 
 
 def begin_first(
@@ -48,12 +48,10 @@ def begin_first(
     folder: Path,
     tell: Beginning,
     trained: PolicyBundle | None = None,
-    enough: Enough = never,
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
     folder: of the run, where the search for paths is kept. trained: a single network that goes on.
-    enough: see `learn_returning`.
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
@@ -62,11 +60,13 @@ def begin_first(
         env = own.env(1, threads=1)
         env.close()
         start = WarmStart(trained.first_actions(env.num_actions).clipped(own.ppo().obs_clip))
-        if stage.kind != "primitive":
+        if not config.recovery:
             return stage, start
-        # What is trained already is the first primitive, and recovery comes next.
-        known = replace(start, policy=columns_of(start.policy, config.lateral))
-        return SECOND, begin_recovery(known, imitation, 2, threads, folder, tell, enough)
+        if stage.kind == "primitive":
+            # What is trained already is the first primitive.
+            known = replace(start, policy=columns_of(start.policy, config.lateral))
+            start = begin_recovery(known, imitation, 2)
+        return SECOND[stage.kind], start
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None
     start = None
@@ -109,17 +109,16 @@ def _joint(sized: Imitation) -> PolicyBundle:
 
 def begin_stage(
     before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
-    folder: Path, tell: Beginning, enough: Enough = never,
+    dumps: Path | None, tell: Beginning,
 ) -> WarmStart:  # fmt: skip
     """What a later stage starts from: one primitive more, a composer, or the same network.
 
     before: what the last stage learned, with its critic, which goes on. owner: see `begin_composer`.
-    folder: of the run. enough: see `learn_returning`.
     """
     if stage.kind == "composer":
-        return begin_composer(before, staged(imitation, stage), owner, threads, folder / DUMPS, tell)
+        return begin_composer(before, imitation, stage, owner, threads, dumps, tell)
     if stage.kind == "recovery":
-        return begin_recovery(before, imitation, stage.number, threads, folder, tell, enough)
+        return begin_recovery(before, imitation, stage.number)
     if stage.kind == "primitive":
         return begin_primitive(before, imitation.config, stage.number)
     return before
@@ -138,34 +137,23 @@ def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmSt
     return replace(before, policy=next_column(before.policy, config.start, generator=rng))
 
 
-def begin_recovery(
-    before: WarmStart, imitation: Imitation, number: int, threads: int, folder: Path, tell: Beginning,
-    enough: Enough = never,
-) -> WarmStart:  # fmt: skip
-    """The recovery primitive: taught ways back where the library has any, or as the one before it."""
-    start = begin_primitive(before, imitation.config, number)
-    own = replace(imitation, task=stage_task(imitation.config, imitation.humanoid, "primitive"))
-    rng = make_generator(imitation.config.seed, f"recovery {number}")
-    # What is told to who recovers is so unlike a frame to track that a copy learns it later.
-    pupil = next_column(before.policy, "random", generator=rng)
-    try:
-        return learn_returning(start, pupil, own, folder, threads, tell, enough)
-    except UnstableError as problem:
-        if tell.failed is not None:
-            tell.failed(str(problem))
-        return start
+def begin_recovery(before: WarmStart, imitation: Imitation, number: int) -> WarmStart:
+    """The recovery primitive: as the one before it where it tracks ways back, else as any primitive."""
+    config: Perpetual = imitation.config
+    config = config if imitation.ways is None else replace(config, start="copy")
+    return begin_primitive(before, config, number)
 
 
 def begin_composer(
-    before: WarmStart, imitation: Imitation, owner: Tensor, threads: int, dumps: Path | None,
-    tell: Beginning,
+    before: WarmStart, imitation: Imitation, stage: Stage, owner: Tensor, threads: int,
+    dumps: Path | None, tell: Beginning,
 ) -> WarmStart:  # fmt: skip
     """The composer over all primitives, taught at first to do as the primitive that learned the clip,
-    and as the last one, that of recovery, for who is far.
+    and as the last one, that of recovery, on ways back or for who is far.
 
-    imitation: with the task of the composer's stage. owner: `(C,)`, the primitive of each clip.
+    owner: `(C,)`, the primitive of each clip of the library.
     """
-    config: Perpetual = imitation.config
+    config, own = imitation.config, staged(practised(imitation, stage), stage)
     rng = make_generator(config.seed, "composer")
     parts = (config.combine, config.weights, config.composer_hidden, config.ppo.std)
     combine, weights, hidden, std = parts
@@ -173,9 +161,9 @@ def begin_composer(
     policy = compose(before.policy, combine, weights, hidden, std, generator=rng)
     if not config.composer_clone:
         return replace(before, policy=policy)
-    env = unhelped(imitation).env(
-        min(config.num_envs, CLONE_WORLDS), threads=threads, dumps=dumps, help_scale=0.0
-    )
+    env = own.env(min(config.num_envs, CLONE_WORLDS), threads=threads, dumps=dumps, help_scale=0.0)
+    seconds = (imitation.reference.length.cpu() - 1).double()
+    env.weights = odds(imitation, stage, seconds, own.reference.length)
     # Choosing among primitives is learned sooner than acting; the critic goes on from them.
     settings = clone_config(imitation)
     settings = replace(settings, rounds=min(1, settings.rounds), critic_steps=0)
@@ -197,14 +185,16 @@ def begin_composer(
 class Owners:
     """Acts for each world as the primitive that learned its clip: a teacher for the composer.
 
-    Where the task knows recovery, the last primitive acts for whoever is so far from the reference, or
-    fallen below it, that the goal is a point, which is what the composer can see.
+    owner: `(C,)`; clips beyond are ways back, on which the last primitive acts. Where the task knows
+    point goals it does for whoever is so far from the reference, or fallen below it, that the goal is
+    a point, which is what the composer can see.
     """
 
     def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor):
         assert isinstance(policy.policy, Composer)
         self.env, self.norm, self.primitives = env, policy.norm, policy.policy.primitives
-        self.owner = owner.to(env.device)
+        ways = len(env.reference.length) - len(owner)
+        self.owner = torch.cat((owner, owner.new_full((ways,), len(self.primitives) - 1))).to(env.device)
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -228,17 +218,18 @@ def make_trainer(
     config: Perpetual = imitation.config
     # Another stage draws other starts and noise.
     seed = (config.seed + 1_000_003 * (stage.number - 1)) % 2**31
-    own = staged(imitation, stage)
+    own = staged(practised(imitation, stage), stage)
     own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
     ppo = finetuning(own.ppo()) if warm else own.ppo()
     return own.trainer(threads, dumps, warm_start=start, ppo=ppo, device=device, style=config.style)
 
 
 def staged(imitation: Imitation, stage: Stage) -> Imitation:
-    """The task of a stage: whether it recovers, and that no success changes a composer's help."""
-    task = stage_task(imitation.config, imitation.humanoid, stage.recovers)
+    """The task of a stage: whether it knows point goals, and that what recovers learns without help and
+    no success changes a composer's."""
+    task = stage_task(imitation.config, imitation.humanoid, None if imitation.ways else stage.recovers)
     own = replace(imitation, task=task)
-    return unhelped(own) if stage.kind == "composer" else own
+    return unhelped(own) if stage.kind == "composer" or stage.recovers else own
 
 
 def clone_config(imitation: Imitation) -> CloneConfig:

@@ -107,10 +107,12 @@ def try_recovery(
     clip, frame = standing(imitation.reference)
     if isinstance(policy, PolicyBundle):
         policy = policy.copy().to(device)
-    tried = replace(imitation, task=trial_task(imitation.task, FAR, trials))
+    ways = imitation.ways
+    tried = replace(imitation, task=trial_task(imitation.task, FAR, trials, ways is not None))
     return recovery_card(
         lambda worlds: bare_env(tried, worlds, 0.0, threads, device),
         policy, trials, method=config.method, clip=clip, frame=frame, seconds=config.recovering.seconds,
+        ways=ways,
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ from poise.recipes.perpetual.stages import Course
 from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
 from poise.recipes.session import FINAL, RUN_FILE
 
-#: Least step size of a network that begins anew beside a policy that is done.
+#: Least step size where a policy that is done learns to come back.
 ANEW = 1e-4
 
 
@@ -64,12 +64,14 @@ def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
     done = {"expert": False, "paths": None, "help_start": 0.0}
     asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery")}
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
+    if wanted.recovery:
+        # What the policy ended with is too careful for who learns something new.
+        ppo = replace(ppo, policy_lr=max(ppo.policy_lr, ANEW))
     if wanted.recovery and not wanted.single:
         # Primitives have the sizes of the network that becomes the first of them.
         asked |= {"single": False, "multiplicative": True, "progressive": True}
         hidden = policy.single_hidden if policy.single else ppo.policy_hidden
-        # What the policy ended with is too careful for who begins.
-        ppo = replace(ppo, policy_hidden=hidden, policy_lr=max(ppo.policy_lr, ANEW))
+        ppo = replace(ppo, policy_hidden=hidden)
     return replace(policy, ppo=ppo, **done, **asked)
 
 
@@ -198,7 +200,7 @@ def reopen(folder: Path) -> Imitation:
     if not config.recovery or _knows_recovery(folder):
         return imitation
     config = replace(config, recovery=False)
-    return replace(imitation, config=config, task=task(config, imitation.humanoid))
+    return replace(imitation, config=config, task=task(config, imitation.humanoid), ways=None)
 
 
 def _rebuilt(folder: Path) -> Imitation:

@@ -37,7 +37,6 @@ from poise.recipes.perpetual.judge import Judge, Judged
 from poise.recipes.perpetual.ledger import Ledger
 from poise.recipes.perpetual.next import (
     DUMPS,
-    SECOND,
     begin_first,
     begin_stage,
     critic_of,
@@ -47,12 +46,10 @@ from poise.recipes.perpetual.next import (
 from poise.recipes.perpetual.plan import ends, following, is_over, lasts, most_help, primitives
 from poise.recipes.perpetual.progress import Progress, Stage, share_of
 from poise.recipes.perpetual.recovery import check_falls
-from poise.recipes.perpetual.returning import Enough
+from poise.recipes.perpetual.returning import odds
 from poise.recipes.perpetual.task import Perpetual
 from poise.recipes.perpetual.trouble import Troubles
 
-#: Of the time of recovery, what demonstrations of it may take.
-WAYS_SHARE = 0.5
 #: What is left of the policy's step size at the end of a stage that cools.
 COLD = 0.1
 
@@ -90,8 +87,7 @@ class Course:
             remove_partial(folder)
         else:
             check_falls(imitation)
-            how = trained, self._enough(SECOND, 0.0)
-            stage, start = begin_first(imitation, threads, folder, self.tell, *how)
+            stage, start = begin_first(imitation, threads, folder, self.tell, trained)
             warm = start is not None and (start.critic is not None or trained is not None)
             if stage.kind == "recovery":
                 self.ledger.begin(members_of(stage, torch.zeros(0), imitation))
@@ -132,7 +128,9 @@ class Course:
     @property
     def helps(self) -> float | Tensor:
         """What is left of it in each group of `Perpetual.help_by`, or a number for all."""
-        return self.env.help.left if self.imitation.task.residual is not None else 0.0
+        if self.imitation.task.residual is None or self.stage.recovers is not None:
+            return 0.0
+        return self.env.help.left
 
     @property
     def primitives(self) -> int:
@@ -209,7 +207,7 @@ class Course:
     def _judge(self, over: bool) -> Judged:
         """Evaluates the present policy. over: the stage's time is."""
         judged = self.judge.judge(self.stage, self.trainer.policy(), self.helps, over, self.iteration)
-        self.env.weights = self.ledger.mining.weights()
+        self._use_odds()
         return judged
 
     # --- stages -------------------------------------------------------------------------------
@@ -230,7 +228,7 @@ class Course:
             self.finished = True
             return None
         before = WarmStart(policy, critic_of(t), t.samples, t.seconds)
-        where = (self.threads, self.folder, self.tell, self._enough(follows, self.share))
+        where = (self.threads, self.dumps, self.tell)
         start = begin_stage(before, self.imitation, follows, ledger.owner, *where)
         # A composer and what recovers learn without help; a primitive's clips keep what they have.
         scale = self.helps if follows.kind == "primitive" else 0.0
@@ -243,19 +241,18 @@ class Course:
             self.trainer.style.load_learned(t.style.state())
         return follows
 
-    def _enough(self, stage: Stage, begins: float) -> Enough:
-        """Says when half of the time of a stage that begins at this share of the training is over."""
-        limit = begins + WAYS_SHARE * (ends(self.config, stage, begins) - begins)
-        done = self.iteration if hasattr(self, "trainer") else 0
-        return lambda samples, seconds: share_of(self.until, done, samples, seconds) >= limit
-
     def _enter(self, stage: Stage, start: WarmStart | None, warm: bool, scale: float | Tensor) -> None:
         """Makes the stage's trainer, with the share `scale` of the help, or each group's own `(G,)`."""
         self.stage, self.warm = stage, warm
         where = (self.threads, self.dumps, self.device)
         self.trainer: Trainer = make_trainer(self.imitation, stage, start, warm, *where)
         self.env.help.set(scale)
-        self.env.weights = self.ledger.mining.weights()
+        self._use_odds()
+
+    def _use_odds(self) -> None:
+        """Clips are drawn by what is known of them."""
+        library, length = self.ledger.mining.weights(), self.env.reference.length
+        self.env.weights = odds(self.imitation, self.stage, library, length)
 
     # --- persistence --------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
 | fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_recovery`    |
 | P^(F) on Q^loco; interleaved recovery             | `recipes.perpetual.recovery`                |
+| in place of them, by default: ways back           | `env.guide`, `recipes.perpetual.returning`  |
 | Eqs. 5, 6 multiplicative composer                 | `learn.compose`, `nets.Composer`            |
 | Sec. 4, success: mean distance within 0.5 m       | `recipes.perpetual.eval`                    |
 | the authors' later single network                 | `Perpetual.single`                          |
@@ -39,14 +40,16 @@ from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual, RecoveryPlan
 from poise.recipes.perpetual.progress import Recovers
+from poise.recipes.perpetual.returning import known_ways
 from poise.recipes.perpetual.shapes import shaped
 
 __all__ = ["RECIPE", "Perpetual", "RecoveryPlan", "build", "stage_task", "task"]
 
 
-def task(config: Perpetual, humanoid: Humanoid) -> TaskConfig:
-    """Imitation as terms, as the finished policy knows it: with point goals if it learned recovery."""
-    return stage_task(config, humanoid, "composer" if config.recovery else None)
+def task(config: Perpetual, humanoid: Humanoid, guided: bool = False) -> TaskConfig:
+    """Imitation as terms, as the finished policy knows it: with point goals if it learned recovery by
+    them. guided: it learned ways back, which are tracked as all motions."""
+    return stage_task(config, humanoid, "composer" if config.recovery and not guided else None)
 
 
 def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None) -> TaskConfig:
@@ -135,7 +138,9 @@ def build(
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
-    built = Imitation(library, humanoid, reference, report, config, task(config, humanoid))
+    ways = known_ways(config, reference)
+    own = task(config, humanoid, guided=ways is not None)
+    built = Imitation(library, humanoid, reference, report, config, own, ways)
     return shaped(built, config.shapes, lambda body: task(config, body))
 
 

@@ -20,8 +20,10 @@ from torch import Tensor
 from poise import __version__
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
+from poise.env.ways import Ways
 from poise.errors import PoiseError
 from poise.learn import PolicyBundle, load_checkpoint, save_checkpoint
+from poise.learn.state import under
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.imitation import Imitation
@@ -38,7 +40,7 @@ SHIPPED = Path(__file__).parents[2] / "data/tracker.safetensors"
 EXAMPLE_FRAMES = 300
 #: The largest number of half precision.
 _HALF_MAX = torch.finfo(torch.float16).max
-_EXAMPLE = "example/"
+_EXAMPLE, _WAYS = "example/", "ways/"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,8 @@ class Tracker:
     policy: acts deterministically on raw observations. humanoid: the body, its model with the physics
     settings. example: a clip on the body's skeleton, which tells how it stands. config: the settings by
     which it was trained. about: "clips" (names), "stage", "samples", "seconds", "help_n" (what help the
-    training still gave), "poise" (the version that wrote it).
+    training still gave), "poise" (the version that wrote it). ways: by which the policy comes back
+    where it has lost a motion; None if it has not learned that.
     """
 
     policy: PolicyBundle
@@ -56,6 +59,7 @@ class Tracker:
     example: Clip
     config: Perpetual
     about: Mapping[str, Any]
+    ways: Ways | None = None
 
     @property
     def target(self) -> Target:
@@ -118,7 +122,8 @@ def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
         "help_n": float(said["help_limit"]),
         "poise": __version__,
     }
-    return Tracker(policy, imitation.humanoid, imitation.library.clips[0], imitation.config, about)
+    example = imitation.library.clips[0]
+    return Tracker(policy, imitation.humanoid, example, imitation.config, about, imitation.ways)
 
 
 def export_policy(run: Path, path: Path) -> Tracker:
@@ -144,7 +149,10 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
         "about": dict(tracker.about),
         **tracker.policy.identity(tracker.humanoid.identity),
     }
-    save_checkpoint(path, {**tensors, **{_EXAMPLE + k: v for k, v in small.items()}}, meta)
+    tensors |= {_EXAMPLE + k: v for k, v in small.items()}
+    if tracker.ways is not None:
+        tensors |= {_WAYS + k: v.float() for k, v in tracker.ways.state().items()}
+    save_checkpoint(path, tensors, meta)
 
 
 def load_tracker(path: Path) -> Tracker:
@@ -172,6 +180,8 @@ def load_tracker(path: Path) -> Tracker:
         bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
         bundle.load_state(tensors)
         about, character = meta["about"], meta["character"]
+        told = {k: v.double() for k, v in under(_WAYS.rstrip("/"), tensors).items()}
+        ways = Ways.of(told) if told else None
     except (PoiseError, KeyError, TypeError, ValueError, AttributeError):
         raise foreign from None
     if humanoid.identity != character:
@@ -183,7 +193,7 @@ def load_tracker(path: Path) -> Tracker:
         )
     config.sim.apply(humanoid.model)
     bundle.meta = {"samples": about.get("samples", 0), "seconds": about.get("seconds", 0.0)}
-    return Tracker(bundle, humanoid, example, config, about)
+    return Tracker(bundle, humanoid, example, config, about, ways)
 
 
 def _check_kind(meta: Mapping[str, Any], path: Path) -> None:

@@ -28,6 +28,7 @@ from poise.recipes.track.clip import Placed, place
 from poise.recipes.track.crowd import crowd_env, places
 from poise.recipes.track.points import fitted, follow
 from poise.recipes.track.policy import Tracker
+from poise.recipes.track.recovering import Losses, with_returns
 
 #: Characters in one world.
 MOST = 64
@@ -40,7 +41,8 @@ class TrackConfig:
     """How a motion is tracked.
 
     noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
-    failed is put back onto the reference. smooth_hz: cut-off of a low-pass on keypoints.
+    failed is put back onto the reference. recover: it gets up, comes back and goes on, while the motion
+    waits, see `env.guide`; for one character. smooth_hz: cut-off of a low-pass on keypoints.
     count: characters who do the motion side by side in one world, see `track.crowd`. threads: of the
     physics.
     """
@@ -48,6 +50,7 @@ class TrackConfig:
     noise: tuple[Noise, ...] = ()
     seed: int = 0
     reset_on_fail: bool = False
+    recover: bool = False
     smooth_hz: float | None = None
     count: int = 1
     threads: int = 1
@@ -55,6 +58,9 @@ class TrackConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST:
             raise PoiseError(f"there can be 1 to {MOST} characters, got {self.count}")
+        if self.recover and (self.reset_on_fail or self.count > 1):
+            what = "several characters" if self.count > 1 else "one that is put back onto the motion"
+            raise PoiseError(f"only a single character comes back by itself, not {what}")
 
 
 @dataclass(frozen=True)
@@ -84,8 +90,9 @@ class Tracked:
 
     imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
     placed: the motion on the body. failures: (character, seconds) of each failure in the order of time;
-    without `reset_on_fail` at most one per character. clean: what the noise changed, None without
-    noise. notes: sentences on the input and the noise.
+    without `reset_on_fail` and `recover` at most one per character. clean: what the noise changed, None
+    without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
+    was lost and found again; None where it was not.
     """
 
     tracker: Tracker
@@ -95,6 +102,7 @@ class Tracked:
     failures: tuple[tuple[int, float], ...]
     clean: Clean | None
     notes: tuple[str, ...]
+    losses: Losses | None = None
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -125,7 +133,10 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
     goals = imitation.reference.pose.pos
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
-    keeper = Keeper(tracker.policy, config.reset_on_fail)
+    acts, losses = tracker.policy, None
+    if config.recover and (found := with_returns(tracker, placed, imitation, config.threads)):
+        placed, imitation, acts, losses = found
+    keeper = Keeper(acts, config.reset_on_fail)
 
     def make_env(worlds: int) -> ImitationEnv:
         if worlds > 1:
@@ -162,7 +173,9 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
         )
     evaluation = Evaluation(card, rollouts, recordings)
     times = tuple((who, frame / rate) for who, frame in frames)
-    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes))
+    if losses is not None:
+        times = tuple((0, t) for t in losses.lost)
+    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses)
 
 
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
@@ -180,7 +193,8 @@ def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
     library = ClipLibrary(tuple(p.clip for p in placed), (1.0,) * len(placed))
     names = [p.clip.name for p in placed]
     reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)
-    return Imitation(library, humanoid, reference, placed[0].report, config, task(config, humanoid))
+    own = task(config, humanoid, guided=tracker.ways is not None)
+    return Imitation(library, humanoid, reference, placed[0].report, config, own, tracker.ways)
 
 
 def side_by_side(imitation: Imitation, count: int) -> Imitation:
