@@ -27,7 +27,7 @@ from poise.motion import Clip, ClipLibrary
 from poise.nets import Composer
 from poise.recipes.imitation import Imitation
 from poise.recipes.library.clips import LibraryConfig
-from poise.recipes.library.files import matches, subject_of
+from poise.recipes.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.recipes.library.folder import library_of
 from poise.recipes.perpetual import run as perpetual_run
 from poise.recipes.perpetual.eval import ClipResults, evaluate_clips
@@ -173,7 +173,7 @@ def library_task(run: Run, clips: ClipLibrary) -> Imitation:
 
 def recorded(names: Sequence[str]) -> tuple[list[int], list[int]]:
     """Indices of clips as they were recorded, and of those that were made of them."""
-    made = [i for i, n in enumerate(names) if n.endswith(("-mirrored", "-backwards"))]
+    made = [i for i, n in enumerate(names) if n.endswith((MIRRORED, BACKWARDS))]
     return [i for i in range(len(names)) if i not in set(made)], made
 
 
@@ -239,7 +239,8 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
     humanoid, config = run.imitation.humanoid, run.imitation.config
     still = np.tile(relaxed_stance(humanoid).qpos, (30, 1))
     reference = Reference(humanoid, [still], config.sim.control_hz, ["standing at ease"])
-    task = trial_task(run.imitation.task, falls=trials)
+    ways = run.imitation.ways
+    task = trial_task(run.imitation.task, falls=trials, guided=ways is not None)
 
     def make(worlds: int) -> ImitationEnv:
         backend = make_backend(humanoid.model, worlds, threads=threads)
@@ -247,8 +248,9 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
         env.help.set(0.0)
         return env
 
-    card = recovery_card(make, run.policy, trials, method=run.name, kinds=(kind,))
-    return card.to_dict() | {"learned": run.imitation.task.recovery is not None}
+    card = recovery_card(make, run.policy, trials, method=run.name, kinds=(kind,), ways=ways)
+    learned = ways is not None or run.imitation.task.recovery is not None
+    return card.to_dict() | {"learned": learned, "ways": ways is not None}
 
 
 def recovery_kinds() -> tuple[str, ...]:

@@ -131,7 +131,9 @@ def _recovery(part: Mapping[str, Any]) -> list[str]:
         )
         rows.append((kind, str(card["trials"]), *(_percent(x) for x in card["within"]), *ends))
     learned = (
-        "Recovery was part of the training."
+        "Who has lost the reference is led back by a way; such ways were part of the training."
+        if card.get("ways")
+        else "Recovery was part of the training."
         if card.get("learned")
         else "This policy was never trained to recover."
     )
