@@ -107,7 +107,8 @@ class Guide:
         place = own.coordinates(self.clip[one], self.frame[one])[0][0].cpu()
         way = way_back(self.rising, self.env.backend.state.qpos[world].double().cpu(), place)
         way = torch.cat((way[:-1], self.rising.blend(way[-1], place)))
-        return Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"way {world}"])
+        found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"way {world}"])
+        return found.to(self.env.device)
 
     def _entry(self, clip: int, frame: int) -> int:
         """A frame of a clip, `frame` or a later one, from which it is easily gone on."""

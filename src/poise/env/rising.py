@@ -12,7 +12,11 @@ from poise.spatial import quat_distance, quat_mul, quat_rotate, slerp
 from poise.spatial.turns import turned, yaw_quat
 
 #: s that a blend takes, and m of the distance between poses that are blended in a second more.
-BLEND_S, BLEND_SPEED = 0.4, 1.0
+BLEND_S, BLEND_SPEED = 0.4, 1.5
+#: Times as fast as in its clip is got up, as somebody who wants to be back.
+QUICK = 1.25
+#: m: poses that are no farther apart are the same.
+SAME = 0.01
 #: m: no limb that would reach into the floor lifts who is blended higher.
 LIFT = 0.12
 #: m that a rad of the bodies' rotations counts, and a s that is up later, where poses are compared.
@@ -30,7 +34,8 @@ class Rising:
 
     def __init__(self, ways: Ways, table: BodyTable, rate_hz: float):
         self.ways, self.table, self.rate_hz = ways, table, rate_hz
-        self._ups = [Poses(table, clip) for clip in ways.ups]
+        self.ups = [_sooner(clip, QUICK) for clip in ways.ups]
+        self._ups = [Poses(table, clip) for clip in self.ups]
         # A clip is entered while its root lies: what comes later needs what came before.
         for up in self._ups:
             height = up.pos[:, 0, 2]
@@ -38,7 +43,7 @@ class Rising:
 
     def up(self, start: Tensor) -> Tensor:
         """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up."""
-        lying, clips = Poses(self.table, start[None]), self.ways.ups
+        lying, clips = Poses(self.table, start[None]), self.ups
         costs = [
             # Of two frames alike the later one is up sooner.
             lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
@@ -51,10 +56,21 @@ class Rising:
 
     def blend(self, a: Tensor, b: Tensor) -> Tensor:
         """`(T, 7 + n)` from one pose to another, the longer the farther they are apart."""
+        return self.out_of(a, b.expand(self._between(a, b), -1))
+
+    def out_of(self, pose: Tensor, frames: Tensor) -> Tensor:
+        """Frames of which the first ones come out of a pose, more of them the farther it is apart."""
+        count = self._between(pose, frames[0])
+        if count == 1:
+            return frames
+        first = frames[:count]
+        share = smooth(torch.arange(len(first), dtype=torch.float64) / (count - 1))
+        return torch.cat((mixed(pose.expand(len(first), -1), first, share), frames[count:]))
+
+    def _between(self, a: Tensor, b: Tensor) -> int:
+        """Frames from one pose to another; 1 where they are the same."""
         gap = float(Poses(self.table, a[None]).apart(Poses(self.table, b[None])))
-        count = round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)) + 1
-        share = smooth(torch.linspace(0, 1, count, dtype=torch.float64))
-        return mixed(a.expand(count, -1), b.expand(count, -1), share)
+        return round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)) + 1 if gap > SAME else 1
 
     def _lifted(self, frames: Tensor) -> Tensor:
         """Frames raised or lowered until they touch the floor, by no more than `LIFT` m up."""
@@ -104,6 +120,14 @@ class Poses:
             faces = quat_distance(quat_mul(yaw, other.quat), self.quat[i].expand_as(yaw))
             out[i] = (far + TURNED * faces).mean(-1)
         return out
+
+
+def _sooner(qpos: Tensor, times: float) -> Tensor:
+    """The same motion `times` as fast, to its last frame."""
+    last = len(qpos) - 1
+    at = torch.linspace(0, last, max(2, round(last / times) + 1), dtype=torch.float64)
+    low = at.long().clamp(max=last - 1)
+    return mixed(qpos[low], qpos[low + 1], at - low)
 
 
 def mixed(a: Tensor, b: Tensor, share: Tensor) -> Tensor:

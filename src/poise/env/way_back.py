@@ -9,7 +9,8 @@ It is a reference, not physics: blends float and sink, and feet slide in turns. 
 track such ways (`recipes.perpetual.returning`) finds what physics allows.
 
 Turning follows a unicycle: the heading turns toward the place at no more than `TURN` rad/s, and the
-walk's stride shortens by the cosine of what is left to turn.
+walk's stride shortens by the cosine of what is left to turn. To a place that is near and behind the walk
+is done from its end to its beginning.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ TURN, HERE, FACING = 2.0, 0.08, 0.1
 FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
 #: Share of the height of who stands at ease, below which the root of who must get up is.
 DOWN = 0.6
+#: m, cosine: a place that is no farther and no more ahead is come to backwards.
+NEAR, BEHIND = 1.2, -0.6
 #: s: at ease at the end.
 STAY_S = 1.0
 #: Steps after which a walk gives up.
@@ -50,7 +53,7 @@ def way_back(rising: Rising, start: Tensor, place: Tensor, which: int = 0, phase
     stand = facing(ways.ease, heading_angle(body[-1, 3:7]))
     stand[:2] = body[-1, :2]
     walk = _walk(ways, stand, place, rising.rate_hz, which, phase)
-    return torch.cat((body[:-1], rising.blend(body[-1], stand), walk))
+    return torch.cat((body[:-1], rising.out_of(body[-1], walk)))
 
 
 def return_motions(
@@ -80,12 +83,17 @@ def _walk(ways: Ways, start: Tensor, place: Tensor, rate_hz: float, which: int, 
     speed, faces = length * rate_hz / count, heading_angle(cycle[:-1, 3:7])
     at, goal, psi, aim = start[:2].numpy().copy(), place[:2].numpy(), heading_angle(start[3:7]), 0.0
     to, here, pace, stayed, k = phase * count, False, 0.0, 0, 0
+    left = goal - at
+    ahead = math.atan2(left[1], left[0]) - (psi - faces)
+    # To what is near and behind it is walked backwards.
+    way = -1 if math.hypot(*left) < NEAR and math.cos(ahead) < BEHIND else 1
     path, seen = [], []
     while stayed < STAY_S * rate_hz and k < LONGEST:
         left = goal - at
         apart = math.hypot(*left)
         here = here or apart < HERE
-        want = heading_angle(place[3:7]) if here else math.atan2(left[1], left[0]) + faces
+        toward = math.atan2(way * left[1], way * left[0])
+        want = heading_angle(place[3:7]) if here else toward + faces
         error = math.remainder(want - psi, 2 * math.pi)
         turn = max(-TURN, min(TURN, 4 * error))
         psi += turn / rate_hz
@@ -93,10 +101,9 @@ def _walk(ways: Ways, start: Tensor, place: Tensor, rate_hz: float, which: int, 
         done = here and abs(error) < FACING
         aim = 0.0 if done else max(stride, ON_SPOT * min(1.0, abs(turn) / TURN))
         pace += max(-SLOWER, min(FASTER, aim - pace))
-        forward = (_along(walk, to + pace) - _along(walk, to)) * (
-            stride / max(aim, 1e-9) if aim else 0.0
-        )
-        to += pace
+        forward = _along(walk, to + way * pace) - _along(walk, to)
+        forward *= stride / aim if aim else 0.0
+        to += way * pace
         heading = psi - faces
         at = at + forward * np.array([math.cos(heading), math.sin(heading)])
         path.append((*at, heading, psi))
