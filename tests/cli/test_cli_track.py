@@ -121,7 +121,9 @@ def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, ref
     refused("track", short, *given, "--noise", "jitter:lots", words=("must be a number",))
     refused("track", short, *given, "--seed", "-1", words=("--seed must",))
     refused("track", short, *given, "--count", "0", words=("--count must",))
-    refused("track", short, *given, "--recover", words=("has not learned to come back", "Leave --recover"))
+    refused(
+        "track", short, *given, "--recover", words=("has not learned to come back", "Leave --recover")
+    )
     refused("track", short, *given, "--recover", "--count", "2", words=("a single character",))
     one = ("--policy", file, "-o", tmp_path / "one.bvh", "--count", "2")
     refused("track", short, *one, words=("several files",))
