@@ -10,7 +10,7 @@ from typing import Any
 
 from poise.errors import PoiseError
 from poise.eval.field_card import FieldTable, markdown
-from poise.eval.field_paper import paper_rows
+from poise.eval.field_paper import PHC_RECOVERY, paper_rows
 
 #: Subjects that are named one by one.
 NAMED = 60
@@ -106,9 +106,13 @@ def _figures(parts: Mapping[str, Any]) -> list[str]:
     noisy = parts.get("noisy", {}).get("table")
     if noisy:
         out.append(f"- Files of real pose estimators: {_share(noisy['succ'])} of {noisy['episodes']}.")
+    told = {r.start: r for r in PHC_RECOVERY if r.method == "PHC"}
     for kind, row in parts.get("recovery", {}).get("kinds", {}).items():
         shares = " and ".join(_share(x) for x in row["within"])
-        out.append(f"- Recovery, {kind}: {shares} back in 5 and 10 s, {row['trials']} trials.")
+        paper = f"{told[kind].succ_5s:.1f} and {told[kind].succ_10s:.1f} %"
+        out.append(
+            f"- Recovery, {kind}: {shares} back in 5 and 10 s, {row['trials']} trials (PHC: {paper})."
+        )
     speed = parts.get("speed")
     if speed:
         one = speed["one"]
