@@ -114,7 +114,7 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
 def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
     assert going_on(tracker.config, Perpetual(recovery=False)).single
     config = going_on(tracker.config, replace(tiny(recovery=True), single=True))
-    assert config.single and config.recovery
+    assert config.single and config.recovery and config.recovering.ways == 4
     run, told = tmp_path / "run", []
     went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
     own = begin(run, lively(), config, earlier=went)

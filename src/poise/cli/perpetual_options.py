@@ -32,6 +32,9 @@ class Primitives:
     """perpetual: rotations tells of places and rotations, keypoints of places alone."""
     recovery: bool = True
     """perpetual: fallen and far characters learn to get up and come back; so nobody does."""
+    ways: bool = True
+    """perpetual: they follow ways that are made of the library's clips, where somebody gets up in it and
+    somebody walks; so they are told a point to come back to, as in the paper."""
     multiplicative: bool = True
     """perpetual: a composer combines primitives; so there is one network of their size."""
     progressive: bool = True
@@ -82,6 +85,8 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         expert=training.expert,
         body=body.config(),
     )
+    if not primitives.ways:
+        config = replace(config, recovering=replace(config.recovering, ways=0))
     if not primitives.style:
         config = replace(config, style=None)
     return config if training.envs is None else replace(config, num_envs=training.envs)
@@ -92,7 +97,7 @@ def check_going_on(primitives: Primitives, body: Body, library: Library) -> None
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    own = {name: getattr(primitives, name) for name in ("recovery", "single", "going_on")}
+    own = {name: getattr(primitives, name) for name in ("recovery", "ways", "single", "going_on")}
     plain = Primitives(**own)
     names = [f.name for f in fields(plain) if getattr(primitives, f.name) != getattr(plain, f.name)]
     names += [f.name for f in fields(body) if getattr(body, f.name) != getattr(Body(), f.name)]

@@ -49,7 +49,7 @@ class Earlier:
 
 def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    who learns, with which seed, and whether recovery is learned. Where it is, the policy stays as it
+    who learns, with which seed, and whether and how recovery is learned. Where it is, the policy stays as it
     is, the first primitive of more, unless one network is to learn both. Observations are clipped no
     nearer than at `WIDE` deviations.
 
@@ -63,6 +63,7 @@ def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
         )
     done = {"expert": False, "paths": None, "help_start": 0.0}
     asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery")}
+    asked["recovering"] = replace(policy.recovering, ways=wanted.recovering.ways)
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
     if wanted.recovery:
         # What the policy ended with is too careful for who learns something new.
