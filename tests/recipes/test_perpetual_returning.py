@@ -21,6 +21,7 @@ from poise.recipes.perpetual.recovery import try_recovery
 from poise.recipes.perpetual.returning import demonstrations, odds, practised
 from poise.recipes.perpetual.run import Earlier, begin, going_on, reopen, resume, train
 from poise.recipes.track import TrackConfig, track
+from poise.recipes.track.learning import learn
 from poise.recipes.track.policy import Tracker, load_tracker, policy_of_run, save_tracker
 from toy_human import swing
 
@@ -153,5 +154,8 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
     assert abs(a - b).max() < 1e-9
     assert "lost the motion" in done.losses.sentence()
+    # Who learns the motion still knows its ways back.
+    learned = learn(able, plain.placed, tmp_path / "learned", 0.01, threads=1)
+    assert learned.tracker.ways is able.ways
     with pytest.raises(PoiseError, match="a single character"):
         TrackConfig(recover=True, count=2)

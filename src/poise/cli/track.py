@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,7 +90,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
     with claimed(out):
         with working("tracking"):
-            tracked = track(tracker, given, config)
+            # What is to be learned is the motion alone.
+            tracked = track(tracker, given, replace(config, recover=o.recover and not o.learn))
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
                 return 130

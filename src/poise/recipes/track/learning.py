@@ -77,4 +77,5 @@ def learn(
     result = train(
         imitation, folder, Until(minutes=minutes), on_iteration, threads, False, trained=tracker.policy
     )
-    return Learned(tracker_of(folder, imitation), result)
+    # It knows its ways back as before, or nearly.
+    return Learned(replace(tracker_of(folder, imitation), ways=tracker.ways), result)
