@@ -49,9 +49,9 @@ class Earlier:
 
 def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    who learns, with which seed, and whether and how recovery is learned. Where it is, the policy stays as it
-    is, the first primitive of more, unless one network is to learn both. Observations are clipped no
-    nearer than at `WIDE` deviations.
+    who learns, with which seed, and whether and how recovery is learned. Where it is, the policy stays
+    as it is, the first primitive of more, unless one network is to learn both. Observations are clipped
+    no nearer than at `WIDE` deviations.
 
     Raises:
         PoiseError: the policy is made of primitives.
