@@ -30,7 +30,7 @@ from poise.recipes.library.clips import LibraryConfig
 from poise.recipes.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.recipes.library.folder import library_of
 from poise.recipes.perpetual import run as perpetual_run
-from poise.recipes.perpetual.eval import ClipResults, evaluate_clips
+from poise.recipes.perpetual.eval import ClipResults, bare_env, evaluate_clips
 from poise.recipes.session import RUN_FILE
 from poise.recipes.track import imitation_of
 from poise.recipes.track.clip import place
@@ -207,7 +207,8 @@ def table(
             yield run_episodes(make, policy, clip, torch.zeros_like(clip), cycles=1)[0]
 
     def make(worlds: int) -> ImitationEnv:
-        return task.env(worlds, auto_reset=False, threads=threads, help_scale=0.0)
+        # A world that goes bad after its character was lost is no reason to stop.
+        return bare_env(task, worlds, 0.0, threads, "cpu")
 
     return field_table(rollouts(), method=method, data=data)
 

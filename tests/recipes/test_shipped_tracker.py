@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from poise.env import Reference
+from poise.eval.recovery import KINDS
 from poise.motion import read_clip
 from poise.recipes.library.files import subject_of
-from poise.recipes.track import track
+from poise.recipes.perpetual.recovery import try_recovery
+from poise.recipes.track import TrackConfig, imitation_of, track
+from poise.recipes.track.clip import place
 from poise.recipes.track.policy import SHIPPED, Tracker, open_tracker
 from toy_policy import WALK
 
@@ -35,6 +40,28 @@ def test_the_embedded_walk_is_done_without_help(tracker: Tracker) -> None:
     card = tracked.evaluation.card
     assert not tracked.failures and card.succ == 1.0 and card.help.limit_n == 0.0
     assert card.mpjpe_mm < 60
+
+
+def test_it_gets_up_and_comes_back(tracker: Tracker) -> None:
+    assert tracker.ways is not None
+    still = tracker.ways.ease.expand(30, -1).numpy()
+    walk = imitation_of(tracker, [place(read_clip(WALK), tracker)])
+    stands = replace(walk, reference=Reference(tracker.humanoid, [still], 30.0, ["stands"]))
+    card = try_recovery(stands, tracker.policy, 8, threads=1)
+    assert {r.kind: r.within[1] >= 0.5 for r in card.rows} == dict.fromkeys(KINDS, True)
+
+
+def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
+    """A jump aside of 2 m in one frame, which nobody can do."""
+    clip = read_clip(WALK)
+    pos = clip.root_pos.copy()
+    pos[clip.frames // 2 :, 1] += 2.0
+    tracked = track(tracker, clip.replaced(root_pos=pos), TrackConfig(recover=True))
+    losses = tracked.losses
+    assert losses is not None and len(losses.back) == len(losses.lost)
+    assert "came back" in losses.sentence()
+    rows = tracked.evaluation.recordings[0].qpos
+    assert abs(rows[-1, :2] - tracked.placed.qpos[-1, :2]).max() < 0.5
 
 
 def test_a_held_out_take_is_followed_for_a_while(tracker: Tracker, data_dir: Path) -> None:

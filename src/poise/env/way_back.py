@@ -33,7 +33,7 @@ TURN, HERE, FACING = 2.0, 0.08, 0.1
 FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
 #: Share of the height of who stands at ease, below which the root of who must get up is.
 DOWN = 0.6
-#: m, cosine: a place that is no farther and no more ahead is come to backwards.
+#: m: what is no farther is come to at once. Cosine: backwards, where it is no more ahead.
 NEAR, BEHIND = 1.2, -0.6
 #: s: at ease at the end.
 STAY_S = 1.0
@@ -53,6 +53,9 @@ def way_back(rising: Rising, start: Tensor, place: Tensor, which: int = 0, phase
     stand = facing(ways.ease, heading_angle(body[-1, 3:7]))
     stand[:2] = body[-1, :2]
     walk = _walk(ways, stand, place, rising.rate_hz, which, phase)
+    if float((place[:2] - stand[:2]).norm()) > NEAR:
+        # Who walks far comes to stand first, since whoever sets off while getting up falls more often.
+        return torch.cat((body[:-1], rising.blend(body[-1], stand)[:-1], walk))
     return torch.cat((body[:-1], rising.out_of(body[-1], walk)))
 
 
