@@ -131,10 +131,12 @@ def _sooner(qpos: Tensor, times: float) -> Tensor:
 
 
 def mixed(a: Tensor, b: Tensor, share: Tensor) -> Tensor:
+    """Frames `(T, 7 + n)` between those of `a` and of `b`, by the shares `(T)` of `b`."""
     out = torch.lerp(a, b, share.unsqueeze(-1))
     out[:, 3:7] = slerp(a[:, 3:7], b[:, 3:7], share)
     return out
 
 
 def smooth(share: Tensor) -> Tensor:
+    """Shares from 0 to 1 that begin and end without speed, s^2 (3 - 2 s)."""
     return share * share * (3 - 2 * share)

@@ -3,7 +3,9 @@
 Getting up is hard to find by trial, and easy to learn from a clip of it. Of what a library knows of
 coming back (`env.ways`) a way is made for any start:
 
-    lying -> blended (`env.rising`) -> a clip that gets up -> at ease -> the walk, steered -> at ease
+    lying -> blended (`env.rising`) -> a clip that gets up -> the walk, steered -> at ease
+
+Before a walk to what is farther than `NEAR` it stands at ease, too.
 
 It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
 track such ways (`recipes.perpetual.returning`) finds what physics allows.

@@ -27,6 +27,7 @@ def facing(pose: Tensor, heading: float) -> Tensor:
 
 
 def yaw_quat(angle: Tensor) -> Tensor:
+    """`(..., 4)` wxyz float64, turns about Z by `angle (...)` rad."""
     half, none = 0.5 * angle.double(), torch.zeros_like(angle, dtype=torch.float64)
     return torch.stack((half.cos(), none, none, half.sin()), -1)
 

@@ -45,7 +45,8 @@ class Losses:
         times = "once" if len(self.lost) == 1 else f"{len(self.lost)} times"
         said = f"The character lost the motion {times}, first at {self.lost[0]:.1f} s,"
         if len(self.back) < len(self.lost):
-            return f"{said} and did not come back after {self.lost[-1]:.1f} s, where the result ends."
+            last = f"the loss at {self.lost[-1]:.1f} s"
+            return f"{said} and did not come back after {last}; the result ends where it was given up."
         away = sum(self.back) - sum(self.lost)
         return f"{said} and came back; the motion waited for it, and is {away:.1f} s longer in all."
 
