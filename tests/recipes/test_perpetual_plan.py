@@ -10,7 +10,15 @@ from poise.learn import CloneConfig
 from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual.clone import MOST, clone_for
 from poise.recipes.perpetual.config import RecoveryPlan
-from poise.recipes.perpetual.plan import ends, first_stage, following, is_over, lasts, most_help
+from poise.recipes.perpetual.plan import (
+    ends,
+    first_stage,
+    following,
+    is_over,
+    lasts,
+    most_help,
+    primitives,
+)
 from poise.recipes.perpetual.progress import Stage
 
 
@@ -37,6 +45,20 @@ def test_each_switch_has_its_stages() -> None:
         one = {switch: switch == "single"}
         assert path(Perpetual(**one)) == [name, f"{name} with recovery"]
         assert path(Perpetual(**one, recovery=False)) == [name]
+
+
+def test_where_the_first_primitive_recovers_none_of_its_own_does() -> None:
+    plan = RecoveryPlan(primitive="first", share=0.2)
+    known = Perpetual(recovering=plan, shares=(0.5, 0.8))
+    assert path(known) == ["primitive 1", "primitive 2", "primitive 3", "composer"]
+    assert path(known, fails=False) == ["primitive 1"]
+    last = Stage("composer", 4, mixed=True)
+    assert last.recovers == "composer" and primitives(known, last) == 3
+    assert primitives(Perpetual(), Stage("composer", 5, mixed=True)) == 3
+    assert primitives(known, Stage("primitive", 2)) == 2
+    assert [ends(known, Stage("primitive", k), 0.0) for k in (2, 3)] == pytest.approx([0.65, 0.8])
+    with pytest.raises(PoiseError, match="there must be another"):
+        Perpetual(recovering=plan, max_primitives=1)
 
 
 def test_what_recovers_is_told_by_the_stage() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_library import library, rises, tiny
+from toy_library import Scripted, library, rises, tiny
 
 from poise.errors import PoiseError
 from poise.learn import Until, load_policy
@@ -132,6 +132,66 @@ def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
         assert torch.allclose(kept.state()[name], value, atol=1e-6)
     again = try_recovery(reopen(run), learned.policy, 2, 1)
     assert again.rows == try_recovery(reopen(run), learned.policy, 2, 1).rows
+
+
+def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    config = going_on(tracker.config, tiny(recovery=True, max_primitives=2), returns=True)
+    assert config.recovering.primitive == "first" and config.max_primitives == 2
+    told: list[tuple[str, int]] = []
+
+    def show(p: Progress) -> None:
+        told.append((p.stage.name, p.clips))
+
+    whole, until = tmp_path / "whole", Until(iterations=8)
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(whole, lively(), config, earlier=went)
+    done = train(own, whole, until, show, 1, False, trained=tracker.policy)
+    # What was given is evaluated, and what it fails is learned by the second primitive.
+    rows = (whole / "success.csv").read_text().splitlines()[1:]
+    first = [r.split(",") for r in rows if r.split(",")[1] == "primitive 1"]
+    failed = sum(r[4] == "0" for r in first)
+    assert len(first) == len(own.library) and failed
+    assert told[0] == ("primitive 2", failed) and told[-1] == ("composer", len(own.library))
+    assert done.primitives == 2 and done.recovery is not None
+    policy = load_policy(whole / "policy.safetensors")
+    assert isinstance(policy.policy, Composer)
+    columns = policy.policy.primitives
+    for a, b in zip(
+        columns.column(0).parameters(), tracker.policy.policy.mean.parameters(), strict=True
+    ):
+        assert torch.equal(a, b)
+    # Killed before the first checkpoint, in each stage, and gone on with: the same.
+    parts = tmp_path / "parts"
+    begin(parts, lively(), config, earlier=went)
+    for stop in (1, 5, 99):
+        cut = lambda p, stop=stop: p.iteration < stop  # noqa: E731
+        train(resume(parts, config), parts, until, cut, 1, False, trained=tracker.policy)
+    after = policy.state()
+    other = load_policy(parts / "policy.safetensors").state()
+    assert all(torch.equal(v, other[k]) for k, v in after.items())
+    # The composer's teacher on ways is the one that was given.
+    env = staged(practised(own, COMPOSER), COMPOSER).env(2, threads=1)
+    owners = Owners(env, policy, torch.ones(len(own.library), dtype=torch.long), own=False)
+    assert owners.owner.tolist() == [1] * len(own.library) + [0] * 4
+    env.close()
+    # In a library in which nobody gets up, recovery is learned by a primitive of its own.
+    assert build(library(), config).config.recovering.primitive == "own"
+
+
+def test_a_policy_that_fails_nothing_is_done(
+    tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("judge", "result"):
+        path = f"poise.recipes.perpetual.{module}.evaluate_clips"
+        monkeypatch.setattr(path, Scripted(lambda *_: True))
+    config = going_on(tracker.config, tiny(recovery=True), returns=True)
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(tmp_path, lively(), config, earlier=went)
+    done = train(own, tmp_path, Until(iterations=8), None, 1, False, trained=tracker.policy)
+    assert done.solved and done.last is None and done.recovery is not None
+    assert policy_of_run(tmp_path).ways is not None
 
 
 def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:

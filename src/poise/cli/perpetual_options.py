@@ -45,7 +45,8 @@ class Primitives:
     """perpetual: joint targets as in the paper, or additive ones, with settings for hours on a CPU."""
     going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
     """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body;
-    with recovery it stays as it is, beside a primitive that recovers (--single: one network)."""
+    with recovery it stays as it is, beside a primitive that recovers or, where it can already, others
+    that learn what it fails (--single: one network)."""
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
@@ -92,12 +93,16 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
     return config if training.envs is None else replace(config, num_envs=training.envs)
 
 
-def check_going_on(primitives: Primitives, body: Body, library: Library) -> None:
-    """Refuses options whose say a policy has that training goes on from."""
+def check_going_on(primitives: Primitives, body: Body, library: Library, returns: bool = True) -> None:
+    """Refuses options whose say a policy has that training goes on from. returns: it comes back by ways
+    already, so that primitives may learn what it fails."""
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    own = {name: getattr(primitives, name) for name in ("recovery", "ways", "single", "going_on")}
+    free = ["recovery", "ways", "single", "going_on"]
+    if returns and primitives.recovery and primitives.ways and not primitives.single:
+        free.append("max_primitives")
+    own = {name: getattr(primitives, name) for name in free}
     plain = Primitives(**own)
     names = [f.name for f in fields(plain) if getattr(primitives, f.name) != getattr(plain, f.name)]
     names += [f.name for f in fields(body) if getattr(body, f.name) != getattr(Body(), f.name)]

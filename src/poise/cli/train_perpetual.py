@@ -50,9 +50,11 @@ def run(
 
         check_going_on(primitives, body, library)
         tracker = open_tracker(primitives.going_on)
+        returns = tracker.ways is not None
+        check_going_on(primitives, body, library, returns)
         if training.envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
-        config = going_on(tracker.config, config)
+        config = going_on(tracker.config, config, returns)
     imitation = begin(library, primitives, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result = training, None

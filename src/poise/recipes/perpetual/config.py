@@ -25,6 +25,8 @@ class RecoveryPlan:
 
     share: of the whole training, what the recovery primitive has at least; of a single network it is
     taken from the part without recovery. falls: different fallen characters to begin from.
+    primitive: which of them recovers: one of its "own", after those that track, or the "first", where
+    that is a policy that goes on and can come back already.
     ways: demonstrations of coming back, made of the library's own clips where somebody gets up in it and
     somebody walks, see `env.guide`; 0 learns to come back to a point, as the paper does. way_share: of
     the episodes of who tracks and recovers, how many are of them.
@@ -34,6 +36,7 @@ class RecoveryPlan:
     """
 
     share: float = 0.15
+    primitive: Literal["own", "first"] = "own"
     falls: int = 512
     ways: int = 768
     way_share: float = 0.5
@@ -160,6 +163,9 @@ class Perpetual:
             raise PoiseError(what, "Perpetual")
         if not 0 < self.help_share <= 1:
             raise PoiseError(f"help_share must lie in (0, 1], got {self.help_share}", "Perpetual")
+        if self.recovering.primitive == "first" and self.max_primitives < 2:
+            what = "where the first primitive recovers there must be another, got max_primitives=1"
+            raise PoiseError(what, "Perpetual")
         if self.goal == "keypoints" and self.action == "additive":
             what = "additive actions need the next frame's angles, of which keypoints tell nothing"
             raise PoiseError(what, hint="Take absolute actions, or rotations as the goal")

@@ -29,7 +29,7 @@ from poise.recipes.expert import CLONE_WORLDS, Beginning, clone_expert, finetuni
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.clone import clone_for
 from poise.recipes.perpetual.paths import find_paths
-from poise.recipes.perpetual.plan import first_stage
+from poise.recipes.perpetual.plan import first_stage, own_recovery
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import walking_clips
 from poise.recipes.perpetual.returning import odds, practised
@@ -51,7 +51,8 @@ def begin_first(
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
-    folder: of the run, where the search for paths is kept. trained: a single network that goes on.
+    folder: of the run, where the search for paths is kept. trained: a single network that goes on. As a
+    first primitive that recovers already it is done: its stage is over when it begins.
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
@@ -62,11 +63,13 @@ def begin_first(
         start = WarmStart(trained.first_actions(env.num_actions).clipped(own.ppo().obs_clip))
         if not config.recovery:
             return stage, start
-        if stage.kind == "primitive":
-            # What is trained already is the first primitive.
-            known = replace(start, policy=columns_of(start.policy, config.lateral))
-            start = begin_recovery(known, imitation, 2)
-        return SECOND[stage.kind], start
+        if stage.kind == "single":
+            return SECOND[stage.kind], start
+        # What is trained already is the first primitive.
+        known = replace(start, policy=columns_of(start.policy, config.lateral))
+        if not own_recovery(config):
+            return stage, known
+        return SECOND[stage.kind], begin_recovery(known, imitation, 2)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None
     start = None
@@ -149,7 +152,7 @@ def begin_composer(
     dumps: Path | None, tell: Beginning,
 ) -> WarmStart:  # fmt: skip
     """The composer over all primitives, taught at first to do as the primitive that learned the clip,
-    and as the last one, that of recovery, on ways back or for who is far.
+    and as the one that recovers on ways back or for who is far.
 
     owner: `(C,)`, the primitive of each clip of the library.
     """
@@ -169,8 +172,8 @@ def begin_composer(
     settings = replace(settings, rounds=min(1, settings.rounds), critic_steps=0)
     try:
         taught, _ = clone(
-            cast(VecEnv, env), Owners(env, policy, owner), settings, imitation.ppo(), config.seed,
-            tell.round, policy,
+            cast(VecEnv, env), Owners(env, policy, owner, own_recovery(config)), settings,
+            imitation.ppo(), config.seed, tell.round, policy,
         )  # fmt: skip
     except UnstableError as problem:
         if tell.failed is not None:
@@ -185,16 +188,16 @@ def begin_composer(
 class Owners:
     """Acts for each world as the primitive that learned its clip: a teacher for the composer.
 
-    owner: `(C,)`; clips beyond are ways back, on which the last primitive acts. Where the task knows
-    point goals it does for whoever is so far from the reference, or fallen below it, that the goal is
-    a point, which is what the composer can see.
+    owner: `(C,)`; clips beyond are ways back, on which the primitive acts that recovers: the last one,
+    or without one of its `own` the first. Where the task knows point goals it does for whoever is so far
+    from the reference, or fallen below it, that the goal is a point, which is what the composer can see.
     """
 
-    def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor):
+    def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor, own: bool = True):
         assert isinstance(policy.policy, Composer)
         self.env, self.norm, self.primitives = env, policy.norm, policy.policy.primitives
-        ways = len(env.reference.length) - len(owner)
-        self.owner = torch.cat((owner, owner.new_full((ways,), len(self.primitives) - 1))).to(env.device)
+        ways, self.recovers = len(env.reference.length) - len(owner), own * (len(self.primitives) - 1)
+        self.owner = torch.cat((owner, owner.new_full((ways,), self.recovers))).to(env.device)
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -203,7 +206,7 @@ class Owners:
         owner, recoveries = self.owner[self.env.clip], self.env.recoveries
         if recoveries is not None:
             far = recoveries.before > recoveries.config.switch
-            owner = torch.where(far, len(self.primitives) - 1, owner)
+            owner = torch.where(far, self.recovers, owner)
         return actions[torch.arange(len(obs), device=obs.device), owner]
 
 

@@ -6,6 +6,7 @@
 |------------------------|-----------------------------------------------------------------------------|
 | as it is               | primitive 1 .. K, recovery, composer with recovery interleaved              |
 | no recovery            | primitive 1 .. K, composer; primitive 1 alone where nothing fails any more  |
+| the first can recover  | the same, the composer with recovery interleaved                            |
 | no progressive         | joint (K primitives and composer together), joint with recovery             |
 | no multiplicative      | single (of a primitive's size), single with recovery                        |
 | single                 | single, single with recovery                                                |
@@ -30,12 +31,18 @@ def first_stage(config: Perpetual) -> Stage:
     return Stage("primitive" if config.progressive else "joint")
 
 
+def own_recovery(config: Perpetual) -> bool:
+    """Whether recovery is learned by a primitive of its own, or by one network after tracking."""
+    return config.recovery and config.recovering.primitive == "own"
+
+
 def lasts(config: Perpetual, stage: Stage) -> bool:
     """Whether no stage follows, so that this one has all the time that is left."""
     if stage.kind == "composer" or stage.mixed:
         return True
-    one = stage.kind in WHOLE or (stage.kind == "primitive" and config.max_primitives == 1)
-    return one and not config.recovery
+    if stage.kind in WHOLE:
+        return not config.recovery
+    return stage.kind == "primitive" and config.max_primitives == 1 and not own_recovery(config)
 
 
 def following(config: Perpetual, stage: Stage, fails: bool) -> Stage | None:
@@ -51,7 +58,7 @@ def following(config: Perpetual, stage: Stage, fails: bool) -> Stage | None:
     if stage.kind == "primitive":
         if fails and stage.number < config.max_primitives:
             return Stage("primitive", number)
-        if config.recovery:
+        if own_recovery(config):
             return Stage("recovery", number)
         if not fails and stage.number == 1:
             return None
@@ -66,7 +73,7 @@ def ends(config: Perpetual, stage: Stage, begun: float) -> float:
     """
     if lasts(config, stage):
         return 1.0
-    share = config.recovering.share if config.recovery else 0.0
+    share = config.recovering.share if own_recovery(config) else 0.0
     first, last = ((1.0 - share) * x for x in config.shares)
     if stage.kind == "recovery":
         return begun + (1.0 - begun) * share / (1.0 - last)
@@ -75,12 +82,14 @@ def ends(config: Perpetual, stage: Stage, begun: float) -> float:
     return first + (last - first) * (stage.number - 1) / (config.max_primitives - 1)
 
 
-def primitives(stage: Stage) -> int:
+def primitives(config: Perpetual, stage: Stage) -> int:
     """Primitives of tracking that were begun by this stage; 0 for a network that learns all at once."""
     if stage.kind == "primitive":
         return stage.number
+    if stage.kind == "recovery":
+        return stage.number - 1
     # Before a composer comes the primitive of recovery, if there is one.
-    return stage.number - 1 - stage.mixed if stage.kind in ("recovery", "composer") else 0
+    return stage.number - 1 - own_recovery(config) if stage.kind == "composer" else 0
 
 
 def is_over(config: Perpetual, stage: Stage, decision: Decision, share: float) -> bool:

@@ -43,12 +43,12 @@ def finish(course: Course) -> tuple[ClipResults, RecoveryCard | None]:
     imitation, where = staged(course.imitation, stage), (course.threads, course.device)
     facts = {
         "method": imitation.config.method, "seed": imitation.config.seed, "stage": stage.name,
-        "recovers": stage.recovers is not None, "primitives": course.primitives,
+        "recovers": course.recovers, "primitives": course.primitives,
         "solved": course.finished, "iterations": course.iteration,
     }  # fmt: skip
     cost = {"samples": t.samples, "seconds": round(t.seconds, 1)}
     results, card = evaluate_clips(imitation, policy, None, 0.0, *where), None
-    if stage.recovers is not None:
+    if course.recovers:
         card = try_recovery(imitation, policy, imitation.config.recovering.final_trials, *where)
     course.history.add(course.iteration, FINAL_STAGE, 0.0, results)
     policy.save(course.folder / FINAL, t.character, facts | cost)

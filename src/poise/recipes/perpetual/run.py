@@ -47,11 +47,14 @@ class Earlier:
     target: Target
 
 
-def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
+def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
     who learns, with which seed, and whether and how recovery is learned. Where it is, the policy stays
     as it is, the first primitive of more, unless one network is to learn both. Observations are clipped
     no nearer than at `WIDE` deviations.
+
+    returns: the policy comes back by ways already, so that more primitives learn what it fails, and none
+    of its own is needed for recovery.
 
     Raises:
         PoiseError: the policy is made of primitives.
@@ -71,6 +74,9 @@ def going_on(policy: Perpetual, wanted: Perpetual) -> Perpetual:
     if wanted.recovery and not wanted.single:
         # Primitives have the sizes of the network that becomes the first of them.
         asked |= {"single": False, "multiplicative": True, "progressive": True}
+        if returns and wanted.recovering.ways:
+            asked["recovering"] = replace(asked["recovering"], primitive="first")
+            asked["max_primitives"] = wanted.max_primitives
         hidden = policy.single_hidden if policy.single else ppo.policy_hidden
         ppo = replace(ppo, policy_hidden=hidden)
     return replace(policy, ppo=ppo, **done, **asked)

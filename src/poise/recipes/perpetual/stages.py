@@ -43,7 +43,15 @@ from poise.recipes.perpetual.next import (
     make_trainer,
     members_of,
 )
-from poise.recipes.perpetual.plan import ends, following, is_over, lasts, most_help, primitives
+from poise.recipes.perpetual.plan import (
+    ends,
+    following,
+    is_over,
+    lasts,
+    most_help,
+    own_recovery,
+    primitives,
+)
 from poise.recipes.perpetual.progress import Progress, Stage, share_of
 from poise.recipes.perpetual.recovery import check_falls
 from poise.recipes.perpetual.returning import odds
@@ -99,6 +107,9 @@ class Course:
         self.log = Log(folder, self.iteration, tensorboard)
         self._saved_at = time.monotonic()
         if not (folder / LATEST).exists():
+            if trained is not None and self.stage.kind == "primitive" and self.config.recovery:
+                # It is the first primitive as it is: what it fails is for the next one.
+                self._advance(self._judge(over=True))
             self.save()
 
     # --- where it stands ----------------------------------------------------------------------
@@ -135,7 +146,13 @@ class Course:
     @property
     def primitives(self) -> int:
         """Primitives of tracking that were begun; 0 for a network that learns all clips at once."""
-        return primitives(self.stage)
+        return primitives(self.config, self.stage)
+
+    @property
+    def recovers(self) -> bool:
+        """Whether the stage's policy learned to recover."""
+        known = self.config.recovery and not own_recovery(self.config) and self.stage.number == 1
+        return known or self.stage.recovers is not None
 
     @property
     def began(self) -> float:

@@ -139,6 +139,9 @@ def build(
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     ways = known_ways(config, reference)
+    if ways is None:
+        # Who knows ways back must practise a point goal by a primitive of its own.
+        config = replace(config, recovering=replace(config.recovering, primitive="own"))
     own = task(config, humanoid, guided=ways is not None)
     built = Imitation(library, humanoid, reference, report, config, own, ways)
     return shaped(built, config.shapes, lambda body: task(config, body))
