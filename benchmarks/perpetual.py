@@ -6,6 +6,7 @@ RUN is the run's folder, FOLDER the library that it was trained on, of which the
 are read again. Nothing helps. Parts (all by default; what a part lacks, such as FOLDER, leaves it out):
 
     table     success and errors on held-out clips and on the library, beside the paper's rows
+    search    the same where what the policy loses is searched, by --characters at once
     recovery  1,000 trials each fallen, far and both, against a body that stands at ease
     owners    the composer against every primitive, clip by clip
     noise     success over the strength of a video estimator's noise
@@ -42,15 +43,17 @@ from perpetual_measure import (
     subjects,
     table,
 )
+from perpetual_search import searched
 from perpetual_text import report
 
 from poise.bench import machine
+from poise.env import SearchConfig
 from poise.errors import PoiseError
 from poise.eval.model_card import model_card
 from poise.learn.checkpoint import write_atomic
 from poise.motion import ClipLibrary
 
-PARTS = ("table", "recovery", "owners", "noise", "noisy", "speed", "curves")
+PARTS = ("table", "search", "recovery", "owners", "noise", "noisy", "speed", "curves")
 Save = Callable[[], None]
 
 
@@ -91,6 +94,18 @@ class Measurement:
             out["library_made"] = table(*how, said, run.name, threads, made).to_dict()
         bodies = [] if made else by_body(run.imitation, library)
         return out | {"library": library.to_dict()} | ({"bodies": bodies} if bodies else {})
+
+    def _search(self) -> dict[str, Any]:
+        run, a, out = self.run, self.a, {}
+        config, own = SearchConfig(a.characters), recorded(run.imitation.library.names)[0]
+        if a.clips is not None:
+            task = library_task(run, self.held()[0])
+            every = range(len(task.reference.length))
+            out["held_out"] = searched(run, task, "held-out clips", every, config, a.threads, say)
+        if not a.unseen:
+            said = "training library"
+            out["library"] = searched(run, run.imitation, said, own, config, a.threads, say)
+        return out | {"machine": machine()}
 
     def _recovery(self) -> None:
         done = self.parts.setdefault("recovery", {"kinds": {}, "reference": "standing at ease"})
@@ -184,6 +199,8 @@ def arguments() -> argparse.ArgumentParser:
     p.add_argument("--never", nargs="*", default=[], metavar="PATTERN", help="clips that are not read")
     p.add_argument("--cache", type=Path, help="a folder for the library that is read")
     p.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    p.add_argument("--characters", type=int, default=512, help="that search at once")
+    p.add_argument("--unseen", action="store_true", help="search held-out clips alone")
     p.add_argument("--trials", type=int, default=1000)
     p.add_argument("--again", action="store_true", help="make finished kinds of recovery again")
     p.add_argument("--noise-clips", type=int, default=20)

@@ -115,6 +115,22 @@ def _table(part: Mapping[str, Any]) -> list[str]:
     return out + ([""] if part.get("notes") else []) + [f"- {n}" for n in part.get("notes", ())]
 
 
+def _search(part: Mapping[str, Any]) -> list[str]:
+    kinds = [part[k] for k in ("held_out", "library") if k in part]
+    tables = [FieldTable.from_dict(k["table"]) for k in kinds]
+    out = ["### What is searched", ""]
+    for k, t in zip(kinds, tables, strict=True):
+        one = k["seconds_of_a_second"]
+        took = (
+            "" if one is None else f" {one:.1f} s for 1 s of motion on {k['threads']} threads (median)."
+        )
+        out += [
+            f"{t.data}: the policy alone does {k['alone']} clips, {k['found']} of the other "
+            f"{k['searched']} were found by {k['characters']} characters, without help.{took}", "",
+        ]  # fmt: skip
+    return [*out, markdown(tables, (), WORST).rstrip()]
+
+
 def _recovery(part: Mapping[str, Any]) -> list[str]:
     rows: list[Sequence[str]] = [
         ("start", "trials", "Succ-5s", "Succ-10s", "median s", "slowest s", "paper 5 s", "paper 10 s")
@@ -251,6 +267,6 @@ def _clock(seconds: float) -> str:
 
 
 _PARTS = (
-    ("table", _table), ("recovery", _recovery), ("owners", _owners), ("noise", _noise),
-    ("noisy", _noisy), ("speed", _speed), ("curves", _curves),
+    ("table", _table), ("search", _search), ("recovery", _recovery), ("owners", _owners),
+    ("noise", _noise), ("noisy", _noisy), ("speed", _speed), ("curves", _curves),
 )  # fmt: skip

@@ -78,6 +78,23 @@ def test_a_motion_that_is_lost_is_learned(
     assert open_tracker(tmp_path / "made/learned").about["samples"] > about["samples"]
 
 
+def test_a_motion_that_is_lost_is_looked_for(
+    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["track", str(short), "--policy", str(file), "-o", str(tmp_path / "o.bvh"), "--search"]
+    assert main([*argv, "--characters", "16", "--threads", "1"]) == 0
+    said = capsys.readouterr()
+    assert "of 1.0 s found" in said.err and "16 characters looked for it" in said.out
+    score = json.loads((tmp_path / "o/score.json").read_text())
+    assert score["method"] == "perpetual-single, searched" and score["help"]["limit_n"] == 0.0
+    if "Found to its end" not in said.out:
+        assert "Try --characters 32" in said.out
+    assert main([*argv, "--characters", "4"]) == 2
+    assert "--characters must lie in 8 to" in capsys.readouterr().err
+    crowd = ["track", str(short), "-o", str(tmp_path / "many"), "--search", "--count", "2"]
+    assert main(crowd) == 2 and "single character" in capsys.readouterr().err
+
+
 def test_what_cannot_be_learned_is_refused(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,10 +18,11 @@ from poise.cli.results import print_card
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
+    from poise.env import SearchConfig
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
     from poise.recipes.perpetual.progress import Progress
-    from poise.recipes.track import Tracked
+    from poise.recipes.track import TrackConfig, Tracked
     from poise.recipes.track.policy import Tracker
 
 #: Failures that are named one by one.
@@ -30,7 +32,7 @@ NAMED = 8
 @dataclass(frozen=True)
 class Options:
     """Let a trained policy do a motion that it need not know, without help and without training: write
-    the motion, score.json and report.html. A motion that it loses it can --learn."""
+    the motion, score.json and report.html. For a motion that it loses it can --search, or --learn it."""
 
     clip: Annotated[Positional[Path], arg(metavar="FILE")]
     """The motion file: a clip of any human skeleton, or keypoints."""
@@ -40,11 +42,16 @@ class Options:
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
     Poise."""
+    search: bool = False
+    """If the policy loses the motion, look for it: many characters try at once, those that come near it
+    go on. What is found is one simulation, without help; it takes seconds for each of the motion."""
+    characters: Annotated[int, arg(metavar="N")] = 512
+    """Characters that --search at once; more find harder motions."""
     learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
     """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
     threads: Annotated[int, arg(metavar="N")] = 0
-    """Cores for --learn; 0 is all."""
+    """Cores for --search and --learn; 0 is all."""
     reset_on_fail: bool = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
     recover: bool = False
@@ -74,6 +81,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     if o.learn and o.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
         raise PoiseError(what, hint="Leave one out")
+    if not 8 <= o.characters <= 65_536:
+        raise PoiseError(f"--characters must lie in 8 to 65536, got {o.characters}")
     if o.threads < 0:
         raise PoiseError(f"--threads must be at least 0, got {o.threads}")
     out, motion = places(o.clip, o.out)
@@ -88,14 +97,19 @@ def run(options: Options, argv: Sequence[str]) -> int:
     with working("opening the policy"):
         tracker = open_tracker(o.policy)
     config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
+    config = replace(config, search=searches(o), search_threads=o.threads)
     with claimed(out):
         with working("tracking"):
             # What is to be learned is the motion alone.
-            tracked = track(tracker, given, replace(config, recover=o.recover and not o.learn))
+            plain = replace(config, recover=o.recover and not o.learn, search=None)
+            tracked = track(tracker, given, plain)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
                 return 130
-            tracked = track(learned, given, config)
+            tracker = learned
+            tracked = track(tracker, given, replace(config, search=None))
+        if o.search and tracked.failures:
+            tracked = look(tracker, given, config)
         with working("writing"):
             done = write(tracked, out, motion, o.hold_feet)
             if o.save_policy is not None:
@@ -108,6 +122,28 @@ def run(options: Options, argv: Sequence[str]) -> int:
     for path in (*done.paths.values(), *((o.save_policy,) if o.save_policy else ())):
         say(str(path))
     return 0
+
+
+def searches(options: Options) -> SearchConfig | None:
+    """How a motion is looked for, if it is."""
+    from poise.env import SearchConfig
+
+    return SearchConfig(options.characters, seed=options.seed) if options.search else None
+
+
+def look(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
+    """The motion as it is found by a search."""
+    from poise.recipes.track import track
+
+    began, rate = time.monotonic(), tracker.config.sim.control_hz
+    with showing("searching") as bar:
+
+        def show(done: int, steps: int) -> None:
+            share, spent = done / steps, time.monotonic() - began
+            left = f", {clock(spent * (1 / share - 1))} left" if share else ""
+            bar(share, f"{done / rate:.1f} of {steps / rate:.1f} s found{left}")
+
+        return track(tracker, given, config, show)
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
@@ -137,10 +173,13 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
 
 def advice(options: Options) -> str:
     """What to do about a motion that was lost."""
-    if not options.learn:
-        return "With --learn 10 the policy first learns this motion, for 10 minutes at most."
-    more = 2 * options.learn
-    return f"The same command with more minutes goes on learning: --learn {more:g}."
+    o = options
+    learns = "with --learn 10 the policy first learns this motion, for 10 minutes at most."
+    if o.learn:
+        return f"The same command with more minutes goes on learning: --learn {2 * o.learn:g}."
+    if o.search:
+        return f"Try --characters {2 * o.characters}; or {learns}"
+    return f"With --search many characters look for it; {learns}" if o.count == 1 else "W" + learns[1:]
 
 
 def outcome(tracked: Tracked, reset: bool) -> str:
@@ -154,6 +193,8 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if tracked.losses is not None:
         return tracked.losses.sentence()
+    if not times and tracked.found is not None:
+        return f"Found to its end, {seconds:.1f} s, without help; the policy alone loses it."
     if not times:
         return f"Tracked to its end, {seconds:.1f} s, without help."
     if not reset:

@@ -9,14 +9,17 @@ from poise.env.path_config import PathConfig, Paths, PathStats
 from poise.env.paths import PathSearch
 from poise.env.recovery import Recovery
 from poise.env.reference import Reference
-from poise.env.task import EnvStep, TaskConfig
+from poise.env.search import Found, Search, SearchConfig
+from poise.env.task import Acts, EnvStep, TaskConfig
 
 __all__ = [
+    "Acts",
     "DoneTerm",
     "EnvStep",
     "Expert",
     "ExpertConfig",
     "Follower",
+    "Found",
     "Frame",
     "GymEnv",
     "GymVectorEnv",
@@ -30,6 +33,8 @@ __all__ = [
     "Recovery",
     "Reference",
     "RewardTerm",
+    "Search",
+    "SearchConfig",
     "TaskConfig",
     "make_plan",
 ]

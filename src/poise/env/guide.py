@@ -8,14 +8,13 @@ needs no other goal, reward or network for it.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
 from poise.env.reference import Reference
 from poise.env.rising import Poses, Rising
+from poise.env.task import Acts
 from poise.env.way_back import way_back
 from poise.env.ways import Ways
 
@@ -27,12 +26,6 @@ REST, WAITS_S = 0.5, 1.5
 MOVES, SKIPS = 0.3, 0.05
 #: What a world does.
 TRACKS, FALLS, RETURNS = 0, 1, 2
-
-
-class Policy(Protocol):
-    """What maps observations `(N, O)` to actions `(N, A)`."""
-
-    def act(self, obs: Tensor) -> Tensor: ...
 
 
 class Guide:
@@ -51,7 +44,7 @@ class Guide:
     which the reference is or waits. lost: (world, frame of its clip) of every time one was lost.
     """
 
-    def __init__(self, env: ImitationEnv, policy: Policy, ways: Ways):
+    def __init__(self, env: ImitationEnv, policy: Acts, ways: Ways):
         self.env, self.policy, self.reference = env, policy, env.reference
         table, rate = env.reference.humanoid.table, env.reference.rate_hz
         self.rising, self._ease = Rising(ways, table, rate), Poses(table, ways.ease[None])

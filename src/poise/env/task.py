@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -12,6 +12,12 @@ from poise.control import HelpSchedule, PDTargets, Residual
 from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
 from poise.env.recovery import Recovery
 from poise.errors import PoiseError
+
+
+class Acts(Protocol):
+    """Anything that maps observations `(N, O)` to deterministic actions `(N, A)`."""
+
+    def act(self, obs: Tensor) -> Tensor: ...
 
 
 class EnvStep(NamedTuple):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.env import ImitationEnv, Reference
+from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval.rolloutset import RolloutSet
 from poise.metrics import Shapes
@@ -19,12 +18,6 @@ from poise.metrics.shapes import KINDS
 
 #: Frames of a part of rollouts: 110 MB of 20 bodies.
 PADDED = 100_000
-
-
-class Acts(Protocol):
-    """Anything that maps observations `(N, O)` to deterministic actions `(N, A)`."""
-
-    def act(self, obs: Tensor) -> Tensor: ...
 
 
 @dataclass(frozen=True, eq=False)

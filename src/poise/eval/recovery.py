@@ -17,12 +17,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv, Recovery, TaskConfig
+from poise.env import Acts, ImitationEnv, Recovery, TaskConfig
 from poise.env.guide import Guide
 from poise.env.recovery import FALLEN, FAR
 from poise.env.ways import Ways
 from poise.errors import PoiseError
-from poise.eval.episodes import Acts
 from poise.eval.field_paper import PHC_RECOVERY
 
 #: The fail-states by name.

@@ -16,6 +16,7 @@ from poise.learn.protocols import DemoSampler, FeatureSource, Policy, Step, Styl
 from poise.learn.rollout import Rollout
 from poise.learn.run import RunResult, Until, run
 from poise.learn.train import IterationStats, Trainer
+from poise.learn.value import Value
 
 __all__ = [
     "BEST",
@@ -47,6 +48,7 @@ __all__ = [
     "TrainingError",
     "Until",
     "UpdateStats",
+    "Value",
     "VecEnv",
     "WarmStart",
     "check_fits",

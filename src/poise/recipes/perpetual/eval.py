@@ -16,8 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv
-from poise.eval.episodes import Acts
+from poise.env import Acts, ImitationEnv
 from poise.learn import PolicyBundle
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import mpjpe_global, mpjpe_root, success_rule

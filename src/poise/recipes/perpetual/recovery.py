@@ -11,11 +11,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from poise.env import Reference
+from poise.env import Acts, Reference
 from poise.env.falls import fall_states
 from poise.errors import PoiseError
 from poise.eval import RecoveryCard, recovery_card, trial_task
-from poise.eval.episodes import Acts
 from poise.learn import PolicyBundle
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual

@@ -22,8 +22,8 @@ from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env.ways import Ways
 from poise.errors import PoiseError
-from poise.learn import PolicyBundle, load_checkpoint, save_checkpoint
-from poise.learn.state import under
+from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
+from poise.learn.state import prefixed, under
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.imitation import Imitation
@@ -51,7 +51,8 @@ class Tracker:
     settings. example: a clip on the body's skeleton, which tells how it stands. config: the settings by
     which it was trained. about: "clips" (names), "stage", "samples", "seconds", "help_n" (what help the
     training still gave), "poise" (the version that wrote it). ways: by which the policy comes back
-    where it has lost a motion; None if it has not learned that.
+    where it has lost a motion; None if it has not learned that. value: what its critic tells of a state,
+    by which `track.searching` looks ahead; None where the critic was not kept.
     """
 
     policy: PolicyBundle
@@ -60,6 +61,7 @@ class Tracker:
     config: Perpetual
     about: Mapping[str, Any]
     ways: Ways | None = None
+    value: Value | None = None
 
     @property
     def target(self) -> Target:
@@ -123,7 +125,17 @@ def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
         "poise": __version__,
     }
     example = imitation.library.clips[0]
-    return Tracker(policy, imitation.humanoid, example, imitation.config, about, imitation.ways)
+    value = value_of_run(folder, policy, imitation.config)
+    return Tracker(policy, imitation.humanoid, example, imitation.config, about, imitation.ways, value)
+
+
+def value_of_run(folder: Path, policy: PolicyBundle, config: Perpetual) -> Value | None:
+    """The critic of a run's last checkpoint, None where there is none."""
+    path = folder / LATEST
+    if not path.exists():
+        return None
+    state = load_checkpoint(path)[0]
+    return Value(policy, state, config.ppo.activation) if "critic/layers.0.weight" in state else None
 
 
 def export_policy(run: Path, path: Path) -> Tracker:
@@ -152,6 +164,8 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
     tensors |= {_EXAMPLE + k: v for k, v in small.items()}
     if tracker.ways is not None:
         tensors |= {_WAYS + k: v.float() for k, v in tracker.ways.state().items()}
+    if tracker.value is not None:
+        tensors |= {k: _halved(k, v) for k, v in prefixed("value", tracker.value.state()).items()}
     save_checkpoint(path, tensors, meta)
 
 
@@ -182,6 +196,10 @@ def load_tracker(path: Path) -> Tracker:
         about, character = meta["about"], meta["character"]
         told = {k: v.double() for k, v in under(_WAYS.rstrip("/"), tensors).items()}
         ways = Ways.of(told) if told else None
+        critic = {
+            k: v.float() if v.dtype == torch.half else v for k, v in under("value", tensors).items()
+        }
+        value = Value(bundle, critic, config.ppo.activation) if critic else None
     except (PoiseError, KeyError, TypeError, ValueError, AttributeError):
         raise foreign from None
     if humanoid.identity != character:
@@ -193,7 +211,7 @@ def load_tracker(path: Path) -> Tracker:
         )
     config.sim.apply(humanoid.model)
     bundle.meta = {"samples": about.get("samples", 0), "seconds": about.get("seconds", 0.0)}
-    return Tracker(bundle, humanoid, example, config, about, ways)
+    return Tracker(bundle, humanoid, example, config, about, ways, value)
 
 
 def _check_kind(meta: Mapping[str, Any], path: Path) -> None:
@@ -212,6 +230,6 @@ def _check_kind(meta: Mapping[str, Any], path: Path) -> None:
 
 def _halved(name: str, value: Tensor) -> Tensor:
     """Matrices of the networks in half precision, where its range holds them."""
-    if not name.startswith("policy/") or value.ndim < 2 or not value.is_floating_point():
+    if not name.startswith(("policy/", "value/")) or value.ndim < 2 or not value.is_floating_point():
         return value
     return value.half() if float(value.abs().max()) < _HALF_MAX else value

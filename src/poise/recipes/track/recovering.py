@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from poise.env import Reference
 from poise.env.guide import TRACKS, Guide
@@ -16,20 +15,10 @@ from poise.motion import Clip, ClipLibrary, resample
 from poise.recipes.imitation import Imitation
 from poise.recipes.track.clip import Placed
 from poise.recipes.track.policy import Tracker
+from poise.recipes.track.searching import Replay
 
 #: A motion that is lost more often is given up, and so is who has been away for so many s.
 LOSSES, AWAY_S = 8, 30.0
-
-
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """Actions `(T, A)` one after another, for the one character that they were made for."""
-
-    actions: list[Tensor]
-
-    def act(self, obs: Tensor) -> Tensor:
-        """The next one; `obs` is not looked at."""
-        return self.actions.pop(0)
 
 
 @dataclass(frozen=True)
@@ -103,7 +92,7 @@ def with_returns(
     library = ClipLibrary((placed.clip,), (1.0,))
     reference = Reference(body, [qpos], rate, [own.name])
     out = replace(imitation, library=library, reference=reference)
-    return placed, out, Replay(actions), Losses(tuple(lost), tuple(back))
+    return placed, out, Replay(torch.cat(actions)), Losses(tuple(lost), tuple(back))
 
 
 def _held(clip: Clip, rate: float, of: list[int]) -> Clip:

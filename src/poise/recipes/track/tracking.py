@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
-from poise.env import ImitationEnv, Reference
+from poise.env import Acts, Found, ImitationEnv, Reference, SearchConfig
 from poise.errors import PoiseError
 from poise.eval import run_episodes, score_rollouts
-from poise.eval.episodes import Acts
 from poise.eval.judged import judge
 from poise.kin.fit import widen
 from poise.metrics import mpjpe_global, success_rule
@@ -23,12 +22,14 @@ from poise.motion.noise import Noise, perturb_clip, perturb_points
 from poise.recipes.deliver import simulated_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
+from poise.recipes.perpetual.eval import evaluate_clips
 from poise.recipes.session import Evaluation
 from poise.recipes.track.clip import Placed, place
 from poise.recipes.track.crowd import crowd_env, places
 from poise.recipes.track.points import fitted, follow
 from poise.recipes.track.policy import Tracker
 from poise.recipes.track.recovering import Losses, with_returns
+from poise.recipes.track.searching import replay, search, sentence
 
 #: Characters in one world.
 MOST = 64
@@ -43,8 +44,9 @@ class TrackConfig:
     noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
     failed is put back onto the reference. recover: it gets up, comes back and goes on, while the motion
     waits, see `env.guide`; for one character. smooth_hz: cut-off of a low-pass on keypoints.
-    count: characters who do the motion side by side in one world, see `track.crowd`. threads: of the
-    physics.
+    count: characters who do the motion side by side in one world, see `track.crowd`. search: a motion
+    that the policy loses is looked for, see `env.search`; for one character. search_threads: of it, 0
+    is all cores. threads: of the physics.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -53,6 +55,8 @@ class TrackConfig:
     recover: bool = False
     smooth_hz: float | None = None
     count: int = 1
+    search: SearchConfig | None = None
+    search_threads: int = 0
     threads: int = 1
 
     def __post_init__(self) -> None:
@@ -61,6 +65,9 @@ class TrackConfig:
         if self.recover and (self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that is put back onto the motion"
             raise PoiseError(f"only a single character comes back by itself, not {what}")
+        if self.search and (self.recover or self.reset_on_fail or self.count > 1):
+            what = "several characters" if self.count > 1 else "one that comes or is put back"
+            raise PoiseError(f"a motion is searched for a single character, not {what}")
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,8 @@ class Tracked:
     placed: the motion on the body. failures: (character, seconds) of each failure in the order of time;
     without `reset_on_fail` and `recover` at most one per character. clean: what the noise changed, None
     without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
-    was lost and found again; None where it was not.
+    was lost and found again; None where it was not. found: with `search`, what that came to; None where
+    the policy alone did not lose the motion.
     """
 
     tracker: Tracker
@@ -103,6 +111,7 @@ class Tracked:
     clean: Clean | None
     notes: tuple[str, ...]
     losses: Losses | None = None
+    found: Found | None = None
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -114,8 +123,15 @@ class Tracked:
         return simulated_clip(self.imitation, self.evaluation, character)
 
 
-def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None = None) -> Tracked:
+def track(
+    tracker: Tracker,
+    motion: Clip | Keypoints,
+    config: TrackConfig | None = None,
+    show: Callable[[int, int], None] | None = None,
+) -> Tracked:
     """Tracks a motion from its first frame to its last with the deterministic policy, without help.
+
+    show: is told how many control steps of how many are searched.
 
     Keypoints reach a policy with goals of keypoints frame by frame (`kin.KeypointStream`); any other
     policy gets the clip that is fitted to them.
@@ -133,9 +149,13 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
     goals = imitation.reference.pose.pos
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
-    acts, losses = tracker.policy, None
-    if config.recover and (found := with_returns(tracker, placed, imitation, config.threads)):
-        placed, imitation, acts, losses = found
+    acts, losses, found = tracker.policy, None, None
+    if config.search and loses(tracker, imitation):
+        found = search(tracker, imitation, config.search, 0, config.search_threads, show)
+        acts = replay(found, acts)
+        notes.append(sentence(found, config.search, imitation.reference.rate_hz))
+    if config.recover and (back := with_returns(tracker, placed, imitation, config.threads)):
+        placed, imitation, acts, losses = back
     keeper = Keeper(acts, config.reset_on_fail)
 
     def make_env(worlds: int) -> ImitationEnv:
@@ -153,7 +173,7 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
     card = score_rollouts(
         rollouts,
         rule=RULE,
-        method=tracker.config.method,
+        method=tracker.config.method + (", searched" if found else ""),
         seconds=float(about.get("seconds", 0.0)),
         samples=int(about.get("samples", 0)),
         seed=tracker.config.seed,
@@ -175,7 +195,14 @@ def track(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig | None
     times = tuple((who, frame / rate) for who, frame in frames)
     if losses is not None:
         times = tuple((0, t) for t in losses.lost)
-    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses)
+    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, found)
+
+
+def loses(tracker: Tracker, imitation: Imitation) -> bool:
+    """Whether the policy alone loses a task's first motion."""
+    first = torch.zeros(1, dtype=torch.long)
+    results = evaluate_clips(imitation, tracker.policy, first, 0.0, 1)
+    return not bool(results.succeeded)
 
 
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:

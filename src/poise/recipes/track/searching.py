@@ -1,0 +1,67 @@
+"""A motion that the policy loses is looked for by many characters at once, see `env.search`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from poise.env import Acts, Found, ImitationEnv, Search, SearchConfig
+from poise.recipes.imitation import Imitation
+from poise.recipes.track.policy import Tracker
+from poise.sim import make_backend
+
+
+@dataclass(eq=False)
+class Replay:
+    """Actions `(T, A)` one after another, for the one character that they were made for; after them
+    acts the policy, if there is one."""
+
+    actions: Tensor
+    policy: Acts | None = None
+    step: int = 0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """The next one, `(1, A)`; `obs` is looked at by the policy alone."""
+        at, self.step = self.step, self.step + 1
+        if at >= len(self.actions) and self.policy is not None:
+            return self.policy.act(obs)
+        return self.actions[at : at + 1]
+
+
+def search(
+    tracker: Tracker,
+    imitation: Imitation,
+    config: SearchConfig,
+    clip: int = 0,
+    threads: int = 0,
+    show: Callable[[int, int], None] | None = None,
+) -> Found:
+    """Looks for one of a task's motions with the tracker's policy, without help.
+
+    threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
+    """
+    backend = make_backend(imitation.humanoid.model, config.characters, "cpu", threads=threads)
+    # Worlds that lose the motion may go bad; they are left behind.
+    task = replace(imitation.task, dones=(), style=(), auto_reset=False, help=None, help_by="all")
+    env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
+    env.help.set(0.0)
+    try:
+        return Search(env, tracker.policy, config, tracker.value, clip).run(show)
+    finally:
+        env.close()
+
+
+def sentence(found: Found, config: SearchConfig, rate_hz: float) -> str:
+    """What the search came to."""
+    much = f"{config.characters} characters looked for it, {found.tries:,} control steps, without help"
+    if found.whole:
+        return f"The policy alone loses the motion; {much}, and found it to its end."
+    at = found.reached / rate_hz
+    return f"The policy alone loses the motion; {much}, and came as far as {at:.1f} s."
+
+
+def replay(found: Found, policy: Acts) -> Replay:
+    """Does what was found, and from where it was lost what the policy does."""
+    return Replay(found.actions[: found.reached].clone(), policy)
