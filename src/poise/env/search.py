@@ -149,7 +149,8 @@ class Search:
         now = self._first(obs)
         before: deque[_Kept] = deque(maxlen=c.retries * c.back + 1)
         path: list[_Choice] = []
-        farthest, failures = 0, 0
+        came: tuple[int, list[_Choice], _Kept] = (0, [], now)
+        wall, failures = 0, 0
         while (done := sum(len(x.actions) for x in path)) < self.last:
             if show is not None:
                 show(done, self.last)
@@ -159,17 +160,19 @@ class Search:
                 path.append(choice)
                 now = after
                 continue
-            # Nobody came through: from farther back each time, up to where this one began.
-            if done > farthest + c.hold * c.back:
-                farthest, failures = done, 0
-            farthest, failures = max(farthest, done), failures + 1
+            # Nobody came through: from farther back each time, unless it is another place.
+            if done > wall + c.hold * c.back:
+                failures = 0
+            wall, failures = max(wall, done), failures + 1
+            came = max(came, (done, list(path), now), key=lambda x: x[0])
             if failures > c.retries:
-                break
+                done, path, now = came
+                return self._result(path, now, done)
             for _ in range(min(failures * c.back, len(before) - 1)):
                 before.pop()
                 path.pop()
             now = before.pop()
-        return self._result(path, now, sum(len(x.actions) for x in path))
+        return self._result(path, now, self.last)
 
     def _first(self, obs: Tensor) -> _Kept:
         nothing = torch.zeros(self.states)
