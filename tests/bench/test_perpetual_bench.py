@@ -72,6 +72,8 @@ def test_every_part_of_one_run(run: Path, clips: Path, tmp_path: Path, capsys) -
     few = [
         "--trials",
         "4",
+        "--characters",
+        "16",
         "--noise-clips",
         "1",
         "--strengths",
@@ -94,6 +96,12 @@ def test_every_part_of_one_run(run: Path, clips: Path, tmp_path: Path, capsys) -
     opened = measure.Run.open("toy", run)
     results = evaluate_clips(opened.imitation, opened.policy, threads=1)
     assert parts["table"]["library"]["succ"] == pytest.approx(results.rate)
+    # What is searched is all that is lost alone; the toy falls everywhere.
+    for part, count in ((parts["search"]["held_out"], 1), (parts["search"]["library"], 2)):
+        rows = part["per_clip"]
+        assert part["alone"] == 0 and part["searched"] == len(rows) == count
+        assert part["table"]["succ"] == part["found"] / count and part["seconds_of_a_second"] > 0
+        assert all(0 < r["reached"] <= r["steps"] and r["tries"] > 0 for r in rows)
     kinds = parts["recovery"]["kinds"]
     assert set(kinds) == {"fallen", "far", "fallen and far"}
     assert {k["trials"] for k in kinds.values()} == {4} and not kinds["far"]["learned"]
@@ -106,7 +114,8 @@ def test_every_part_of_one_run(run: Path, clips: Path, tmp_path: Path, capsys) -
     assert parts["curves"]["stages"] == [{"stage": "single", "from_samples": 0}]
     markdown = out.with_suffix(".md").read_text()
     for words in ("| PHC (PHC table 1) | AMASS-Test", "Not the paper's data", "never trained to recover",
-                  "Held out: toy.", "Real time", "a toy machine"):  # fmt: skip
+                  "Held out: toy.", "Real time", "a toy machine",
+                  "of the other 2 were found by 16"):  # fmt: skip
         assert words in markdown, words
     assert str(tmp_path) not in markdown and str(run) not in markdown
     written = card.read_text()

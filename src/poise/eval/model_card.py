@@ -103,6 +103,7 @@ def _figures(parts: Mapping[str, Any]) -> list[str]:
         said = "The paper's rows are on other data, another body and another simulator."
         paper = [r for r in paper_rows("AMASS-Train", "AMASS-Test") if r.method.startswith("PHC")]
         out += [markdown(tables, paper).rstrip(), "", said, ""]
+    out += [_searched(p) for k in ("held_out", "library") if (p := parts.get("search", {}).get(k))]
     noisy = parts.get("noisy", {}).get("table")
     if noisy:
         out.append(f"- Files of real pose estimators: {_share(noisy['succ'])} of {noisy['episodes']}.")
@@ -124,11 +125,20 @@ def _figures(parts: Mapping[str, Any]) -> list[str]:
             f"- {m['characters']} characters in one world on {m['threads']} threads: {m['hz']:.0f} Hz."
             for m in speed["crowds"] if m["characters"] > 1
         ]  # fmt: skip
-    asked = ("table", "recovery", "noise", "noisy", "speed", "curves")
+    asked = ("table", "search", "recovery", "noise", "noisy", "speed", "curves")
     missing = [p for p in asked if p not in parts or "skipped" in parts[p]]
     if missing:
         out += ["", f"Not measured: {', '.join(missing)}."]
     return out
+
+
+def _searched(part: Mapping[str, Any]) -> str:
+    t, error = part["table"], part["table"]["views"]["all_frame"]["g_mpjpe"]
+    return (
+        f"- Searched, {t['data']}: {_share(t['succ'])} of {t['episodes']} clips, {error:.0f} mm. "
+        f"{part['found']} of the {part['searched']} that it loses alone were found by "
+        f"{part['characters']} characters at once, without help; no controller, see docs/track.md."
+    )
 
 
 def _limits(a: Mapping[str, Any], parts: Mapping[str, Any]) -> list[str]:
