@@ -61,7 +61,7 @@ class Options:
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of the noise."""
+    """Seed of the noise, and of what --search and --learn draw."""
     hold_feet: bool = True
     """In the written motion standing feet are held to the spot; so they stay as simulated."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
