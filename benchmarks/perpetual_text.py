@@ -125,8 +125,9 @@ def _search(part: Mapping[str, Any]) -> list[str]:
             "" if one is None else f" {one:.1f} s for 1 s of motion on {k['threads']} threads (median)."
         )
         out += [
-            f"{t.data}: the policy alone does {k['alone']} clips, {k['found']} of the other "
-            f"{k['searched']} were found by {k['characters']} characters, without help.{took}", "",
+            f"{t.data}: the policy alone does {k['alone']} of {k['alone'] + k['searched']} clips, "
+            f"{k['found']} of the other {k['searched']} were found by {k['characters']} characters, "
+            f"without help.{took}", "",
         ]  # fmt: skip
     return [*out, markdown(tables, (), WORST).rstrip()]
 

@@ -52,13 +52,8 @@ class SearchConfig:
         if self.brood < 2 or self.characters < 2 * self.brood:
             what = f"got {self.characters} characters, {self.brood} from each state"
             raise PoiseError(what, "SearchConfig", "Take 8 or more, 2 or more from each")
-        if (
-            self.hold < 1
-            or self.rounds < 1
-            or self.back < 1
-            or self.retries < 0
-            or not 0 < self.least <= self.most
-        ):
+        counts, spread = (self.hold, self.rounds, self.back), 0 < self.least <= self.most
+        if min(counts) < 1 or self.retries < 0 or not spread:
             what = "hold, rounds, back, least and most must be positive, and least the smaller one"
             raise PoiseError(what, "SearchConfig")
 

@@ -27,10 +27,8 @@ class Value:
         layers = sorted(k for k in state if k.startswith("critic/") and k.endswith("weight"))
         widths = tuple(len(state[k]) for k in layers)
         rng = torch.Generator().manual_seed(0)
-        self.norm, self.critic = policy.norm, MLP(
-            policy.num_obs, widths[:-1], 1, activation, generator=rng
-        )  # fmt: skip
-        self.scale = RunningNorm(1, clip=math.inf)
+        self.norm, self.scale = policy.norm, RunningNorm(1, clip=math.inf)
+        self.critic = MLP(policy.num_obs, widths[:-1], 1, activation, generator=rng)
         load_module(self.critic, state, "critic")
         load_module(self.scale, state, "return_norm")
 
