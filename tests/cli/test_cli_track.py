@@ -89,6 +89,7 @@ def test_a_motion_that_is_lost_is_looked_for(
     assert score["method"] == "perpetual-single, searched" and score["help"]["limit_n"] == 0.0
     if "Found to its end" not in said.out:
         assert "Try --characters 32" in said.out
+    assert main([*argv, "--rounds", "0"]) == 2 and "--rounds must lie" in capsys.readouterr().err
     assert main([*argv, "--characters", "4"]) == 2
     assert "--characters must lie in 8 to" in capsys.readouterr().err
     crowd = ["track", str(short), "-o", str(tmp_path / "many"), "--search", "--count", "2"]

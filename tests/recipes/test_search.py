@@ -55,6 +55,18 @@ def test_what_is_found_is_one_simulation(tracker: Tracker) -> None:
     assert blind.reached > 0 and not torch.equal(blind.actions, found.actions)
 
 
+def test_another_round_comes_no_farther_away(tracker: Tracker) -> None:
+    clip = walk(0, 14)
+    imitation = imitation_of(tracker, [place(clip, tracker)])
+    shown: list[tuple[int, int]] = []
+    once = search(tracker, imitation, FEW)
+    twice = search(tracker, imitation, replace(FEW, rounds=2), show=lambda *x: shown.append(x))
+    assert once.whole and twice.whole and twice.error_mm < once.error_mm
+    assert twice.tries == 2 * once.tries and shown[0] == (0, 26) and shown[-1][0] > 13
+    again = evaluate_clips(imitation, replay(twice, tracker.policy), threads=1)
+    assert bool(again.succeeded.all())
+
+
 def test_where_nobody_comes_through_the_search_ends(tracker: Tracker) -> None:
     """A leap aside of 3 m in one frame."""
     clip = walk(0, 40)

@@ -47,6 +47,8 @@ class Options:
     go on. What is found is one simulation, without help; it takes seconds for each of the motion."""
     characters: Annotated[int, arg(metavar="N")] = 512
     """Characters that --search at once; more find harder motions."""
+    rounds: Annotated[int, arg(metavar="N")] = 1
+    """How often it is searched; later rounds stay about what was found, and come nearer."""
     learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
     """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
@@ -83,6 +85,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
         raise PoiseError(what, hint="Leave one out")
     if not 8 <= o.characters <= 65_536:
         raise PoiseError(f"--characters must lie in 8 to 65536, got {o.characters}")
+    if not 1 <= o.rounds <= 20:
+        raise PoiseError(f"--rounds must lie in 1 to 20, got {o.rounds}")
     if o.threads < 0:
         raise PoiseError(f"--threads must be at least 0, got {o.threads}")
     out, motion = places(o.clip, o.out)
@@ -128,7 +132,8 @@ def searches(options: Options) -> SearchConfig | None:
     """How a motion is looked for, if it is."""
     from poise.env import SearchConfig
 
-    return SearchConfig(options.characters, seed=options.seed) if options.search else None
+    o = options
+    return SearchConfig(o.characters, rounds=o.rounds, seed=o.seed) if o.search else None
 
 
 def look(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
