@@ -140,13 +140,13 @@ def look(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Trac
     """The motion as it is found by a search."""
     from poise.recipes.track import track
 
-    began, rate = time.monotonic(), tracker.config.sim.control_hz
+    began = time.monotonic()
     with showing("searching") as bar:
 
         def show(done: int, steps: int) -> None:
             share, spent = done / steps, time.monotonic() - began
             left = f", {clock(spent * (1 / share - 1))} left" if share else ""
-            bar(share, f"{done / rate:.1f} of {steps / rate:.1f} s found{left}")
+            bar(share, f"{100 * share:.0f} % searched{left}")
 
         return track(tracker, given, config, show)
 
