@@ -50,6 +50,7 @@ def run(
 
         check_going_on(primitives, body, library)
         tracker = open_tracker(primitives.going_on)
+        # Whether --max-primitives has a say is known by the policy alone.
         returns = tracker.ways is not None
         check_going_on(primitives, body, library, returns)
         if training.envs is None:

@@ -20,7 +20,7 @@ class Value:
     "return_norm/", of a critic with rectifiers or whichever `activation` it was trained with.
 
     Raises:
-        KeyError: entries are missing.
+        PoiseError: entries are missing, or of other sizes.
     """
 
     def __init__(self, policy: PolicyBundle, state: Mapping[str, Tensor], activation: str = "relu"):

@@ -147,16 +147,22 @@ def _batch(
 
 
 def bare_env(
-    imitation: Imitation, worlds: int, scale: float | Tensor, threads: int, device: str
+    imitation: Imitation,
+    worlds: int,
+    scale: float | Tensor,
+    threads: int,
+    device: str,
+    rewards: bool = False,
 ) -> ImitationEnv:
-    """Worlds without a guard, rewards and ends: one that goes bad is a failure and no reason to stop.
+    """Worlds without a guard and ends: one that goes bad is a failure and no reason to stop.
 
     scale: what is left of the residual force's limits, or of those of each of the task's groups `(G,)`.
+    rewards: whether they are worked out; else only what the policy sees is.
     """
     config = imitation.config
     backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
-    # Only what the policy sees is worked out.
-    task = replace(imitation.task, rewards=(), dones=(), style=(), auto_reset=False)
+    task = replace(imitation.task, dones=(), style=(), auto_reset=False)
+    task = task if rewards else replace(task, rewards=())
     task = task if isinstance(scale, Tensor) else replace(task, help_by="all")
     env = ImitationEnv(imitation.reference, backend, task, config.sim.substeps, int(config.seed))
     env.help.set(scale)

@@ -29,7 +29,7 @@ from poise.recipes.expert import CLONE_WORLDS, Beginning, clone_expert, finetuni
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.clone import clone_for
 from poise.recipes.perpetual.paths import find_paths
-from poise.recipes.perpetual.plan import first_stage, own_recovery
+from poise.recipes.perpetual.plan import first_recovers, first_stage, own_recovery
 from poise.recipes.perpetual.progress import Stage
 from poise.recipes.perpetual.recovery import walking_clips
 from poise.recipes.perpetual.returning import odds, practised
@@ -67,7 +67,7 @@ def begin_first(
             return SECOND[stage.kind], start
         # What is trained already is the first primitive.
         known = replace(start, policy=columns_of(start.policy, config.lateral))
-        if not own_recovery(config):
+        if first_recovers(config):
             return stage, known
         return SECOND[stage.kind], begin_recovery(known, imitation, 2)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))

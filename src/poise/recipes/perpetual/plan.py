@@ -36,6 +36,11 @@ def own_recovery(config: Perpetual) -> bool:
     return config.recovery and config.recovering.primitive == "own"
 
 
+def first_recovers(config: Perpetual) -> bool:
+    """Whether the first primitive is a policy that goes on and can recover already."""
+    return config.recovery and config.recovering.primitive == "first"
+
+
 def lasts(config: Perpetual, stage: Stage) -> bool:
     """Whether no stage follows, so that this one has all the time that is left."""
     if stage.kind == "composer" or stage.mixed:

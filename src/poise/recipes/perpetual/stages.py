@@ -45,11 +45,11 @@ from poise.recipes.perpetual.next import (
 )
 from poise.recipes.perpetual.plan import (
     ends,
+    first_recovers,
     following,
     is_over,
     lasts,
     most_help,
-    own_recovery,
     primitives,
 )
 from poise.recipes.perpetual.progress import Progress, Stage, share_of
@@ -107,7 +107,7 @@ class Course:
         self.log = Log(folder, self.iteration, tensorboard)
         self._saved_at = time.monotonic()
         if not (folder / LATEST).exists():
-            if trained is not None and self.stage.kind == "primitive" and self.config.recovery:
+            if trained is not None and first_recovers(self.config):
                 # It is the first primitive as it is: what it fails is for the next one.
                 self._advance(self._judge(over=True))
             self.save()
@@ -151,8 +151,8 @@ class Course:
     @property
     def recovers(self) -> bool:
         """Whether the stage's policy learned to recover."""
-        known = self.config.recovery and not own_recovery(self.config) and self.stage.number == 1
-        return known or self.stage.recovers is not None
+        given = first_recovers(self.config) and self.stage.number == 1
+        return given or self.stage.recovers is not None
 
     @property
     def began(self) -> float:

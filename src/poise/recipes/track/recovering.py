@@ -15,7 +15,7 @@ from poise.motion import Clip, ClipLibrary, resample
 from poise.recipes.imitation import Imitation
 from poise.recipes.track.clip import Placed
 from poise.recipes.track.policy import Tracker
-from poise.recipes.track.searching import Replay
+from poise.recipes.track.replay import Replay
 
 #: A motion that is lost more often is given up, and so is who has been away for so many s.
 LOSSES, AWAY_S = 8, 30.0

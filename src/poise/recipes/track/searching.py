@@ -3,31 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
-from torch import Tensor
-
-from poise.env import Acts, Found, ImitationEnv, Search, SearchConfig
+from poise.env import Acts, Found, Search, SearchConfig
 from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual.eval import bare_env
 from poise.recipes.track.policy import Tracker
-from poise.sim import make_backend
-
-
-@dataclass(eq=False)
-class Replay:
-    """Actions `(T, A)` one after another, for the one character that they were made for; after them
-    acts the policy, if there is one."""
-
-    actions: Tensor
-    policy: Acts | None = None
-    step: int = 0
-
-    def act(self, obs: Tensor) -> Tensor:
-        """The next one, `(1, A)`; `obs` is looked at by the policy alone."""
-        at, self.step = self.step, self.step + 1
-        if at >= len(self.actions) and self.policy is not None:
-            return self.policy.act(obs)
-        return self.actions[at : at + 1]
+from poise.recipes.track.replay import Replay
 
 
 def search(
@@ -42,11 +23,8 @@ def search(
 
     threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
     """
-    backend = make_backend(imitation.humanoid.model, config.characters, "cpu", threads=threads)
     # Worlds that lose the motion may go bad; they are left behind.
-    task = replace(imitation.task, dones=(), style=(), auto_reset=False, help=None, help_by="all")
-    env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
-    env.help.set(0.0)
+    env = bare_env(imitation, config.characters, 0.0, threads, "cpu", rewards=True)
     try:
         return Search(env, tracker.policy, config, tracker.value, clip).run(show)
     finally:
