@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from speed.standing import measure, scaled, stand
 
-from poise.bench.standing import measure, scaled, stand
 from poise.body import Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
 from poise.kin import Kinematics, Stance, fit_humanoid, lowest_height, relaxed_stance
