@@ -18,13 +18,13 @@ from poise.jobs.track.policy import Tracker
 from poise.kin.keypoint_body import PointBody
 from poise.kin.keypoint_stream import KeypointStream, StreamConfig
 from poise.motion import Clip
-from poise.motion.io.arrays import Archive
-from poise.motion.io.c3d import c3d_points
-from poise.motion.io.points import RawPoints, assemble_points
-from poise.motion.io.points_arrays import array_points
-from poise.motion.io.points_csv import csv_points
+from poise.motion.io.numpy.arrays import Archive
+from poise.motion.io.points.arrays import array_points
+from poise.motion.io.points.c3d import c3d_points
+from poise.motion.io.points.csv import csv_points
+from poise.motion.io.points.raw import RawPoints, assemble_points
+from poise.motion.io.points.trc import trc_points
 from poise.motion.io.raw import Options
-from poise.motion.io.trc import trc_points
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing
 from poise.motion.points import FitConfig, fit_clip
