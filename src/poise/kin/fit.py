@@ -14,9 +14,9 @@ import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.cycle import Cycle, join_cycle
+from poise.kin.doctor.clean import CleanReport, clean_clip
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
 from poise.kin.ground import GroundFit, clip_flights, fit_ground, lowest_height

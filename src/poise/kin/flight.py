@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.flips import spells
+from poise.kin.runs import find_runs
 from poise.spatial import quat_rotate
 
 GRAVITY = 9.81
@@ -57,7 +57,7 @@ def find_flights(low: np.ndarray, height: np.ndarray, fps: float) -> tuple[Fligh
     `PARABOLA_M` with c of at least half of gravity. Spells cut off by the clip's ends count too.
     """
     found = []
-    for start, stop in spells(low - np.quantile(low, 0.1) > AIR_M, 0):
+    for start, stop in find_runs(low - np.quantile(low, 0.1) > AIR_M, 0):
         frames = stop - start + 1
         if frames < max(4, round(AIR_S * fps)):
             continue

@@ -11,7 +11,7 @@ from torch import Tensor
 from poise.body import BodyTable
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, centre_of_mass, find_flights
-from poise.kin.flips import spells
+from poise.kin.runs import find_runs
 from poise.motion import Clip
 from poise.spatial import quat_rotate
 
@@ -164,7 +164,7 @@ def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
     """How far `(T,)` m a supported body is above `HOVER_M`; through the air from its ends."""
     excess = np.maximum(height - HOVER_M, 0.0)
     air = np.zeros(len(height), dtype=bool)
-    for first, last in spells(excess > 0.0, 0):
+    for first, last in find_runs(excess > 0.0, 0):
         if height[first : last + 1].max() > ALOFT_M:
             air[first : last + 1] = True
     for flight in flights:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from poise.kin.retarget import retarget
+from poise.kin import retarget
 from poise.motion import Clip
 from poise.motion.edits import backwards
 from poise.motion.mirror import mirrored_clip

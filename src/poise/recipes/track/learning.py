@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from poise.env import Reference
-from poise.kin.clean import clean_clip
+from poise.kin.doctor.clean import clean_clip
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual

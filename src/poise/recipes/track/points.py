@@ -13,8 +13,8 @@ from torch import Tensor
 
 from poise.env import Reference
 from poise.errors import PoiseError
-from poise.kin.keypoint_body import PointBody
-from poise.kin.keypoint_stream import KeypointStream, StreamConfig
+from poise.kin.retarget.keypoint_body import PointBody
+from poise.kin.retarget.keypoint_stream import KeypointStream, StreamConfig
 from poise.motion import Clip
 from poise.motion.io.arrays import Archive
 from poise.motion.io.c3d import c3d_points
