@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from speed.stance import relaxed_stance
 from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
@@ -20,7 +21,6 @@ from poise.eval.field_card import FieldTable
 from poise.eval.field_table import field_table
 from poise.eval.recovery import KINDS, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
-from poise.kin import relaxed_stance
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary

@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 
 import torch
+from speed.standing import measure, scaled, table_lines
 
-from poise.bench.standing import measure, scaled, table_lines
 from poise.body import generate_table
 from poise.motion import Clip, read_clip
 

@@ -23,7 +23,6 @@ from poise.kin.ik.polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
-from poise.kin.stance import Stance, relaxed_stance
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
@@ -46,7 +45,6 @@ __all__ = [
     "Polished",
     "RetargetConfig",
     "RetargetReport",
-    "Stance",
     "Support",
     "TwoBone",
     "analytic_ik",
@@ -78,7 +76,6 @@ __all__ = [
     "polish",
     "qpos_to_clip",
     "qpos_velocity",
-    "relaxed_stance",
     "retarget",
     "support_of",
     "swap_sides",

@@ -9,10 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from speed.stance import Stance, polygon_margin, relaxed_stance
 
 from poise.body import BodyConfig, Humanoid
-from poise.kin import Kinematics, Stance, fit_ground, fit_humanoid, lowest_height, relaxed_stance
-from poise.kin.stance import polygon_margin
+from poise.kin import Kinematics, fit_ground, fit_humanoid, lowest_height
 from poise.motion import Clip, Skeleton
 from poise.sim import SimConfig
 

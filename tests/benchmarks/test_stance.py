@@ -9,12 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from speed.stance import Stance, polygon_margin, relaxed_stance, sole_corners, support_polygon
+from speed.standing import measure, scaled, stand
 
-from poise.bench.standing import measure, scaled, stand
 from poise.body import Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import Kinematics, Stance, fit_humanoid, lowest_height, relaxed_stance
-from poise.kin.stance import polygon_margin, sole_corners, support_polygon
+from poise.kin import Kinematics, fit_humanoid, lowest_height
 from poise.motion import Clip, read_clip, trim
 from rigs import rig
 from toy_human import human, swing
