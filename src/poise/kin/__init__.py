@@ -13,7 +13,7 @@ from poise.kin.feet.hold import Held, hold_feet
 from poise.kin.feet.level import Levelled, level_feet
 from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
-from poise.kin.ground import GroundFit, fit_ground, lowest_height
+from poise.kin.ground import GroundFit, fit_ground
 from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik.analytic import analytic_ik, clip_ik
 from poise.kin.ik.body import IkBody, ik_body
@@ -23,6 +23,7 @@ from poise.kin.ik.polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
+from poise.kin.solids import lowest_height
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from poise.body import BodyTable, generate_table
+from poise.kin import lowest_height
 from poise.kin.doctor.alone import (
     AloneRules,
     balance_point,
@@ -17,7 +18,7 @@ from poise.kin.doctor.alone import (
     longest_alone,
     not_alone,
 )
-from poise.kin.ground import fit_heights, lowest_height
+from poise.kin.ground import fit_heights
 from poise.motion import Clip, shifted
 from toy_human import human, swing, turn
 

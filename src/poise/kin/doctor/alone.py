@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.flight import GRAVITY, Flight, centre_of_mass, find_flights
+from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
 from poise.kin.runs import find_runs
+from poise.kin.solids import centre_of_mass
 from poise.motion import Clip
-from poise.spatial import quat_rotate
+from poise.spatial import GRAVITY, quat_rotate
 
 Kind = Literal["held", "leaning", "below"]
 #: Standard deviation (s) of the low-pass on the centre of mass before it is differentiated twice.

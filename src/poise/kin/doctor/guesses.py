@@ -13,8 +13,9 @@ from poise.errors import PoiseError
 from poise.kin.doctor.flips import neutral_pose
 from poise.kin.doctor.sides import exchanged_sides, side_votes
 from poise.kin.doctor.support import SOLE_M, Support, anatomy_of, support_of
-from poise.kin.flight import GRAVITY, clear_fall, likely_rate
+from poise.kin.flight import clear_fall, likely_rate
 from poise.motion import Clip, ground_shift
+from poise.spatial import GRAVITY
 
 _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches"}
 _WORDS = {"feet": "where the feet point", "knees": "where the knees bend", "travel": "where it goes"}

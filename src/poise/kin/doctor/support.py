@@ -13,9 +13,9 @@ from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.doctor.faults import Fault, spell_faults
 from poise.kin.feet.lead import Sole
-from poise.kin.flight import centre_of_mass
-from poise.kin.ground import HOVER_M, GroundFit, fit_heights, lowest_height
+from poise.kin.ground import HOVER_M, GroundFit, fit_heights
 from poise.kin.runs import find_runs
+from poise.kin.solids import centre_of_mass, lowest_height
 from poise.metrics import foot_contacts
 from poise.motion import Clip
 from poise.spatial import quat_rotate

@@ -16,8 +16,9 @@ from torch.nn import functional
 from poise.body import BodyTable
 from poise.kin.doctor.support import soles_of
 from poise.kin.feet.lead import Sole, lead, led
-from poise.kin.ground import lowest_height, smooth_hull
+from poise.kin.ground import smooth_hull
 from poise.kin.runs import find_runs
+from poise.kin.solids import lowest_height
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
 from poise.motion import Clip
 

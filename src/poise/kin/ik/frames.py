@@ -8,11 +8,13 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import torch
 
 from poise.kin.ik.bend import bend_normals, held_normals
 from poise.kin.ik.body import IkBody
 from poise.kin.ik.config import IkConfig
-from poise.kin.ik.vectors import best_rotation, columns, cross, frame_of, norm, square_to, unit
+from poise.kin.ik.vectors import columns, cross, frame_of, norm, square_to, unit
+from poise.spatial import best_rotation
 
 
 class Frames:
@@ -59,7 +61,9 @@ class Frames:
         at = list(body.clusters[row])
         here = body.rest_pos[at] - body.rest_pos[at[0]]
         there = self.p[:, at] - self.p[:, at[:1]]
-        return best_rotation(here, there) @ body.trunk
+        # M = sum there here^T
+        turn, _ = best_rotation(torch.tensor(np.einsum("tki,kj->tij", there, here)))
+        return turn.numpy() @ body.trunk
 
     def _spine(self) -> None:
         """Eqs. 17 and 18: the rows between the pelvis and the lower neck."""

@@ -92,16 +92,3 @@ def prefix_product(m: np.ndarray) -> np.ndarray:
         out = np.concatenate((out[:reach], out[reach:] @ out[:-reach]))
         reach *= 2
     return out
-
-
-def best_rotation(here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Rotations `(T, 3, 3)` that bring points `here (K, 3)` nearest to `there (T, K, 3)` (Kabsch 1976).
-
-    Both are relative to the same origin, which is kept.
-    """
-    # H = sum here there^T = U S V^T, R = V diag(1, 1, det) U^T
-    h = np.einsum("ki,tkj->tij", here, there)
-    u, _, vt = np.linalg.svd(h)
-    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    vt[:, 2] *= sign[:, None]
-    return np.swapaxes(u @ vt, -1, -2)
