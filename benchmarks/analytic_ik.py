@@ -34,8 +34,8 @@ from poise.kin import (
     paper_humanoid,
     polish,
 )
-from poise.kin.ik_angles import count_jumps
-from poise.kin.ik_body import body_points
+from poise.kin.ik.angles import count_jumps
+from poise.kin.ik.body import body_points
 from poise.motion import Clip, read_clip
 from poise.spatial import quat_to_matrix
 

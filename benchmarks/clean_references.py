@@ -17,8 +17,9 @@ import torch
 
 from poise.body import BodyTable, find_anatomy, generate_table
 from poise.kin import Kinematics, clean_clip, clip_to_qpos, fit_humanoid, lowest_height
-from poise.kin.flight import centre_of_mass, clear_fall, find_flights, likely_rate
-from poise.kin.flips import out_of_reach
+from poise.kin.doctor.flips import out_of_reach
+from poise.kin.flight import clear_fall, find_flights, likely_rate
+from poise.kin.solids import centre_of_mass
 from poise.motion import Clip, read_clip, resample
 from poise.spatial import quat_angle, quat_conj, quat_mul
 

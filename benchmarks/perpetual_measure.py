@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from speed.stance import relaxed_stance
 from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
@@ -29,7 +30,6 @@ from poise.jobs.runs import RUN_FILE
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.track.policy import Tracker, tracker_of
-from poise.kin import relaxed_stance
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary

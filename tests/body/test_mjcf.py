@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from speed.stance import relaxed_stance
 
 from poise.body import BodyConfig, make_humanoid, read_mjcf
 from poise.errors import PoiseError
-from poise.kin import Kinematics, fit_humanoid, relaxed_stance
+from poise.kin import Kinematics, fit_humanoid
 from poise.recipes.residual_force import ResidualForce, build
 from rigs import rig
 

@@ -16,8 +16,18 @@ from torch import Tensor
 import poise
 from poise.cli.main import main as command
 from poise.control import SuccessHelp
-from poise.env import ImitationEnv, SearchConfig
+from poise.env import ImitationEnv
 from poise.eval import read_score
+from poise.jobs.deliver import deliver
+from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual.demonstrations import odds, practised
+from poise.jobs.perpetual.progress import Stage
+from poise.jobs.perpetual.stage_initialisation import staged
+from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
+from poise.jobs.track import TrackConfig, Tracked, imitation_of, track, write
+from poise.jobs.track.noise import noise_of
+from poise.jobs.track.placement import place
+from poise.jobs.track.policy import open_tracker
 from poise.learn import (
     AmpConfig,
     CloneConfig,
@@ -27,22 +37,13 @@ from poise.learn import (
     load_checkpoint,
 )
 from poise.motion import Clip, ClipLibrary, Skeleton, read_clip, trim, write_clip
+from poise.plan import SamplingConfig
 from poise.recipes import ResidualForce
 from poise.recipes import build as build_imitation
-from poise.recipes.deliver import deliver
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
 from poise.recipes.perpetual import build as build_perpetual
-from poise.recipes.perpetual import run as perpetual_run
-from poise.recipes.perpetual.next import staged
-from poise.recipes.perpetual.progress import Stage
-from poise.recipes.perpetual.returning import odds, practised
 from poise.recipes.perpetual.shapes import BodyShapes
-from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
-from poise.recipes.track import TrackConfig, Tracked, imitation_of, track, write
-from poise.recipes.track.clip import place
-from poise.recipes.track.noise import noise_of
-from poise.recipes.track.policy import open_tracker
 
 WHERE = Path(poise.__file__).parent
 WALK = WHERE / "data/walk.bvh"
@@ -88,7 +89,7 @@ def tiny(**changes: Any) -> Perpetual:
         "clone": CloneConfig(steps=4, rounds=1, critic_steps=4),
         "recovery": False,
         "recovering": RecoveryPlan(
-            share=0.3, falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2), ways=4
+            share=0.3, falls=4, trials=2, final_trials=2, seconds=(0.1, 0.2), demonstrations=4
         ),
         "convergence": ConvergenceConfig(patience=1),
         "style": None,
@@ -255,7 +256,7 @@ def job_track(folder: Path) -> dict[str, np.ndarray]:
 
 
 def job_track_search(folder: Path) -> dict[str, np.ndarray]:
-    search = SearchConfig(characters=64, retries=2, rounds=2)
+    search = SamplingConfig(characters=64, retries=2, rounds=2)
     done = track(open_tracker(), aside(0.6), TrackConfig(search=search, search_threads=1))
     assert done.found is not None and done.found.whole
     return _tracked(done, folder)

@@ -11,6 +11,15 @@ from typing import Any
 
 import cases
 import numpy as np
+from poise.recipes.deliver import deliver
+from poise.recipes.perpetual.next import staged
+from poise.recipes.perpetual.progress import Stage
+from poise.recipes.perpetual.returning import odds, practised
+from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
+from poise.recipes.track import TrackConfig, Tracked, imitation_of, track, write
+from poise.recipes.track.clip import place
+from poise.recipes.track.noise import noise_of
+from poise.recipes.track.policy import open_tracker
 from torch import Tensor
 
 import poise
@@ -29,20 +38,11 @@ from poise.learn import (
 from poise.motion import Clip, ClipLibrary, Skeleton, read_clip, trim, write_clip
 from poise.recipes import ResidualForce
 from poise.recipes import build as build_imitation
-from poise.recipes.deliver import deliver
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
 from poise.recipes.perpetual import build as build_perpetual
 from poise.recipes.perpetual import run as perpetual_run
-from poise.recipes.perpetual.next import staged
-from poise.recipes.perpetual.progress import Stage
-from poise.recipes.perpetual.returning import odds, practised
 from poise.recipes.perpetual.shapes import BodyShapes
-from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
-from poise.recipes.track import TrackConfig, Tracked, imitation_of, track, write
-from poise.recipes.track.clip import place
-from poise.recipes.track.noise import noise_of
-from poise.recipes.track.policy import open_tracker
 
 WHERE = Path(poise.__file__).parent
 WALK = WHERE / "data/walk.bvh"

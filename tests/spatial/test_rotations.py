@@ -226,3 +226,21 @@ def test_unwrap_flips_signs_only():
 
 def test_normalize_leaves_zero():
     assert spatial.normalize(torch.zeros(2, 3)).tolist() == [[0, 0, 0], [0, 0, 0]]
+
+
+def test_the_best_rotation_is_the_one_that_was_applied():
+    rng = torch.Generator().manual_seed(3)
+    turns = spatial.quat_to_matrix(
+        spatial.normalize(torch.randn(5, 4, dtype=torch.float64, generator=rng))
+    )
+    points = torch.randn(4, 3, dtype=torch.float64, generator=rng)
+    for cloud in (points, points * torch.tensor([1.0, 1.0, 0.0])):
+        moved = cloud @ turns.mT
+        found, values = spatial.best_rotation(moved.mT @ cloud)
+        torch.testing.assert_close(found, turns)
+        # tr(R^T M) is the sum of the values, and that of the squares of the points.
+        torch.testing.assert_close(values.sum(-1), cloud.square().sum().expand(5))
+    # A mirror image is no rotation.
+    found, values = spatial.best_rotation(-torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones((), dtype=torch.float64))
+    torch.testing.assert_close(values.sum(), torch.tensor(1.0, dtype=torch.float64))

@@ -83,7 +83,7 @@ def _tell(json: bool, facts: dict[str, Any], title: str, found: Examination) -> 
 
 def _rows(found: Examination) -> list[tuple[str, str, str, str, str]]:
     from poise.kin import by_kind
-    from poise.kin.faults import KINDS
+    from poise.kin.doctor.faults import KINDS
 
     rows = []
     for name, faults in by_kind(found.faults).items():
@@ -99,7 +99,7 @@ def _rows(found: Examination) -> list[tuple[str, str, str, str, str]]:
 
 
 def _size(fault: Fault) -> str:
-    from poise.kin.faults import KINDS
+    from poise.kin.doctor.faults import KINDS
 
     unit = KINDS[fault.kind].unit
     number = f"{fault.size:.3g} {unit}".strip()

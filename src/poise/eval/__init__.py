@@ -1,7 +1,7 @@
 """Evaluation: padded rollouts in, a score card with stable keys out."""
 
 from poise.eval.clip_figures import clip_figures
-from poise.eval.episodes import Recording, run_episodes, run_in_batches, shapes_of, start_frames
+from poise.eval.episodes import Recording, run_episodes, run_in_batches, start_frames
 from poise.eval.field_card import FieldTable, markdown, read_field_table, write_field_table
 from poise.eval.field_paper import PHC_RECOVERY, PHC_ROWS, paper_rows
 from poise.eval.field_table import field_table
@@ -32,7 +32,6 @@ __all__ = [
     "run_episodes",
     "run_in_batches",
     "score_rollouts",
-    "shapes_of",
     "start_frames",
     "table",
     "trial_task",

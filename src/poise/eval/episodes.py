@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.body import BodyTable
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval.rolloutset import RolloutSet
-from poise.metrics import Shapes
-from poise.metrics.shapes import KINDS
+from poise.kin.solids import shapes_of
 
 #: Frames of a part of rollouts: 110 MB of 20 bodies.
 PADDED = 100_000
@@ -114,7 +112,7 @@ def run_episodes(
         fps=ref.rate_hz,
         mass=humanoid.mass,
         feet=humanoid.feet,
-        shapes=shapes_of(humanoid.table),
+        shapes=shapes_of(humanoid.table, torch.float32),
         limit_n=limit_n,
         limit_nm=limit_nm,
         ref_min_height=ref.min_height[clip],
@@ -153,19 +151,6 @@ def run_in_batches(
         fits = (torch.arange(1, len(order) + 1) * length[order].cummax(0).values <= most).sum()
         rows, order = order[: max(1, int(fits))], order[max(1, int(fits)) :]
         yield run_episodes(make_env, policy, clip[rows], start[rows], limit_n, limit_nm, cycles)[0]
-
-
-def shapes_of(table: BodyTable) -> Shapes:
-    """The geoms of a body table as the metrics take them."""
-    geoms = [(i, g, r.mass / len(r.geoms)) for i, r in enumerate(table.rows) for g in r.geoms]
-    return Shapes(
-        kind=torch.tensor([KINDS[g.kind] for _, g, _ in geoms]),
-        size=torch.tensor([g.size for _, g, _ in geoms], dtype=torch.float32),
-        pos=torch.tensor([g.pos for _, g, _ in geoms], dtype=torch.float32),
-        quat=torch.tensor([g.quat for _, g, _ in geoms], dtype=torch.float32),
-        body=torch.tensor([i for i, _, _ in geoms]),
-        mass=torch.tensor([m for _, _, m in geoms], dtype=torch.float32),
-    )
 
 
 class _Store:

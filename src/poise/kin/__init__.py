@@ -1,29 +1,29 @@
 """Kinematics of a humanoid: clips cleaned and healed, to generalized coordinates and back, ground."""
 
-from poise.kin.clean import CleanReport, Faults, clean_clip, find_faults
-from poise.kin.contacts import contact_labels
 from poise.kin.coords import clip_to_qpos, qpos_to_clip
 from poise.kin.cycle import Cycle, close_cycle, cycle_step, cycle_velocity
-from poise.kin.doctor import Examination, examine, heal
-from poise.kin.faults import Fault, by_kind
+from poise.kin.doctor.clean import CleanReport, Faults, clean_clip, find_faults
+from poise.kin.doctor.doctor import Examination, examine, heal
+from poise.kin.doctor.faults import Fault, by_kind
+from poise.kin.doctor.guesses import Guess, find_guesses, grounded
+from poise.kin.doctor.sides import swap_sides
+from poise.kin.doctor.support import Support, anatomy_of, support_of
+from poise.kin.feet.contacts import contact_labels
+from poise.kin.feet.hold import Held, hold_feet
+from poise.kin.feet.level import Levelled, level_feet
 from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
-from poise.kin.ground import GroundFit, fit_ground, lowest_height
-from poise.kin.guesses import Guess, find_guesses, grounded
+from poise.kin.ground import GroundFit, fit_ground
 from poise.kin.hinges import chain_angles, chain_quat
-from poise.kin.hold import Held, hold_feet
-from poise.kin.ik import analytic_ik, clip_ik
-from poise.kin.ik_body import IkBody, ik_body
-from poise.kin.ik_config import CORRECTIONS, IkConfig
-from poise.kin.ik_paper import paper_humanoid
-from poise.kin.ik_polish import PolishConfig, Polished, polish
-from poise.kin.level import Levelled, level_feet
+from poise.kin.ik.analytic import analytic_ik, clip_ik
+from poise.kin.ik.body import IkBody, ik_body
+from poise.kin.ik.config import CORRECTIONS, IkConfig
+from poise.kin.ik.paper import paper_humanoid
+from poise.kin.ik.polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
-from poise.kin.retarget import RetargetConfig, retarget
-from poise.kin.retarget_report import RetargetReport
-from poise.kin.sides import swap_sides
-from poise.kin.stance import Stance, relaxed_stance
-from poise.kin.support import Support, anatomy_of, support_of
+from poise.kin.retarget.report import RetargetReport
+from poise.kin.retarget.transfer import RetargetConfig, retarget
+from poise.kin.solids import lowest_height
 from poise.kin.velocity import qpos_velocity
 
 __all__ = [
@@ -46,7 +46,6 @@ __all__ = [
     "Polished",
     "RetargetConfig",
     "RetargetReport",
-    "Stance",
     "Support",
     "TwoBone",
     "analytic_ik",
@@ -78,7 +77,6 @@ __all__ = [
     "polish",
     "qpos_to_clip",
     "qpos_velocity",
-    "relaxed_stance",
     "retarget",
     "support_of",
     "swap_sides",

@@ -14,13 +14,14 @@ import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
 from poise.kin.cycle import Cycle, join_cycle
+from poise.kin.doctor.clean import CleanReport, clean_clip
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
-from poise.kin.ground import GroundFit, clip_flights, fit_ground, lowest_height
+from poise.kin.ground import GroundFit, clip_flights, fit_ground
 from poise.kin.own_body import on_own_body
+from poise.kin.solids import lowest_height
 from poise.motion import Clip, ClipLibrary, resample
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 

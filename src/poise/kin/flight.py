@@ -7,14 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from poise.body import BodyTable
-from poise.kin.flips import spells
-from poise.spatial import quat_rotate
+from poise.kin.runs import find_runs
+from poise.spatial import GRAVITY
 
-GRAVITY = 9.81
 #: A body may be in flight where its lowest point is this far (m) above where it mostly touches down, for
 #: this long (s). Shorter and lower hops say nothing, since a foot's own roll lifts its sole as much.
 AIR_M, AIR_S = 0.06, 0.1
@@ -39,17 +35,6 @@ class Flight:
     rms_m: float
 
 
-def centre_of_mass(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
-    """`(..., 3)` m from world body poses; a body's mass sits in the middle of its shapes."""
-    total = torch.zeros_like(pos[..., 0, :])
-    for i, row in enumerate(table.rows):
-        middle = torch.tensor(np.mean([g.pos for g in row.geoms], 0), dtype=pos.dtype)
-        total = total + row.mass * (
-            pos[..., i, :] + quat_rotate(quat[..., i, :], middle.expand_as(total))
-        )
-    return total / table.mass
-
-
 def find_flights(low: np.ndarray, height: np.ndarray, fps: float) -> tuple[Flight, ...]:
     """Flights of a body with lowest points `low (T)` and centre of mass at `height (T)`, both m.
 
@@ -57,7 +42,7 @@ def find_flights(low: np.ndarray, height: np.ndarray, fps: float) -> tuple[Fligh
     `PARABOLA_M` with c of at least half of gravity. Spells cut off by the clip's ends count too.
     """
     found = []
-    for start, stop in spells(low - np.quantile(low, 0.1) > AIR_M, 0):
+    for start, stop in find_runs(low - np.quantile(low, 0.1) > AIR_M, 0):
         frames = stop - start + 1
         if frames < max(4, round(AIR_S * fps)):
             continue

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kin.fk import Kinematics
-from poise.kin.flight import Flight, centre_of_mass, find_flights
-from poise.kin.flips import spells
+from poise.kin.flight import Flight, find_flights
+from poise.kin.runs import find_runs
+from poise.kin.solids import centre_of_mass, lowest_height
 from poise.motion import Clip
 from poise.spatial import quat_rotate
 
@@ -69,37 +70,12 @@ class GroundFit:
         }
 
 
-def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
-    """`(..., B)` m, the lowest point of each body's shapes, from world body poses."""
-    out = []
-    for i, row in enumerate(table.rows):
-        heights = [_lowest(g, pos[..., i, :], quat[..., i, :]) for g in row.geoms]
-        out.append(torch.stack(heights, -1).min(-1).values)
-    return torch.stack(out, -1)
-
-
 def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
     """The flights of a clip at its own frame rate."""
     joints = [r.joint for r in table.rows]
     pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
     low = lowest_height(table, pos, quat).min(-1).values.numpy()
     return find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), clip.fps)
-
-
-def _lowest(geom, pos: Tensor, quat: Tensor) -> Tensor:
-    local = torch.tensor(geom.pos, dtype=pos.dtype).expand_as(pos)
-    centre = pos[..., 2] + quat_rotate(quat, local)[..., 2]
-    size = geom.size
-    turn = torch.tensor(geom.quat, dtype=pos.dtype)
-    ups = [
-        quat_rotate(quat, quat_rotate(turn, torch.eye(3, dtype=pos.dtype)[k]).expand_as(pos))[..., 2]
-        for k in range(3)
-    ]
-    if geom.kind == "sphere":
-        return centre - size[0]
-    if geom.kind == "capsule":
-        return centre - ups[2].abs() * size[1] - size[0]
-    return centre - sum(up.abs() * s for up, s in zip(ups, size, strict=True))
 
 
 def fit_ground(
@@ -164,7 +140,7 @@ def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
     """How far `(T,)` m a supported body is above `HOVER_M`; through the air from its ends."""
     excess = np.maximum(height - HOVER_M, 0.0)
     air = np.zeros(len(height), dtype=bool)
-    for first, last in spells(excess > 0.0, 0):
+    for first, last in find_runs(excess > 0.0, 0):
         if height[first : last + 1].max() > ALOFT_M:
             air[first : last + 1] = True
     for flight in flights:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from poise.body import BodyConfig, BodyTable, read_mjcf
-from poise.kin.retarget import retarget
+from poise.kin.retarget.transfer import retarget
 from poise.motion import ClipLibrary
 
 

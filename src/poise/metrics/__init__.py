@@ -1,6 +1,6 @@
 """Pure functions that score motion: tracking, plausibility, help; definitions in docs/metrics.md."""
 
-from poise.metrics.help import GRAVITY, HelpAudit, help_audit
+from poise.metrics.help import HelpAudit, help_audit
 from poise.metrics.inbetween import Physics, l2p, l2q, npss, physics
 from poise.metrics.masking import masked_mean, masked_quantile, span_mask
 from poise.metrics.plausibility import (
@@ -34,7 +34,6 @@ from poise.metrics.tracking import (
 )
 
 __all__ = [
-    "GRAVITY",
     "KINDS",
     "RULES",
     "HelpAudit",

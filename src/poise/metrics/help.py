@@ -12,9 +12,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.metrics.masking import masked_mean, masked_quantile
-
-GRAVITY = 9.81
-"""Standard gravity, m/s^2."""
+from poise.spatial import GRAVITY
 
 
 @dataclass(frozen=True, eq=False)

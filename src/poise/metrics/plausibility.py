@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.metrics.help import GRAVITY
 from poise.metrics.masking import masked_mean, span_mask
 from poise.metrics.tracking import MM, PHC_FPS
+from poise.spatial import GRAVITY
 
 CONTACT_HEIGHT = 0.02
 """m; a foot point above this is not in contact."""

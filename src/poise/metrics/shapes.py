@@ -6,12 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.spatial import normalize, quat_mul, quat_rotate, quat_to_matrix
+from poise.spatial import normalize, quat_mul, quat_rotate
 
 SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 2, 3, 4, 5, 6
 """Geom kinds by MuJoCo's `mjtGeom` numbers."""
@@ -77,8 +78,21 @@ class Shapes:
         return Shapes(*parts, mass=mass)
 
 
-def _placed(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> tuple[Tensor, Tensor, Tensor]:
-    """World geom centres `(..., G, 3)` and rotations `(..., G, 4)`, sizes `(G, 3)`; one dtype."""
+class _Placed(NamedTuple):
+    """Geoms in the world, one dtype.
+
+    centre: `(..., G, 3)` m. body: `(..., G, 4)` wxyz, their bodies' rotations. own: `(G, 4)` wxyz, their
+    own in their bodies. size: `(G, 3)` m.
+    """
+
+    centre: Tensor
+    body: Tensor
+    own: Tensor
+    size: Tensor
+
+
+def _placed(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> _Placed:
+    """The geoms where the bodies carry them."""
     if (*body_pos.shape[:-1], 4) != tuple(body_quat.shape) or body_pos.shape[-1] != 3:
         raise PoiseError(
             f"body poses must be (..., B, 3) and (..., B, 4), got {tuple(body_pos.shape)} "
@@ -89,10 +103,12 @@ def _placed(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> tuple[Tensor
             f"shapes name body {int(shapes.body.max())}, but the poses hold {body_pos.shape[-2]} bodies"
         )
     pos, quat, size = (a.to(body_pos) for a in (shapes.pos, shapes.quat, shapes.size))
-    quat = normalize(quat)
+    # Unit quaternions keep every digit.
+    off = (quat.norm(dim=-1, keepdim=True) - 1.0).abs() > 4 * torch.finfo(quat.dtype).eps
+    quat = torch.where(off, normalize(quat), quat)
     owner = shapes.body.to(body_pos.device)
     p, q = body_pos[..., owner, :], body_quat[..., owner, :]
-    return p + quat_rotate(q, pos.expand_as(p)), quat_mul(q, quat.expand_as(q)), size
+    return _Placed(p + quat_rotate(q, pos.expand_as(p)), q, quat, size)
 
 
 def geom_heights(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
@@ -100,24 +116,26 @@ def geom_heights(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
 
     The support function of each solid in direction -z; `n` is the world's z in geom axes.
     """
-    centre, quat, size = _placed(body_pos, body_quat, shapes)
-    n = quat_to_matrix(quat)[..., 2, :].abs()
-    kind = shapes.kind.to(body_pos.device)
-    r, half = size[:, 0], size[:, 1]
-    # sphere r;  capsule r + h |n_z|;  ellipsoid sqrt(sum (s_i n_i)^2);
+    centre, body, own, size = _placed(body_pos, body_quat, shapes)
+    axes = quat_rotate(own[:, None].expand(-1, 3, -1), torch.eye(3).to(size).expand(len(own), 3, 3))
+    turn = body[..., None, :].expand(*body.shape[:-1], 3, 4)
+    n = quat_rotate(turn, axes.expand(*turn.shape[:-1], 3))[..., 2].abs()
+    r, half, z = size[:, 0], size[:, 1], centre[..., 2]
+    # sphere r;  capsule h |n_z| + r;  ellipsoid sqrt(sum (s_i n_i)^2);
     # cylinder r sqrt(1 - n_z^2) + h |n_z|;  box sum s_i |n_i|
-    reach = torch.stack(
+    x, y, w = (n * size).unbind(-1)
+    low = torch.stack(
         (
-            r.expand_as(n[..., 0]),
-            r + half * n[..., 2],
-            (size * n).square().sum(-1).sqrt(),
-            r * (1 - n[..., 2].square()).clamp_min(0).sqrt() + half * n[..., 2],
-            (size * n).sum(-1),
+            z - r,
+            z - n[..., 2] * half - r,
+            z - (size * n).square().sum(-1).sqrt(),
+            z - (r * (1 - n[..., 2].square()).clamp_min(0).sqrt() + half * n[..., 2]),
+            z - (x + y + w),
         ),
         -1,
     )
-    picked = reach.gather(-1, (kind - SPHERE).expand_as(n[..., 0]).unsqueeze(-1)).squeeze(-1)
-    return centre[..., 2] - picked
+    kind = (shapes.kind.to(z.device) - SPHERE).expand_as(z)
+    return low.gather(-1, kind.unsqueeze(-1)).squeeze(-1)
 
 
 def lowest_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
@@ -164,7 +182,8 @@ def foot_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes, feet: Seque
     has no speed where it touches.
     """
     owned = shapes.of_bodies(feet)
-    centre, quat, size = _placed(body_pos, body_quat, owned)
+    centre, body, own, size = _placed(body_pos, body_quat, owned)
+    quat = quat_mul(body, own.expand_as(body))
     points = []
     for g in range(len(owned)):
         local = _surface(int(owned.kind[g]), size[g])
@@ -175,7 +194,7 @@ def foot_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes, feet: Seque
 
 def centre_of_mass(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
     """Centre of mass `(..., 3)` m from the geoms' masses, or from their volumes (one density)."""
-    centre, _, size = _placed(body_pos, body_quat, shapes)
+    centre, _, _, size = _placed(body_pos, body_quat, shapes)
     if shapes.mass is not None:
         weight = shapes.mass.to(size)
     else:

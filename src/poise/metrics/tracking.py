@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
+from poise.spatial import best_rotation
 
 MM = 1000.0
 PHC_FPS = 30.0
@@ -54,20 +55,15 @@ def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
 def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
     """MPJPE after the best similarity (rotation, translation, scale) per frame, mm; returns `(..., T)`.
 
-    Procrustes: with centred X, Y and `X^T Y = U S V^T`, `R = V D U^T`, `D = diag(1, 1, det(V U^T))`,
-    `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
+    Procrustes: with centred X, Y the rotation R of `Y^T X` (`spatial.best_rotation`), whose values are
+    S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
     """
     _check_pair(pos, ref)
     x, y = pos.double(), ref.double()
     x, y = x - x.mean(-2, keepdim=True), y - y.mean(-2, keepdim=True)
-    u, s, vh = torch.linalg.svd(x.mT @ y)
-    v = vh.mT
-    sign = torch.linalg.det(v @ u.mT).sign()
-    d = torch.ones_like(s)
-    d[..., 2] = torch.where(sign < 0, -1.0, 1.0)
-    rotation = v @ (d.unsqueeze(-1) * u.mT)
+    rotation, values = best_rotation(y.mT @ x)
     size = x.square().sum((-1, -2))
-    scale = (s * d).sum(-1) / size.clamp_min(1e-18)
+    scale = values.sum(-1) / size.clamp_min(1e-18)
     fitted = scale[..., None, None] * (x @ rotation.mT)
     return ((fitted - y).norm(dim=-1).mean(-1) * MM).to(pos.dtype)
 

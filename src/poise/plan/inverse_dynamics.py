@@ -15,6 +15,7 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.plan.clearance import TouchPoints
+from poise.spatial import GRAVITY
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def _contact_forces(
     cones become the bounds of a small quadratic programme, min |A s - goal|^2 + s^T P s, s >= 0.
     """
     edges = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1.0]])
-    weight = float(model.body_subtreemass[1]) * 9.81
+    weight = float(model.body_subtreemass[1]) * GRAVITY
     root, turn = data.qpos[:3], data.xmat[1].reshape(3, 3)
     k = len(place)
     push = np.tile(edges, (k, 1))

@@ -1,6 +1,14 @@
 """Rotations and rigid transforms: torch, quaternions wxyz, any leading batch dimensions."""
 
-from poise.spatial.directions import across, cluster_quat, frame_quat, rejected, shortest_arc
+from poise.spatial.constants import GRAVITY
+from poise.spatial.directions import (
+    across,
+    best_rotation,
+    cluster_quat,
+    frame_quat,
+    rejected,
+    shortest_arc,
+)
 from poise.spatial.rotations import (
     axis_angle_to_quat,
     axis_heading,
@@ -28,9 +36,11 @@ from poise.spatial.rotations import (
 from poise.spatial.tree import forward_kinematics, matrix_kinematics
 
 __all__ = [
+    "GRAVITY",
     "across",
     "axis_angle_to_quat",
     "axis_heading",
+    "best_rotation",
     "cluster_quat",
     "euler_to_quat",
     "forward_kinematics",

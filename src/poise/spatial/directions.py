@@ -53,11 +53,22 @@ def frame_quat(axis: Tensor, normal: Tensor) -> Tensor:
 def cluster_quat(template: Tensor, vectors: Tensor, weights: Tensor) -> Tensor:
     """wxyz `(..., 4)` of the rotation R that brings `template (K, 3)` nearest to `vectors (..., K, 3)`.
 
-    Minimises sum_k w_k |R t_k - v_k|^2 (Wahba 1965) by the singular values of sum_k w_k v_k t_k^T
-    (Kabsch 1976); mirror images are excluded. Needs two directions that are not parallel.
+    Minimises sum_k w_k |R t_k - v_k|^2 (Wahba 1965) by `best_rotation` of sum_k w_k v_k t_k^T. Needs two
+    directions that are not parallel.
     """
-    b = torch.einsum("...ki,kj,k->...ij", vectors, template, weights)
-    u, _, vt = torch.linalg.svd(b)
-    flip = torch.ones_like(b[..., 0])
+    return matrix_to_quat(
+        best_rotation(torch.einsum("...ki,kj,k->...ij", vectors, template, weights))[0]
+    )
+
+
+def best_rotation(m: Tensor) -> tuple[Tensor, Tensor]:
+    """The rotation R `(..., 3, 3)` of largest tr(R^T M), and the singular values `(..., 3)` of R^T M.
+
+    For M = sum_k v_k t_k^T it brings the points t_k nearest to v_k. With M = U S V^T it is
+    R = U diag(1, 1, d) V^T, where d = det(U V^T) leaves mirror images out and takes the sign of the
+    last of the values (Kabsch 1976).
+    """
+    u, s, vt = torch.linalg.svd(m)
+    flip = torch.ones_like(m[..., 0])
     flip[..., 2] = torch.linalg.det(u @ vt)
-    return matrix_to_quat((u * flip.unsqueeze(-2)) @ vt)
+    return (u * flip.unsqueeze(-2)) @ vt, s * flip

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.kin.lead import Lead, Sole, lead, led
+from poise.kin.feet.lead import Lead, Sole, lead, led
 from poise.motion import Skeleton
 from poise.spatial import forward_kinematics
 from poise.synth.steps import missing_steps, rises, stepping

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from poise.kin.common_pose import CommonPose
-from poise.kin.plant import Scale
-from poise.kin.retarget import passage, transfer
-from poise.kin.standing import World
+from poise.kin.retarget.common_pose import CommonPose
+from poise.kin.retarget.plant import Scale
+from poise.kin.retarget.standing import World
+from poise.kin.retarget.transfer import passage, transfer
 from poise.motion.clip import Clip
 from poise.motion.joint_map import JointMap, map_joints
 from poise.spatial import forward_kinematics, normalize, quat_conj, quat_mul, unwrap_quats

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.kin.flips import spells
+from poise.kin.runs import find_runs
 
 #: Below this distance (m) of ankle or toes, whichever is less, a foot shuffles, turns or rolls.
 LEAST_M = 0.05
@@ -88,7 +88,7 @@ def rises(soles: Tensor, stands: Tensor, clear: float = CLEAR_M) -> Tensor:
     free = ~stands
     free[[0, -1]] = False
     for k in range(stands.shape[1]):
-        for first, last in spells(free[:, k].numpy(), 0):
+        for first, last in find_runs(free[:, k].numpy(), 0):
             gone = soles[last + 1, k, :, :2] - soles[first - 1, k, :, :2]
             if gone.norm(dim=-1).amin() <= LEAST_M:
                 continue

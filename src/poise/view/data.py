@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError
-
-GRAVITY = 9.81
-"""m/s², to turn a mass into a body weight."""
+from poise.spatial import GRAVITY
 
 _KINDS = ("capsule", "box", "sphere")
 _INT16 = 32767

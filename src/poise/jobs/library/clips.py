@@ -15,14 +15,14 @@ from poise.body import BodyConfig, BodyTable, generate_table, read_mjcf
 from poise.errors import PoiseError
 from poise.jobs.library.files import MotionFile, check_patterns, matches
 from poise.jobs.library.report import ClipNote
-from poise.kin.alone import AloneRules, longest_alone, not_alone
-from poise.kin.clean import clean_clip
+from poise.kin import retarget
 from poise.kin.coords import clip_to_qpos
+from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
+from poise.kin.doctor.clean import clean_clip
+from poise.kin.feet.level import level_feet
 from poise.kin.fk import Kinematics
 from poise.kin.flight import rate_sentence
 from poise.kin.ground import GroundFit, fit_heights
-from poise.kin.level import level_feet
-from poise.kin.retarget import retarget
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
 
 _T = TypeVar("_T")

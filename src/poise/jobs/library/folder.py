@@ -2,7 +2,7 @@
 
 Perpetual Humanoid Control (Luo et al. 2023, section 4) trains on AMASS without the sequences in which
 somebody sits on furniture, hangs or is carried, by a list made by hand. Here rules tell them
-(`kin.alone`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules them.
+(`kin.doctor`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules them.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from poise.jobs.library.clips import LibraryConfig, Target, set_down
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
-from poise.kin.retarget import retarget
+from poise.kin import retarget
 from poise.motion import Clip
 from poise.motion.edits import backwards
 from poise.motion.mirror import mirrored_clip

@@ -20,7 +20,7 @@ from poise.jobs.perpetual.result import PerpetualResult
 from poise.jobs.perpetual.run import Earlier, begin, going_on, train
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.policy import Tracker, tracker_of
-from poise.kin.clean import clean_clip
+from poise.kin.doctor.clean import clean_clip
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual

@@ -11,11 +11,11 @@ import torch
 
 from poise.body import Humanoid
 from poise.kin import FitReport, Kinematics, RetargetConfig, RetargetReport, retarget
-from poise.kin.clean import CleanReport, clean_clip
 from poise.kin.coords import clip_to_qpos
+from poise.kin.doctor.clean import CleanReport, clean_clip
+from poise.kin.feet.level import Levelled, level_feet
 from poise.kin.ground import GroundFit, clip_flights, fit_ground
 from poise.kin.hinges import within_turns
-from poise.kin.level import Levelled, level_feet
 from poise.motion import Clip, resample
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.track.placement import Placed
 from poise.jobs.track.policy import Tracker
-from poise.kin.keypoint_body import PointBody
-from poise.kin.keypoint_stream import KeypointStream, StreamConfig
+from poise.kin.retarget.keypoint_body import PointBody
+from poise.kin.retarget.keypoint_stream import KeypointStream, StreamConfig
 from poise.motion import Clip
 from poise.motion.io.numpy.arrays import Archive
 from poise.motion.io.points.arrays import array_points

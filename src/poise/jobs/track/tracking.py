@@ -134,7 +134,7 @@ def track(
 
     show: is told how many control steps of how many are searched.
 
-    Keypoints reach a policy with goals of keypoints frame by frame (`kin.KeypointStream`); any other
+    Keypoints reach a policy with goals of keypoints frame by frame (`kin.retarget`); any other
     policy gets the clip that is fitted to them.
 
     Raises:

@@ -27,6 +27,7 @@ from poise.env import Reference, TaskConfig
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
 from poise.kin import clean_clip, clip_to_qpos, fit_ground, retarget
+from poise.kin.fit import widen
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, ClipLibrary, Skeleton, resample
 from poise.recipes.imitation import Imitation
@@ -215,14 +216,8 @@ def _widened(
     tables: Sequence[BodyTable], motions: Sequence[np.ndarray], margin: float
 ) -> list[BodyTable]:
     """Tables with the joint ranges of the first, grown to hold all motions and `margin` rad more."""
-    low = np.min([q[:, 7:].min(0) for q in motions], 0) - margin
-    high = np.max([q[:, 7:].max(0) for q in motions], 0) + margin
-    ends, at = [], 0
-    for row in tables[0].rows:
-        parts = zip(row.ranges, low[at:], high[at:], strict=False)
-        ends.append(tuple((float(min(a, lo)), float(max(b, hi))) for (a, b), lo, hi in parts))
-        at += len(row.ranges)
+    rows = widen(tables[0], motions, margin)[0].rows
     return [
-        replace(t, rows=tuple(replace(r, ranges=e) for r, e in zip(t.rows, ends, strict=True)))
+        replace(t, rows=tuple(replace(r, ranges=w.ranges) for r, w in zip(t.rows, rows, strict=True)))
         for t in tables
     ]

@@ -1,0 +1,99 @@
+"""Faults of a captured motion that no body can do: found, repaired, and told in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from poise.body import Anatomy, find_anatomy, generate_table
+from poise.errors import PoiseError
+from poise.kin.doctor.flips import Flip, out_of_reach, unflip
+from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds
+from poise.kin.flight import likely_rate, rate_sentence
+from poise.kin.ground import clip_flights
+from poise.motion import Clip
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """What was repaired in one clip; empty for a clean one. Frames are the file's.
+
+    flips: feet and hands that were turned back. speeds: turns faster than a human joint. left: (joint,
+    frames) of feet and hands that are still where none reaches, since no repair was sure enough.
+    """
+
+    flips: tuple[Flip, ...] = ()
+    speeds: tuple[SpeedRepair, ...] = ()
+    left: tuple[tuple[str, int], ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.flips or self.speeds or self.left)
+
+    def sentences(self) -> list[str]:
+        """The repairs in words, one line for each kind."""
+        out = []
+        if self.flips:
+            parts = [
+                f"{joint} {_frames(mine)} (by up to {max(f.angle_deg for f in mine):.0f} degrees)"
+                for joint, mine in _by_joint(self.flips)
+            ]
+            out.append(f"Turned back from where no joint reaches: {', '.join(parts)}.")
+        if self.speeds:
+            groups = sorted(_by_joint(self.speeds), key=lambda g: -max(s.before for s in g[1]))
+            parts = []
+            for joint, mine in groups[:4]:
+                before, after = max(s.before for s in mine), max(s.after for s in mine)
+                parts.append(f"{joint} {_frames(mine)} ({before:.0f} rad/s, now {after:.0f})")
+            more = f" and {len(groups) - 4} more joints" if len(groups) > 4 else ""
+            out.append(f"Faster than a human joint, so interpolated: {', '.join(parts)}{more}.")
+        if self.left:
+            parts = [f"{joint} in {frames} frames" for joint, frames in self.left]
+            out.append(f"Left where no joint reaches: {', '.join(parts)}.")
+        return out
+
+    def to_dict(self) -> dict[str, Any]:
+        """The repairs as plain lists and numbers."""
+        return asdict(self)
+
+
+def _by_joint(found: Sequence[Any]) -> list[tuple[str, list[Any]]]:
+    return [(j, [f for f in found if f.joint == j]) for j in dict.fromkeys(f.joint for f in found)]
+
+
+def _frames(found: Sequence[Any]) -> str:
+    count = sum(f.frames for f in found)
+    return f"{count} frame{'' if count == 1 else 's'}"
+
+
+def clean_clip(clip: Clip, anatomy: Anatomy | None = None) -> tuple[Clip, CleanReport]:
+    """The clip with its faults repaired, and every repair; a clean clip comes back as it is.
+
+    First feet and hands are turned back (`unflip`), then speeds that no human joint reaches are
+    interpolated (`limit_speeds`), so that what remains of the jumps goes too.
+    """
+    anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
+    turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
+    slowed, speeds = limit_speeds(turned, anatomy)
+    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy))
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What a clip's fit will repair or doubt: in words, and as numbers (`CleanReport.to_dict` and
+    `likely_fps`, the frame rate that gravity vouches for where it is far from the file's)."""
+
+    sentences: tuple[str, ...]
+    numbers: dict[str, Any]
+
+
+def find_faults(clip: Clip) -> Faults | None:
+    """The faults of a clip, before a body is fitted; None where its joints are no human's."""
+    try:
+        cleaned, report = clean_clip(clip)
+        flights = clip_flights(cleaned, generate_table(cleaned.skeleton, None, [cleaned]))
+    except PoiseError:
+        return None
+    doubt = rate_sentence(flights, clip.fps)
+    numbers = {**report.to_dict(), "likely_fps": likely_rate(flights, clip.fps)}
+    return Faults((*([doubt] if doubt else []), *report.sentences()), numbers)

@@ -1,0 +1,177 @@
+"""The motion doctor: what no body can have done in a clip, and what of it can be mended."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from poise.body import Anatomy
+from poise.kin.doctor.clean import CleanReport, clean_clip
+from poise.kin.doctor.faults import Fault, by_kind
+from poise.kin.doctor.jitter import jitter_faults, mend_jitter
+from poise.kin.doctor.limits import limit_faults
+from poise.kin.doctor.sides import exchanged_sides
+from poise.kin.doctor.slides import lock_feet, lock_path
+from poise.kin.doctor.support import Support, anatomy_of, slide_faults, support_faults, support_of
+from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
+from poise.kin.flight import likely_rate
+from poise.kin.ground import smooth_hull
+from poise.metrics import floating, foot_slide, jerk, penetration
+from poise.motion import Clip
+
+#: How often feet are locked: a leg that is led back changes what its sole does.
+ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What was found in a clip. figures: numbers to compare before and after a repair, None where
+    they cannot be told. judged: whether the body could be told, so that feet and joints were judged."""
+
+    faults: tuple[Fault, ...]
+    figures: dict[str, float | None]
+    judged: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists and numbers."""
+        return {
+            "faults": [f.to_dict() for f in self.faults],
+            "figures": dict(self.figures),
+            "judged": self.judged,
+        }
+
+
+def examine(clip: Clip) -> Examination:
+    """All faults of a clip and its figures; nothing is changed.
+
+    Faults of the frames and of the joints are told of the clip as it is, the stance of the feet too.
+    """
+    anatomy = anatomy_of(clip)
+    support = support_of(clip, anatomy)
+    cleaned, report = clean_clip(clip, anatomy)
+    faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
+    faults += [*limit_faults(clip), *_read_faults(clip)]
+    if support is not None:
+        faults += [*support_faults(clip, support), *_rate_faults(support, clip)]
+    if exchanged_sides(clip, anatomy):
+        hint = "the joints named left lie on the body's right; --swap-sides exchanges the names"
+        faults.append(Fault("sides", "", 0, clip.frames - 1, 1.0, hint))
+    ordered = [f for group in by_kind(faults).values() for f in group]
+    return Examination(tuple(ordered), _figures(clip, support), support is not None)
+
+
+def heal(clip: Clip) -> Clip:
+    """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
+
+    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, the height
+    above the floor, sliding feet. A step whose faults are not there changes nothing.
+    """
+    anatomy = anatomy_of(clip)
+    clip = mend_holds(clip)
+    support = support_of(clip, anatomy)
+    low = None if support is None else support.low.min(-1)
+    clip = mend_teleports(clip, low)
+    clip = clean_clip(clip, anatomy)[0]
+    clip = mend_jitter(clip)
+    if support is None:
+        return clip
+    return _on_floor(_locked(_on_floor(clip, anatomy), anatomy), anatomy)
+
+
+def _on_floor(clip: Clip, anatomy: Anatomy) -> Clip:
+    support = support_of(clip, anatomy)
+    return clip if support is None else set_on_floor(clip, support)
+
+
+def set_on_floor(clip: Clip, support: Support) -> Clip:
+    """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is.
+
+    First the whole of it, by what its soles say; then spells that hover or sink, smoothed over 0.2 s.
+    """
+    lift = np.full(clip.frames, -support.off_m)
+    settle = support.fit.settle_m
+    if any(
+        f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in support_faults(clip, support)
+    ):
+        lift -= settle
+    # Points deeper than their margin come up to half of it, so that rounding leaves nothing behind.
+    depth = np.where(support.depth > 0, support.depth + 0.5 * support.margin, 0.0).max(-1)
+    if depth.any():
+        lift += np.maximum(smooth_hull(depth, max(1, round(0.1 * clip.fps)), False), 0.0)
+    if not lift.any():
+        return clip
+    return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
+
+
+def _locked(clip: Clip, anatomy: Anatomy) -> Clip:
+    """The clip without sliding feet."""
+    steps: list[Callable[[Clip, Support, list[Fault]], Clip]] = [lock_path] + [lock_feet] * ROUNDS
+    for step in steps:
+        support = support_of(clip, anatomy)
+        faults = slide_faults(clip, support) if support is not None else []
+        if support is None or not faults:
+            return clip
+        clip = step(clip, support, faults)
+    return clip
+
+
+def _joint_faults(report: CleanReport, clip: Clip) -> list[Fault]:
+    out = [
+        Fault("flip", f.joint, f.start, f.stop, f.before_deg, f"turned by {f.angle_deg:.0f} degrees")
+        for f in report.flips
+    ]
+    out += [Fault("speed", s.joint, s.start, s.stop, s.before) for s in report.speeds]
+    last = clip.frames - 1
+    return out + [Fault("out of reach", joint, 0, last, float(n)) for joint, n in report.left]
+
+
+def _read_faults(clip: Clip) -> list[Fault]:
+    """What reading mended: bones that drift, quaternions off unit length, inserted frames."""
+    scale = {"bone drift": 1e3}
+    return [
+        Fault(kind, joint, a, clip.frames - 1 if b < 0 else b, size * scale.get(kind, 1.0))
+        for kind, joint, a, b, size in clip.skeleton.source.mended
+    ]
+
+
+def _rate_faults(support: Support, clip: Clip) -> list[Fault]:
+    rate = likely_rate(support.fit.flights, clip.fps)
+    if rate is None:
+        return []
+    detail = f"falling bodies vouch for {rate:g} frames per second; state it with --fps {rate:g}"
+    return [Fault("frame rate", "", 0, clip.frames - 1, rate, detail)]
+
+
+def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
+    """Measures of the whole clip; lengths are told against the floor at z = 0."""
+    pos = torch.tensor(clip.positions())
+    shake = jerk(pos, clip.fps)
+    step = np.linalg.norm(np.diff(clip.root_pos, axis=0), axis=-1)
+    out: dict[str, float | None] = {
+        "foot_slide_mm_per_s": None,
+        "penetration_mm": None,
+        "penetration_max_mm": None,
+        "float_mm": None,
+        "jerk_m_per_s3": float(shake.mean()) if len(shake) else 0.0,
+        "jerk_max_m_per_s3": float(shake.max()) if len(shake) else 0.0,
+        "root_step_max_mm": float(step.max()) * 1e3,
+        "joint_speed_max_rad_per_s": float(body_steps(clip).max()) * clip.fps,
+    }
+    if support is not None:
+        slide = foot_slide(support.soles, clip.fps, height=0.04, ground=-support.fit.lift_m)
+        lowest = torch.tensor(support.low.min(-1))
+        depth = penetration(lowest)
+        gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com), clip.fps)
+        out["foot_slide_mm_per_s"] = _number(slide)
+        out["penetration_mm"], out["penetration_max_mm"] = _number(depth.mean_mm), _number(depth.max_mm)
+        out["float_mm"] = _number(gap)
+    return out
+
+
+def _number(value: torch.Tensor) -> float | None:
+    return float(value) if math.isfinite(float(value)) else None

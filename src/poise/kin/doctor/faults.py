@@ -1,0 +1,92 @@
+"""The faults that the motion doctor knows: what each one is, in which unit, and who can mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from poise.kin.runs import find_runs
+
+
+class Kind(NamedTuple):
+    """title: in words. unit: of `Fault.size`. repair: how it is mended; empty where it is not."""
+
+    title: str
+    unit: str
+    repair: str = ""
+
+
+#: In the order in which they are mended, then those that are only told.
+KINDS = {
+    "frozen frames": Kind("frames that repeat the one before", "frames", "filled in or left out"),
+    "missing frames": Kind("a gap of frames", "frames"),
+    "teleport": Kind("the root jumps", "m", "the path is joined by its usual step"),
+    "flip": Kind("turned where no joint reaches", "degrees", "turned back"),
+    "speed": Kind("faster than a human joint", "rad/s", "interpolated, held or smoothed"),
+    "jitter": Kind("trembles from frame to frame", "mm", "smoothed without delay"),
+    "root jitter": Kind("the root trembles from frame to frame", "mm", "smoothed without delay"),
+    "float": Kind("hovers without falling", "cm", "lowered to the floor"),
+    "penetration": Kind("lies under the floor", "cm", "lifted out of the floor"),
+    "foot slide": Kind("slides while it stands", "cm", "held in place, the leg follows"),
+    "out of reach": Kind("stays where no joint reaches", "frames"),
+    "limit": Kind("beyond the file's own limits", "degrees"),
+    "bone drift": Kind("its bone changes its length or place", "mm", "kept rigid when it is read"),
+    "quaternion length": Kind("quaternions off unit length", "", "normalised when they are read"),
+    "rest frame": Kind("a rest pose put before the motion", "frames", "left out when it is read"),
+    "frame rate": Kind("gravity contradicts the frame rate", "frames/s"),
+    "sides": Kind("left and right are exchanged or mirrored", ""),
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something no body can have done, in frames `start` to `stop` (inclusive, from 0, as read).
+
+    kind: a key of `KINDS`, which states the unit of `size`. joint: "" for the whole body.
+    detail: what else is to be said, a clause without a full stop.
+    """
+
+    kind: str
+    joint: str
+    start: int
+    stop: int
+    size: float
+    detail: str = ""
+
+    @property
+    def repairable(self) -> bool:
+        """Whether `heal` mends this kind, or reading did."""
+        return bool(KINDS[self.kind].repair)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, with the unit of the size."""
+        return {**asdict(self), "unit": KINDS[self.kind].unit, "repairable": self.repairable}
+
+
+def by_kind(faults: Iterable[Fault]) -> dict[str, list[Fault]]:
+    """The faults of each kind that occurs, in the order of `KINDS`."""
+    found = list(faults)
+    kinds = [k for k in KINDS if any(f.kind == k for f in found)]
+    return {k: [f for f in found if f.kind == k] for k in kinds}
+
+
+def spell_faults(
+    kind: str, joint: str, size: np.ndarray, bad: np.ndarray, gap: int, least: int = 1
+) -> list[Fault]:
+    """One fault for every run of true in `bad (T)`, with the largest `size (T)` in it.
+
+    Runs at most `gap` frames apart are one; runs shorter than `least` frames are left out.
+    """
+    runs = [(a, b) for a, b in find_runs(bad, gap) if b - a + 1 >= least]
+    return [Fault(kind, joint, a, b, float(np.max(size[a : b + 1]))) for a, b in runs]
+
+
+def frames_of(faults: Sequence[Fault], frames: int) -> np.ndarray:
+    """`(T,)` bool, the frames that some of the faults cover."""
+    out = np.zeros(frames, dtype=bool)
+    for fault in faults:
+        out[max(fault.start, 0) : fault.stop + 1] = True
+    return out

@@ -1,0 +1,187 @@
+"""Feet and hands that a solver turned about half a turn away from where they can be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import Anatomy
+from poise.kin.runs import find_runs
+from poise.motion import Clip, Skeleton
+from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, quat_to_rotvec, rotvec_to_quat
+
+#: Angles (rad) from the neutral pose that no foot or hand reaches. A foot: 50 degrees of plantar flexion
+#: (American Academy of Orthopaedic Surgeons) and about twice that in a ballet dancer on pointe, to which
+#: up to 45 degrees about the shin come where a skeleton's knee is a pure hinge. A hand: 80 degrees of
+#: flexion on top of 90 of pronation, which some skeletons put into the wrist.
+UNREACHABLE = {"foot": math.radians(120.0), "hand": math.radians(150.0)}
+#: A flip is a turn of at least this angle (rad); turned back, the joint lies this near to neutral.
+HALF_TURN, HOME = math.radians(150.0), math.radians(60.0)
+#: Gaps (s) that belong to one spell, and how far (s) from its ends the jumps are looked for.
+GAP_S, REACH_S = 0.05, 0.06
+
+
+@dataclass(frozen=True)
+class Flip:
+    """Frames `start` to `stop` (inclusive) of one joint that were turned back by `angle_deg` degrees.
+
+    before_deg, after_deg: the median angle from the neutral pose.
+    """
+
+    joint: str
+    start: int
+    stop: int
+    angle_deg: float
+    before_deg: float
+    after_deg: float
+
+    @property
+    def frames(self) -> int:
+        """How many frames were turned back."""
+        return self.stop - self.start + 1
+
+    def sentence(self) -> str:
+        """The repair in words."""
+        return (
+            f"{self.joint}: {self.frames} frames from frame {self.start} on turned back by "
+            f"{self.angle_deg:.0f} degrees"
+        )
+
+
+def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip, ...]]:
+    """The clip with flipped feet and hands turned back, and what was turned.
+
+    A spell is a flip where the joint is farther from its neutral pose than it can reach (see
+    `UNREACHABLE`) and gets there or back in a jump faster than `speed` rad/s; a spell that lasts the
+    whole clip has no jump and counts only where the rest pose stands and is flipped by half a turn. The
+    spell is turned back about one axis of the joint's own frame: a principal axis of the foot or hand,
+    since mirrored solutions of a solver lie there, or the axis of the jump itself where that is a
+    single step and leads nearer to neutral.
+    """
+    rot = torch.tensor(clip.rot)
+    neutral, stands = neutral_pose(clip, anatomy)
+    found: list[Flip] = []
+    for part in anatomy.parts:
+        limit = UNREACHABLE.get(part.kind)
+        if limit is None:
+            continue
+        j, home = part.joint, neutral[part.joint]
+        away = _from(home, rot[:, j])
+        for start, stop in find_runs(away.numpy() > limit, round(GAP_S * clip.fps)):
+            whole = start == 0 and stop == clip.frames - 1
+            if whole and not (stands and float(away.median()) > HALF_TURN):
+                continue
+            if not whole and not _jumps(rot[:, j], start, stop, speed / clip.fps, clip.fps):
+                continue
+            axes = _own_axes(clip.skeleton, j)
+            back = _turn_back(rot[:, j], start, stop, home, axes, speed / clip.fps)
+            if back is None:
+                continue
+            spell = slice(start, stop + 1)
+            fixed = normalize(quat_mul(rot[spell, j], back.expand(stop + 1 - start, 4)))
+            turned, before, after = quat_angle(back), away[spell].median(), _from(home, fixed).median()
+            rot[spell, j] = fixed
+            numbers = [math.degrees(float(x)) for x in (turned, before, after)]
+            found.append(Flip(clip.skeleton.names[j], start, stop, *numbers))
+    return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
+
+
+def out_of_reach(clip: Clip, anatomy: Anatomy) -> tuple[tuple[str, int], ...]:
+    """(joint, frames) of feet and hands that are where none reaches."""
+    neutral, _ = neutral_pose(clip, anatomy)
+    out = []
+    for part in anatomy.parts:
+        if part.kind in UNREACHABLE:
+            away = _from(neutral[part.joint], torch.tensor(clip.rot[:, part.joint]))
+            frames = int((away > UNREACHABLE[part.kind]).sum())
+            out += [(clip.skeleton.names[part.joint], frames)] if frames else []
+    return tuple(out)
+
+
+def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
+    """`(J, 4)` wxyz local rotations from which reach is measured, and whether they are the rest pose.
+
+    Identity where the rest pose stands: its ankles lie below the hips by nearly the length of the
+    legs. Otherwise (LAFAN1 and Bandai lie folded at identity) each joint's mean over the clip.
+    """
+    skeleton = clip.skeleton
+    rest = skeleton.rest_positions()
+    identity = torch.zeros(len(skeleton), 4, dtype=torch.float64)
+    identity[:, 0] = 1.0
+    drops = []
+    for thigh, shin, foot in zip(*(anatomy.of(k) for k in ("thigh", "shin", "foot")), strict=True):
+        leg = np.linalg.norm(rest[shin] - rest[thigh]) + np.linalg.norm(rest[foot] - rest[shin])
+        drops.append((rest[thigh, 2] - rest[foot, 2]) / max(float(leg), 1e-9))
+    if drops and min(drops) > 0.9:
+        return identity, True
+    rot = torch.tensor(clip.rot)
+    # The principal eigenvector of the sum of q q^T (Markley et al. 2007).
+    mean = torch.linalg.eigh(torch.einsum("tja,tjb->jab", rot, rot)).eigenvectors[..., -1]
+    return mean, False
+
+
+def _from(home: Tensor, rot: Tensor) -> Tensor:
+    return quat_angle(quat_mul(quat_conj(home).expand_as(rot), rot))
+
+
+def _jumps(rot: Tensor, start: int, stop: int, step: float, fps: float) -> bool:
+    """Whether some step near either end of the spell is larger than `step` rad."""
+    steps = quat_angle(quat_mul(quat_conj(rot[:-1]), rot[1:]))
+    reach = max(1, round(REACH_S * fps))
+    # Step k leads from frame k to frame k + 1.
+    ends = [steps[max(start - reach, 0) : start + reach]] if start else []
+    ends += [steps[max(stop - reach, 0) : stop + reach]] if stop < len(rot) - 1 else []
+    return any(bool((e > step).any()) for e in ends)
+
+
+def _own_axes(skeleton: Skeleton, joint: int) -> Tensor:
+    """`(3, 3)` unit rows in the joint's frame: along its bone, and two across it."""
+    tips = [skeleton.offsets[c] for c in skeleton.children(joint)]
+    tips += [np.array(v) for j, v in skeleton.ends if j == joint]
+    tips = [v for v in tips if np.linalg.norm(v) > 1e-3] or [np.array([1.0, 0.0, 0.0])]
+    along = torch.tensor(max(tips, key=lambda v: float(np.linalg.norm(v))))
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if torch.linalg.cross(along, up).norm() < 0.1 * along.norm():
+        up = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    across = torch.linalg.cross(up, along)
+    return normalize(torch.stack((along, across, torch.linalg.cross(along, across))))
+
+
+def _turn_back(
+    rot: Tensor, start: int, stop: int, home: Tensor, axes: Tensor, step: float
+) -> Tensor | None:
+    """The turn (wxyz, joint's frame) that brings the spell nearest to neutral, if any brings it home."""
+    turns = list(rotvec_to_quat(axes * math.pi))
+    own = _jump_turn(rot, start, stop, step)
+    if own is not None:
+        turns.append(own)
+    spell = rot[start : stop + 1]
+    rest = [float(_from(home, quat_mul(spell, t.expand_as(spell))).median()) for t in turns]
+    best = int(np.argmin(rest))
+    return turns[best] if rest[best] < HOME else None
+
+
+def _jump_turn(rot: Tensor, start: int, stop: int, step: float) -> Tensor | None:
+    """The turn that undoes the jumps at the ends of a spell, where they are one clean step each."""
+    turns = []
+    for inner, outer, way in ((start, start - 1, -1), (stop, stop + 1, 1)):
+        if not 0 <= outer + way < len(rot):
+            continue
+        drift = quat_mul(quat_conj(rot[outer + way]), rot[outer])
+        if quat_angle(drift) > step:
+            return None
+        # Where the joint would have been, had it gone on as it did outside the spell.
+        expected = quat_mul(rot[outer], drift)
+        turns.append(quat_mul(quat_conj(rot[inner]), expected))
+    if not turns or min(float(quat_angle(t)) for t in turns) < HALF_TURN:
+        return None
+    if len(turns) == 2:
+        if quat_angle(quat_mul(quat_conj(turns[0]), turns[1])) > math.radians(15.0):
+            return None
+        second = turns[1] if float(turns[0] @ turns[1]) > 0 else -turns[1]
+        turns = [normalize(turns[0] + second)]
+    return rotvec_to_quat(quat_to_rotvec(turns[0]))

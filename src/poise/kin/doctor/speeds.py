@@ -1,0 +1,179 @@
+"""Joint speeds beyond what a human reaches, repaired over the shortest possible stretch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.body import Anatomy
+from poise.kin.runs import find_runs
+from poise.motion import Clip
+from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, slerp, unwrap_quats
+
+#: rad/s that no human joint reaches. Elbows come nearest to it: 2,300 degrees per second (40 rad/s) in
+#: professional pitchers (Fleisig et al. 1999, J. Biomech. 32). Only their shoulders are faster, about
+#: the long axis alone, where solvers fail most often, as a straight arm does not tell its twist.
+ARM_SPEED = 40.0
+#: The same for hips, ankles, trunk and neck, which are slower, so that noise is found earlier: the
+#: fastest such turn in clean motion, the ankle of DeepMimic's spin kick, has 25 rad/s.
+TRUNK_SPEED = 30.0
+SLOW_PARTS = ("thigh", "foot", "spine", "neck", "head", "clavicle")
+#: Spells closer than this (s) are one; the frames kept lie this far (s) from the damage.
+GAP_S, MARGIN_S = 0.05, 0.017
+#: Longest stretch (s) that is interpolated, and the longest at an end of the clip that is held.
+LONGEST_S, END_S = 0.3, 0.1
+#: Widest deviation (s) of the Gaussian that smooths what cannot be interpolated.
+WIDEST_S = 0.1
+#: A smoothed stretch is preferred where it changes this much less than an interpolated one.
+CLEARLY_LESS = 0.7
+
+
+@dataclass(frozen=True)
+class SpeedRepair:
+    """Frames `start` to `stop` (inclusive) of one joint whose speed was brought into the human range.
+
+    way: "interpolated", "held" (at an end of the clip) or "smoothed". before, after: largest speed,
+    rad/s. change_deg: the largest turn away from what the file says.
+    """
+
+    joint: str
+    start: int
+    stop: int
+    way: str
+    before: float
+    after: float
+    change_deg: float
+
+    @property
+    def frames(self) -> int:
+        """How many frames were changed."""
+        return self.stop - self.start + 1
+
+    def sentence(self) -> str:
+        """The repair in words."""
+        return (
+            f"{self.joint}: {self.frames} frames from frame {self.start} on {self.way} "
+            f"({self.before:.0f} rad/s, now {self.after:.0f})"
+        )
+
+
+def speed_limits(clip: Clip, anatomy: Anatomy) -> list[float]:
+    """The limit (rad/s) of every joint; joints that are no part of the body have the arm's."""
+    kinds = {p.joint: p.kind for p in anatomy.parts}
+    slow = [kinds.get(j) in SLOW_PARTS for j in range(len(clip.skeleton))]
+    return [TRUNK_SPEED if s else ARM_SPEED for s in slow]
+
+
+def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair, ...]]:
+    """The clip with turns faster than a human joint repaired, and every repair.
+
+    Steps above the limit are gathered into spells. A spell is replaced by a slerp over the shortest
+    stretch around it whose ends can be joined at half the limit; at an end of the clip the joint is
+    held. Where no stretch of `LONGEST_S` does, or where it would lead clearly farther from the file
+    (a real turn, only too fast), the joint is smoothed there, as little as it takes.
+    """
+    rot = torch.tensor(clip.rot)
+    found: list[SpeedRepair] = []
+    for j, limit in enumerate(speed_limits(clip, anatomy)):
+        track = unwrap_quats(rot[:, j])
+        steps = _steps(track) * clip.fps
+        if float(steps.max()) <= limit:
+            continue
+        for first, last in find_runs(steps.numpy() > limit, round(GAP_S * clip.fps)):
+            old = track.clone()
+            way, (a, b) = _repair(track, first, last + 1, limit, clip.fps)
+            lo, hi = max(a + 1, 0), min(b - 1, len(track) - 1)
+            change = _change(old, track)
+            here = slice(max(lo - 1, 0), hi + 1)
+            rot[lo : hi + 1, j] = normalize(track[lo : hi + 1])
+            before, after = float(steps[first : last + 1].max()), float(_steps(track)[here].max())
+            found.append(
+                SpeedRepair(
+                    clip.skeleton.names[j], lo, hi, way, before, after * clip.fps, math.degrees(change)
+                )
+            )
+    return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
+
+
+def _steps(track: Tensor) -> Tensor:
+    """Angles (rad) between neighbouring frames."""
+    return quat_angle(quat_mul(quat_conj(track[:-1]), track[1:]))
+
+
+def _change(old: Tensor, new: Tensor) -> float:
+    return float(quat_angle(quat_mul(quat_conj(old), new)).max())
+
+
+def _repair(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[str, tuple[int, int]]:
+    """Repairs frames a to b in place; how, and the unchanged frames on both sides."""
+    old, smooth = track.clone(), track.clone()
+    stretch = _shortest(track, a, b, limit, fps)
+    if stretch is not None:
+        _join(track, *stretch)
+        if stretch[0] < 0 or stretch[1] >= len(track):
+            return "held", stretch
+        if stretch[1] - stretch[0] <= b - a + 2 * _margin(fps):
+            return "interpolated", stretch
+    sides = _smooth(smooth, a, b, limit, fps)
+    calm = float(_steps(smooth)[max(sides[0], 0) : sides[1]].max()) * fps <= limit
+    if stretch is None or (calm and _change(old, smooth) < CLEARLY_LESS * _change(old, track)):
+        track[:] = smooth
+        return "smoothed", sides
+    return "interpolated", stretch
+
+
+def _margin(fps: float) -> int:
+    """Frames beside the damage that are not trusted either."""
+    return max(1, round(MARGIN_S * fps)) - 1
+
+
+def _shortest(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[int, int] | None:
+    """The kept frames next to the shortest stretch around frames a to b that can be joined.
+
+    -1 or `len(track)` where the stretch reaches an end of the clip.
+    """
+    frames, margin = len(track), _margin(fps)
+    a, b = a - margin, b + margin
+    while b - a <= max(2, round(LONGEST_S * fps)):
+        if a <= 0 or b >= frames - 1:
+            short = b - a <= max(1, round(END_S * fps))
+            return (-1 if a <= 0 else a, frames if b >= frames - 1 else b) if short else None
+        turn = float(quat_angle(quat_mul(quat_conj(track[a]), track[b])))
+        if turn * fps / (b - a) <= limit / 2:
+            return a, b
+        a, b = a - 1, b + 1
+    return None
+
+
+def _join(track: Tensor, a: int, b: int) -> None:
+    """Slerp between frames a and b in place; one of them alone is held to the clip's end."""
+    if a < 0:
+        track[:b] = track[b]
+    elif b >= len(track):
+        track[a + 1 :] = track[a]
+    else:
+        t = torch.linspace(0.0, 1.0, b - a + 1, dtype=track.dtype)[1:-1]
+        ends = track[a].expand(len(t), 4), track[b].expand(len(t), 4)
+        track[a + 1 : b] = slerp(*ends, t)
+
+
+def _smooth(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[int, int]:
+    """Blends in the Gaussian mean around frames a to b in place, with the least deviation that does."""
+    original, frames, sigma = unwrap_quats(track), len(track), 1.0
+    while True:
+        reach = math.ceil(3 * sigma)
+        kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=track.dtype) / sigma) ** 2)
+        padded = torch.cat((original[:1].expand(reach, 4), original, original[-1:].expand(reach, 4)))
+        mean = normalize((padded.unfold(0, 2 * reach + 1, 1) * kernel).sum(-1))
+        # Full weight in the spell, falling to nothing over the filter's reach.
+        at = torch.arange(frames, dtype=track.dtype)
+        away = torch.maximum(a - at, at - b).clamp(0, reach) / reach
+        track[:] = slerp(original, mean, 0.5 + 0.5 * torch.cos(math.pi * away))
+        lo, hi = max(a - reach, 0), min(b + reach, frames - 1)
+        track[:lo], track[hi + 1 :] = original[:lo], original[hi + 1 :]
+        if float(_steps(track)[lo:hi].max()) * fps <= limit or sigma * 1.5 > WIDEST_S * fps:
+            return lo - 1, hi + 1
+        sigma *= 1.5

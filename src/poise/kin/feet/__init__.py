@@ -1,0 +1,1 @@
+"""Feet: when they are in contact, and how they are held there."""

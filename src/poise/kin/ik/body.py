@@ -1,0 +1,214 @@
+"""What inverse kinematics must know of a humanoid: which point is which, and its shape at rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from poise.body import BodyTable, Humanoid, find_anatomy
+from poise.kin.fk import Kinematics
+from poise.kin.ik.vectors import cross, frame_of, rotate, square_to, unit
+from poise.motion import Skeleton
+from poise.spatial import quat_to_matrix
+
+#: A rest pose whose elbow or knee is bent less than this (rad) does not tell the plane it bends in.
+REST_BEND = math.radians(10.0)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Rows of one arm or leg: upper and lower bone; `end` is the point (wrist or ankle) below them."""
+
+    upper: int
+    lower: int
+    end: int
+    leg: bool
+    left: bool
+
+
+@dataclass(frozen=True, eq=False)
+class IkBody:
+    """A humanoid as inverse kinematics sees it; made once by `of`.
+
+    points: names of the positions that it reads: one per row of the table, then the toes.
+    roles: point of each symbol of the paper (root, lhip, lk, lan, lf, lcl, ls, le, lw, ...).
+    spine: rows from the mid spine up to the lower neck. arms: the four limbs. toes: point per foot row.
+    heads: point above each neck row.
+    rest_pos: `(P, 3)` m and rest_rot: `(R, 3, 3)`, the world at zero angles, root at the origin.
+    links: `(R, 3, 3)`, rest rotation in the parent body. axes: `(R, 3, 3)`, the hinges' frame.
+    clusters: points rigidly attached to a trunk row, the row's own first.
+    normals: `(4, 3)`, the unit axis about which each of `arms` bends, in the rest pose, world.
+    trunk: `(3, 3)`, columns left, up and forward in the rest pose.
+    """
+
+    table: BodyTable
+    points: tuple[str, ...]
+    roles: Mapping[str, int]
+    spine: tuple[int, ...]
+    arms: tuple[Arm, ...]
+    toes: Mapping[int, int]
+    heads: Mapping[int, int]
+    rest_pos: np.ndarray
+    rest_rot: np.ndarray
+    links: np.ndarray
+    axes: np.ndarray
+    clusters: Mapping[int, tuple[int, ...]]
+    normals: np.ndarray
+    trunk: np.ndarray
+
+    @property
+    def chest(self) -> int:
+        """The row that carries the shoulders: the last of the spine, the pelvis where there is none."""
+        return self.spine[-1] if self.spine else 0
+
+    @classmethod
+    def of(cls, humanoid: Humanoid) -> IkBody:
+        """The body of a humanoid that has two arms, two legs and a spine."""
+        return ik_body(humanoid.table, humanoid.skeleton)
+
+
+def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
+    """See `IkBody`; `skeleton` tells where the toes are."""
+    rows = table.rows
+    zero = torch.zeros(1, 7 + sum(len(r.order) for r in rows), dtype=torch.float64)
+    zero[:, 3] = 1.0
+    rest = Kinematics(table)(zero)
+    rest_rot = quat_to_matrix(rest.quat[0]).numpy()
+    rest_pos = [*rest.pos[0].numpy()]
+    points, toes = [r.name for r in rows], {}
+    by_joint = {r.joint: i for i, r in enumerate(rows)}
+    for _, joint in find_anatomy(skeleton).toes:
+        foot = by_joint.get(skeleton.parents[joint])
+        if foot is not None and np.linalg.norm(skeleton.offsets[joint]) > 1e-4:
+            toes[foot] = len(points)
+            points.append(skeleton.names[joint])
+            rest_pos.append(rest_pos[foot] + rest_rot[foot] @ skeleton.offsets[joint])
+    rest_pos = np.array(rest_pos)
+    spine = tuple(i for i, r in enumerate(rows) if r.kind == "spine")
+    roles = _roles(table, spine, toes)
+    children: dict[int, list[int]] = {}
+    for i, r in enumerate(rows):
+        children.setdefault(r.parent, []).append(i)
+
+    def attached(i: int) -> tuple[int, ...]:
+        """Points that move rigidly with row i: its children, and theirs where they have no hinge."""
+        out: list[int] = []
+        for c in children.get(i, ()):
+            out += [c, *(attached(c) if not rows[c].order else ())]
+        return tuple(out)
+
+    heads = {i: children[i][0] for i, r in enumerate(rows) if r.kind == "neck" and i in children}
+    trunk = _trunk(rest_pos, roles)
+    arms = _arms(table)
+    axes = quat_to_matrix(torch.tensor([r.frame for r in rows], dtype=torch.float64)).numpy()
+    normals = np.array([_normal(table, a, rest_pos, rest_rot, axes, trunk) for a in arms])
+    return IkBody(
+        table=table,
+        points=tuple(points),
+        roles=roles,
+        spine=spine,
+        arms=arms,
+        toes=toes,
+        heads=heads,
+        rest_pos=rest_pos,
+        rest_rot=rest_rot,
+        links=quat_to_matrix(torch.tensor([r.quat for r in rows], dtype=torch.float64)).numpy(),
+        axes=axes,
+        clusters={i: (i, *attached(i)) for i in (0, *spine[-1:])},
+        normals=normals,
+        trunk=trunk,
+    )
+
+
+def _roles(table: BodyTable, spine: tuple[int, ...], toes: Mapping[int, int]) -> dict[str, int]:
+    """Points by the paper's symbols; a body without collarbones has its shoulders in their place."""
+    short = {
+        "clavicle": "cl",
+        "upper_arm": "s",
+        "forearm": "e",
+        "hand": "w",
+        "thigh": "hip",
+        "shin": "k",
+        "foot": "an",
+    }
+    out = {"root": 0, "mspine": (*spine, 0)[0], "lowneck": (0, *spine)[-1]}
+    for i, r in enumerate(table.rows):
+        if r.kind in short:
+            out[r.side[0] + short[r.kind]] = i
+            if r.kind == "foot" and i in toes:
+                out[r.side[0] + "f"] = toes[i]
+    for side in "lr":
+        out.setdefault(f"{side}cl", out[f"{side}s"])
+    return out
+
+
+def _arms(table: BodyTable) -> tuple[Arm, ...]:
+    def row(kind: str, side: str) -> int:
+        return next(i for i, r in enumerate(table.rows) if (r.kind, r.side) == (kind, side))
+
+    return tuple(
+        Arm(*(row(kind, side) for kind in kinds), leg=leg, left=side == "left")
+        for leg, kinds in (
+            (False, ("upper_arm", "forearm", "hand")),
+            (True, ("thigh", "shin", "foot")),
+        )
+        for side in ("left", "right")
+    )
+
+
+def _trunk(rest: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
+    """Columns left, up and forward of a body at rest, from its hips and shoulders."""
+    hips = rest[roles["lhip"]] + rest[roles["rhip"]]
+    up = rest[roles["ls"]] + rest[roles["rs"]] - hips
+    return frame_of("y", x=rest[roles["lhip"]] - rest[roles["rhip"]], y=up)
+
+
+def _normal(
+    table: BodyTable, arm: Arm, rest: np.ndarray, rot: np.ndarray, axes: np.ndarray, trunk: np.ndarray
+) -> np.ndarray:
+    """The axis about which an elbow or knee bends, in the rest pose.
+
+    The hinge itself where there is one alone; else what the rest pose shows; where it is straight, that
+    which lets a forearm bend forward and a shin backward.
+    """
+    upper = unit(rest[arm.lower] - rest[arm.upper])
+    lower = unit(rest[arm.end] - rest[arm.lower])
+    up, forward = trunk[:, 1], trunk[:, 2]
+    towards = -forward if arm.leg else forward
+    usual = cross(upper, towards)
+    if np.linalg.norm(usual) < 0.3:
+        # The bone points that way itself: a seated thigh bends down, an arm held forward bends up.
+        usual = cross(upper, -up if arm.leg else up)
+    usual = unit(usual)
+    row = table.rows[arm.lower]
+    if len(row.order) == 1:
+        axis = rot[arm.lower] @ axes[arm.lower][:, "XYZ".index(row.order)]
+        low, high = row.ranges[0]
+        along = float(axis @ usual)
+        # A range that lies on one side tells which way the joint bends; else the usual way does.
+        sign = np.sign(low + high) if abs(low + high) > 0.5 * (high - low) else np.sign(along or 1.0)
+        return unit(square_to(sign * axis, upper))
+    bend = cross(upper, lower)
+    angle = math.atan2(float(np.linalg.norm(bend)), float(upper @ lower))
+    if angle > REST_BEND:
+        return unit(bend)
+    if len(row.order) == 3:
+        first, middle = (rot[arm.lower] @ axes[arm.lower][:, "XYZ".index(c)] for c in row.order[:2])
+        if abs(float(middle @ usual)) > 0.7 and abs(float(first @ upper)) < 0.3:
+            # A middle hinge would lock at 90 degrees. The first one bends the limb down, which in a
+            # T-pose is what Eqs. 10 and 13 say.
+            usual = first if float(first @ cross(upper, -up)) >= 0 else -first
+    return unit(square_to(usual, upper))
+
+
+def body_points(body: IkBody, pos: np.ndarray, rot: np.ndarray) -> np.ndarray:
+    """World positions `(T, P, 3)` of points; bodies at `pos (T, R, 3)` turned by `rot (T, R, 3, 3)`."""
+    out = [pos]
+    for foot, toe in sorted(body.toes.items(), key=lambda item: item[1]):
+        local = body.rest_rot[foot].T @ (body.rest_pos[toe] - body.rest_pos[foot])
+        out.append((pos[:, foot] + rotate(rot[:, foot], local))[:, None])
+    return np.concatenate(out, 1)

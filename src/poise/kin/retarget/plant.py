@@ -1,0 +1,229 @@
+"""Contacts carried over to another body: planted feet and hands stay planted, nothing sinks deeper."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.kin.feet.contacts import contact_labels
+from poise.kin.ground import smooth_hull
+from poise.kin.limbs import Limb, match_positions
+from poise.kin.retarget.common_pose import CommonPose, hanging
+from poise.kin.retarget.standing import World
+from poise.motion import Clip, Roles
+from poise.motion.joint_map import JointMap
+from poise.motion.roles import SIDES
+from poise.spatial import forward_kinematics, quat_rotate
+
+#: Time (s) over which a foot goes from its own path to its contact and back.
+BLEND_S = 0.25
+#: Half the time (s) over which a lift is spread.
+LIFT_S = 0.05
+#: Height (m) over the ground under which a slow toe or wrist touches, and what is slow (m/s).
+_LOW = {"foot": 0.05, "hand": 0.1}
+_SLOW = 0.35
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The map of the source's space into the target's: x' = c + k (x - c), and its ground."""
+
+    factor: float
+    centre: tuple[float, float, float]
+    ground: float
+
+    @staticmethod
+    def between(
+        world: World,
+        fps: float,
+        joints: JointMap,
+        here: CommonPose,
+        there: CommonPose,
+        factor: float | None,
+    ) -> Scale:
+        """Scaled by the heights of the hips over the feet, about where the clip begins on its ground."""
+        factor = there.hip_height / here.hip_height if factor is None else factor
+        pos, quat = world
+        treads = []
+        for side, tread in zip(SIDES, here.treads, strict=True):
+            foot = joints.source.joint(f"{side}_foot") or 0
+            treads.append(
+                pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3))
+            )
+        ground = tread_height(torch.stack(treads, 1), fps)
+        hips = [pos[0, joints.source.joint(f"{s}_thigh") or 0] for s in SIDES]
+        middle = (hips[0] + hips[1]) / 2
+        return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground)
+
+    def place(self, x: Tensor) -> Tensor:
+        """Points `(..., 3)` m of the source's world where the target has them."""
+        centre = torch.tensor(self.centre, dtype=x.dtype)
+        # Written so that a factor of 1 changes no digit.
+        return x + (self.factor - 1.0) * (x - centre)
+
+
+def tread_height(points: Tensor, fps: float) -> float:
+    """The height (m) of the ground under points of the feet `(T, F, 3)`: the median of those at rest.
+
+    At rest is the lower point of a frame while it moves slower than 0.35 m/s; without any, the tenth
+    percentile of the lowest points counts.
+    """
+    low, which = points[..., 2].min(-1)
+    step = torch.diff(points, dim=0).norm(dim=-1) * fps
+    speed = torch.cat((step, step[-1:])).gather(1, which[:, None])[:, 0]
+    slow = low[speed < _SLOW]
+    if len(slow) < 5:
+        return float(low.quantile(0.1))
+    # A foot may rest in the air too; the lower half of the moments of rest is on the floor.
+    return float(slow[slow <= slow.median() + 0.02].median())
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """One end that may touch the floor, in source and target.
+
+    name: "left foot", ...; source, target: its joint in either. limb: the joints that move it in the
+    target. tread_source, tread_target: `(3)` m, in its frame, the point that is held.
+    """
+
+    name: str
+    source: int
+    target: int
+    limb: Limb
+    tread_source: Tensor
+    tread_target: Tensor
+
+    def points(self, pos: Tensor, quat: Tensor, target: bool) -> Tensor:
+        """`(T, 3)` m, where the held point is."""
+        joint, tread = (self.target, self.tread_target) if target else (self.source, self.tread_source)
+        return pos[:, joint] + quat_rotate(quat[:, joint], tread.expand(len(pos), 3))
+
+
+def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot, ...]:
+    """Both feet, and the hands that both skeletons have."""
+    out = []
+    for kinds, label in (
+        (("thigh", "shin", "foot"), "foot"),
+        (("upper_arm", "forearm", "hand"), "hand"),
+    ):
+        for k, side in enumerate(SIDES):
+            pairs = [joints.limb_pair(f"{side}_{kind}") for kind in kinds]
+            if any(p is None for p in pairs):
+                continue
+            chain = [p for p in pairs if p is not None]
+            bones = np.diff(there.pos[[p[1] for p in chain]], axis=0)
+            if np.linalg.norm(bones, axis=-1).min() < 1e-4:
+                # A bone of no length reaches nowhere.
+                continue
+            held = [torch.zeros(3, dtype=torch.float64)] * 2
+            if label == "foot":
+                held = [torch.tensor(here.treads[k]), torch.tensor(there.treads[k])]
+            limb = Limb(*(p[1] for p in chain))
+            out.append(Foot(f"{side} {label}", *chain[2], limb, held[0], held[1]))
+    return tuple(out)
+
+
+def source_contacts(world: World, fps: float, feet: tuple[Foot, ...], ground: float) -> Tensor:
+    """`(T, F)` bool, which end touches the ground in the source: low and slow."""
+    out = []
+    for foot in feet:
+        tread = foot.points(*world, target=False)[:, None]
+        low = _LOW[foot.name.split()[1]]
+        out.append(contact_labels(tread, fps, low, _SLOW, ground)[:, 0])
+    return torch.stack(out, 1)
+
+
+def plant(
+    clip: Clip,
+    world: World,
+    joints: JointMap,
+    poses: tuple[CommonPose, CommonPose],
+    rot: Tensor,
+    root: Tensor,
+    feet: tuple[Foot, ...],
+    contacts: Tensor,
+    scale: Scale,
+    hold: bool,
+    clear: bool,
+) -> tuple[Tensor, Tensor]:
+    """New local rotations `(T, J, 4)` and root path `(T, 3)` of the target with its contacts kept.
+
+    While an end touches, and blended over `BLEND_S` before and after, it goes where the source's is
+    after scaling: what stood still stands still. Limbs that would then be under the floor by more than
+    in the source are lifted; where trunk, knees or elbows are, or a limb does not reach, the whole body
+    is. The limbs are solved by two bones in closed form; feet and hands keep their turn.
+    """
+    skeleton = joints.target.skeleton
+    offsets = torch.tensor(skeleton.offsets)
+    depth = floor_depth(joints.source, poses[0], *world, scale.ground) * scale.factor
+
+    def lift(pos: Tensor, quat: Tensor, parts: set[int]) -> Tensor:
+        """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
+        excess = floor_depth(joints.target, poses[1], pos, quat, scale.ground, parts) - depth
+        if float(excess.max()) < 1e-6:
+            return torch.zeros(len(pos), dtype=pos.dtype)
+        reach = max(1, round(LIFT_S * clip.fps))
+        hull = smooth_hull(excess.clamp_min(0.0).numpy(), reach, clip.cyclic)
+        return torch.tensor(np.maximum(hull, 0.0))
+
+    if clear:
+        ends = {j for foot in feet for j in hanging(skeleton, foot.target)}
+        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        up = torch.zeros_like(root)
+        up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
+        root = root + up
+    pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+    goals: dict[int | str, Tensor] = {}
+    for k, foot in enumerate(feet):
+        goal = pos[:, foot.target]
+        if hold:
+            arm = quat_rotate(quat[:, foot.target], foot.tread_target.expand(len(pos), 3))
+            wanted = scale.place(foot.points(*world, target=False)) - arm
+            goal = goal + contact_weight(contacts[:, k], clip.fps)[:, None] * (wanted - goal)
+        if clear:
+            moved = pos + (goal - pos[:, foot.target])[:, None]
+            up = torch.zeros_like(goal)
+            up[:, 2] = lift(moved, quat, hanging(skeleton, foot.target))
+            goal = goal + up
+        goals[foot.target] = goal
+    by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
+    rot = match_positions(skeleton, rot, root, goals, by_end)
+    if clear:
+        pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
+        up = torch.zeros_like(root)
+        up[:, 2] = lift(pos, quat, set(range(len(skeleton))))
+        root = root + up
+    return rot, root
+
+
+def contact_weight(contact: Tensor, fps: float) -> Tensor:
+    """`(T)` in [0, 1]: 1 where `contact (T)` holds, falling to 0 over `BLEND_S` around it."""
+    if not bool(contact.any()):
+        return torch.zeros(len(contact), dtype=torch.float64)
+    frames = torch.arange(len(contact))
+    at = frames[contact]
+    k = torch.searchsorted(at, frames)
+    after = at[k.clamp(max=len(at) - 1)]
+    before = at[(k - 1).clamp(min=0)]
+    away = torch.minimum((after - frames).abs(), (frames - before).abs()).double() / fps
+    return 0.5 + 0.5 * torch.cos(torch.pi * (away / BLEND_S).clamp(max=1.0))
+
+
+def floor_depth(
+    roles: Roles,
+    pose: CommonPose,
+    pos: Tensor,
+    quat: Tensor,
+    ground: float,
+    joints: Collection[int] | None = None,
+) -> Tensor:
+    """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
+
+    The floor lies as far under the `ground` of the treads as the soles do while standing.
+    """
+    joints = range(len(roles.skeleton)) if joints is None else joints
+    return (ground - pose.sole - pose.lowest(roles, pos, quat, joints)).clamp_min(0.0)

@@ -1,0 +1,34 @@
+"""The solid shapes of a body in world poses: its lowest points and its centre of mass."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.metrics import KINDS, Shapes, geom_heights
+from poise.metrics import centre_of_mass as geoms_centre
+
+
+def shapes_of(table: BodyTable, dtype: torch.dtype = torch.float64) -> Shapes:
+    """The geoms of a body table as the metrics take them; a body's mass is shared by its geoms."""
+    geoms = [(i, g, r.mass / len(r.geoms)) for i, r in enumerate(table.rows) for g in r.geoms]
+    return Shapes(
+        kind=torch.tensor([KINDS[g.kind] for _, g, _ in geoms]),
+        size=torch.tensor([(*g.size, 0.0, 0.0)[:3] for _, g, _ in geoms], dtype=dtype),
+        pos=torch.tensor([g.pos for _, g, _ in geoms], dtype=dtype),
+        quat=torch.tensor([g.quat for _, g, _ in geoms], dtype=dtype),
+        body=torch.tensor([i for i, _, _ in geoms]),
+        mass=torch.tensor([m for _, _, m in geoms], dtype=dtype),
+    )
+
+
+def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
+    """`(..., B)` m, the lowest point of each body's shapes, from world body poses."""
+    heights = geom_heights(pos, quat, shapes_of(table)).split([len(r.geoms) for r in table.rows], -1)
+    return torch.stack([h.amin(-1) for h in heights], -1)
+
+
+def centre_of_mass(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
+    """`(..., 3)` m from world body poses; a body's mass sits in the middle of its shapes."""
+    return geoms_centre(pos, quat, shapes_of(table))
