@@ -76,7 +76,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         # As many of the last rewards as a character that goes on would earn: g + g^2 + ...
         completion_bonus=gamma / max(1.0 - gamma, 1.0 / config.horizon),
         first=config.first,
-        hard=config.adaptive_sampling,
+        adaptive=config.adaptive_sampling,
         adaptive_over=config.adaptive_over,
         style=phc_obs.style_terms(humanoid) if config.style else (),
         recovery=recovery,
