@@ -14,7 +14,7 @@ from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.kin import Kinematics, fit_humanoid
 from poise.kin.coords import clip_to_qpos
-from poise.kin.ground import stance_heights
+from poise.kin.feet.contact import stance_heights
 from poise.motion import Clip, shifted, write_clip
 from poise.recipes.library import folder as perpetual_data
 from poise.recipes.library.files import content_key, is_motion, motion_files_of, subject_of

@@ -8,7 +8,7 @@ from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.guesses import Guess, find_guesses, grounded
 from poise.kin.doctor.sides import swap_sides
 from poise.kin.doctor.support import Support, anatomy_of, support_of
-from poise.kin.feet.contacts import contact_labels
+from poise.kin.feet.contact import contact_labels
 from poise.kin.feet.hold import Held, hold_feet
 from poise.kin.feet.level import Levelled, level_feet
 from poise.kin.fit import FitReport, fit_humanoid
