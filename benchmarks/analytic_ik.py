@@ -179,7 +179,7 @@ def summary(rows: list[dict]) -> dict[str, float]:
     }
 
 
-class Found:
+class SamplingResult:
     """What was measured so far."""
 
     def __init__(self) -> None:
@@ -283,7 +283,7 @@ def _row(*cells: object, rule: bool = False) -> list[str]:
 
 def measure_all(data: Path, every: int) -> dict:
     """The figures of every clip."""
-    found = Found()
+    found = SamplingResult()
     for name, folder in (("LAFAN1", "lafan1_bvh"), ("Bandai", "other/bandai_bvh")):
         for i, path in enumerate(sorted((data / folder).glob("*.bvh"))):
             error = found.add(name, path, more=i % every == 0)

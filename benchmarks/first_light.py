@@ -17,12 +17,12 @@ from pathlib import Path
 
 import torch
 
+from poise.jobs.deliver import deliver
+from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
-from poise.recipes.deliver import deliver
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
 
 CLIPS = {
     "02_01 walk": ("cmu_amc/02/02_01.amc", None),

@@ -39,12 +39,12 @@ from poise.eval.inbetween import (
     test_set,
     truth_rows,
 )
+from poise.jobs.inbetween import Inbetween, Task, begin, train
 from poise.learn.adapt import Adaptation, adapt, best_setting, choose_iterations
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.nets.between import BetweenConfig, parameter_count
 from poise.nets.transition import Known
-from poise.recipes.inbetween import Inbetween, Task, begin, train
 from poise.synth.baselines import Baseline
 
 PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.jobs.deliver import simulated_clip
+from poise.jobs.runs import evaluate, reopen, trained_policy
 from poise.motion import Clip, Skeleton, resample
 from poise.motion.io import write_clip
-from poise.recipes.deliver import simulated_clip
-from poise.recipes.session import evaluate, reopen, trained_policy
 from poise.spatial import quat_conj, quat_mul, quat_rotate_inv
 
 NAMES = {

@@ -45,13 +45,13 @@ from perpetual_measure import (
 )
 from perpetual_search import searched
 from perpetual_text import report
+from speed import machine
 
-from poise.bench import machine
-from poise.env import SearchConfig
 from poise.errors import PoiseError
 from poise.eval.model_card import model_card
 from poise.learn.checkpoint import write_atomic
 from poise.motion import ClipLibrary
+from poise.plan import SamplingConfig
 
 PARTS = ("table", "search", "recovery", "owners", "noise", "noisy", "speed", "curves")
 Save = Callable[[], None]
@@ -97,7 +97,7 @@ class Measurement:
 
     def _search(self) -> dict[str, Any]:
         run, a, out = self.run, self.a, {}
-        config, own = SearchConfig(a.characters), recorded(run.imitation.library.names)[0]
+        config, own = SamplingConfig(a.characters), recorded(run.imitation.library.names)[0]
         if a.clips is not None:
             task = library_task(run, self.held()[0])
             every = range(len(task.reference.length))

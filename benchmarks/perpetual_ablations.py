@@ -18,14 +18,14 @@ from pathlib import Path
 from tracker import SIXTY
 
 from poise.body import BodyConfig
-from poise.cli.beginning import beginning
+from poise.cli.callbacks import beginning
 from poise.cli.perpetual_shown import training as shown
+from poise.jobs.library.folder import LibraryConfig
+from poise.jobs.perpetual.result import RESULT
+from poise.jobs.perpetual.run import begin, clips_of, resume, train
+from poise.jobs.runs import RUN_FILE
 from poise.learn import Until
-from poise.recipes.library.folder import LibraryConfig
 from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual.result import RESULT
-from poise.recipes.perpetual.run import begin, clips_of, resume, train
-from poise.recipes.session import RUN_FILE
 
 #: Every row adds what its name says to the one before; the last three stand for themselves.
 LADDER = {

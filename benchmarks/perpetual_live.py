@@ -10,19 +10,19 @@ from typing import Any
 
 import torch
 from perpetual_measure import Run, Tell, library_task
+from speed import bench_latency, machine
 
-from poise.bench import bench_latency, machine
 from poise.errors import PoiseError
 from poise.eval.field_table import field_table
+from poise.jobs.library.files import motion_files_of
+from poise.jobs.track import TrackConfig, side_by_side, track
+from poise.jobs.track.crowd import crowd_env
+from poise.jobs.track.noise import robustness
+from poise.jobs.track.points import points_of
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
 from poise.motion.io.raw import Options as Stated
 from poise.motion.noise import robustness_levels
-from poise.recipes.library.files import motion_files_of
-from poise.recipes.track import TrackConfig, side_by_side, track
-from poise.recipes.track.crowd import crowd_env
-from poise.recipes.track.noise import robustness
-from poise.recipes.track.points import points_of
 
 
 def noise(

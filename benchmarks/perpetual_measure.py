@@ -21,20 +21,21 @@ from poise.eval.field_card import FieldTable
 from poise.eval.field_table import field_table
 from poise.eval.recovery import KINDS, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
+from poise.jobs.library.clips import LibraryConfig
+from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
+from poise.jobs.library.folder import library_of
+from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.perpetual.evaluation import ClipResults, bare_env, evaluate_clips
+from poise.jobs.runs import RUN_FILE
+from poise.jobs.track import imitation_of
+from poise.jobs.track.placement import place
+from poise.jobs.track.policy import Tracker, tracker_of
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary
 from poise.nets import Composer
 from poise.recipes.imitation import Imitation
-from poise.recipes.library.clips import LibraryConfig
-from poise.recipes.library.files import BACKWARDS, MIRRORED, matches, subject_of
-from poise.recipes.library.folder import library_of
-from poise.recipes.perpetual import run as perpetual_run
-from poise.recipes.perpetual.eval import ClipResults, bare_env, evaluate_clips
-from poise.recipes.session import RUN_FILE
-from poise.recipes.track import imitation_of
-from poise.recipes.track.clip import place
-from poise.recipes.track.policy import Tracker, tracker_of
+from poise.settings import to_data
 from poise.sim import make_backend
 
 Tell = Callable[[str], None]
@@ -94,7 +95,7 @@ class Run:
             "samples": about["samples"], "seconds": round(about["seconds"], 1),
             "hardware": hardware or "not recorded",
             "primitives": _columns(self.policy), "policy_numbers": _numbers(self.policy),
-            "config": perpetual_run.to_json(config),
+            "config": to_data(config),
             "body": {
                 "bodies": len(body.bodies), "hinges": len(body.hinges),
                 "mass_kg": round(body.mass, 1), "height_m": round(body.table.height_m, 2),
@@ -240,8 +241,8 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
     humanoid, config = run.imitation.humanoid, run.imitation.config
     still = np.tile(relaxed_stance(humanoid).qpos, (30, 1))
     reference = Reference(humanoid, [still], config.sim.control_hz, ["standing at ease"])
-    ways = run.imitation.ways
-    task = trial_task(run.imitation.task, falls=trials, guided=ways is not None)
+    recovery_clips = run.imitation.recovery_clips
+    task = trial_task(run.imitation.task, falls=trials, guided=recovery_clips is not None)
 
     def make(worlds: int) -> ImitationEnv:
         backend = make_backend(humanoid.model, worlds, threads=threads)
@@ -249,9 +250,11 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
         env.help.set(0.0)
         return env
 
-    card = recovery_card(make, run.policy, trials, method=run.name, kinds=(kind,), ways=ways)
-    learned = ways is not None or run.imitation.task.recovery is not None
-    return card.to_dict() | {"learned": learned, "ways": ways is not None}
+    card = recovery_card(
+        make, run.policy, trials, method=run.name, kinds=(kind,), recovery_clips=recovery_clips
+    )
+    learned = recovery_clips is not None or run.imitation.task.recovery is not None
+    return card.to_dict() | {"learned": learned, "ways": recovery_clips is not None}
 
 
 def recovery_kinds() -> tuple[str, ...]:

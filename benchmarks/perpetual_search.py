@@ -1,4 +1,4 @@
-"""What many characters find of the motions that the policy alone loses (`recipes.track.searching`)."""
+"""What many characters find of the motions that the policy alone loses (`jobs.track.searching`)."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from typing import Any
 import torch
 from perpetual_measure import Run
 
-from poise.env import Acts, Found, ImitationEnv, SearchConfig
+from poise.env import Acts, ImitationEnv
 from poise.eval.episodes import run_episodes
 from poise.eval.field_table import field_table
 from poise.eval.rolloutset import RolloutSet
+from poise.jobs.perpetual.evaluation import bare_env, evaluate_clips
+from poise.jobs.track.searching import replay, search
+from poise.plan import SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual.eval import bare_env, evaluate_clips
-from poise.recipes.track.searching import replay, search
 
 Tell = Callable[[str], None]
 
 
 def searched(
-    run: Run, task: Imitation, data: str, clips: Sequence[int], config: SearchConfig, threads: int,
+    run: Run, task: Imitation, data: str, clips: Sequence[int], config: SamplingConfig, threads: int,
     tell: Tell,
 ) -> dict[str, Any]:  # fmt: skip
     """The field's table of clips where those that the policy alone loses are searched, and what each of
     these took. Alone, each clip is by itself, as `poise track` has it: trajectories part on rounding."""
     alone = evaluate_clips(task, run.policy, torch.tensor(clips), threads=1, worlds=1)
     rows: list[dict[str, Any]] = []
-    found: dict[int, Found] = {}
+    found: dict[int, SamplingResult] = {}
     for c, won in zip(clips, alone.succeeded.tolist(), strict=True):
         if won:
             continue

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.jobs.runs import evaluate
 from poise.learn import PPOConfig
 from poise.motion.io import read_clip
 from poise.recipes.residual_force import ResidualForce, build
-from poise.recipes.session import evaluate
 from poise.view import line_plot
 
 CLIPS = ("90_02", "90_05", "90_08", "05_13")

@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.jobs.runs import evaluate
+from poise.jobs.warm_start import clone_expert, finetuning
 from poise.learn import Trainer
 from poise.motion.io import read_clip
-from poise.recipes.expert import clone_expert, finetuning
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build, paper
-from poise.recipes.session import evaluate
 from poise.sim import SimConfig
 from poise.view import line_plot
 

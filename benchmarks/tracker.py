@@ -5,7 +5,7 @@
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
 that need none. Ctrl-C and --resume as in `poise train perpetual`; the policy is written with
-`poise.recipes.track.policy.export_policy` and measured by `perpetual.py`.
+`poise.jobs.track.policy.export_policy` and measured by `perpetual.py`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from poise.body import BodyConfig
-from poise.cli.beginning import beginning
+from poise.cli.callbacks import beginning
 from poise.cli.perpetual_shown import training as shown
-from poise.env import PathConfig
+from poise.jobs.library.folder import LibraryConfig
+from poise.jobs.perpetual.run import begin, clips_of, resume, train
 from poise.learn import ConvergenceConfig, Until
-from poise.recipes.library.folder import LibraryConfig
+from poise.plan import TrajOptConfig
 from poise.recipes.perpetual import Perpetual
-from poise.recipes.perpetual.run import begin, clips_of, resume, train
 
 #: Dances, a kick, boxing and exercises.
 HELD_OUT = ("cmu 05$", "cmu 11$", "cmu 14$")
@@ -47,7 +47,7 @@ def config(seed: int) -> Perpetual:
         recovery=False,
         help_start=0.0,
         cooling=0.4,
-        paths=PathConfig(),
+        trajopt=TrajOptConfig(),
         convergence=ConvergenceConfig(patience=1000),
         ppo=replace(plain.ppo, std=0.04, kl_target=None),
         seed=seed,

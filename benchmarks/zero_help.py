@@ -27,13 +27,13 @@ import numpy as np
 import torch
 
 from poise.eval import RolloutSet
+from poise.jobs.deliver import deliver
+from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
 from poise.learn import IterationStats, Until
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
-from poise.recipes.deliver import deliver
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, task
-from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
 from poise.view import line_plot
 
 RFC, CMU, MIMIC = "cmu_amc/rfc", "cmu_amc/02", "deepmimic_txt"

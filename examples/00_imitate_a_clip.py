@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 
 import poise
+from poise.jobs.deliver import deliver
+from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
-from poise.recipes.deliver import deliver
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.session import begin, evaluate, learning_curve, train, trained_policy
 
 clip_path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(poise.__file__).parent / "data" / "walk.bvh"
 out = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("out")

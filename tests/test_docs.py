@@ -49,7 +49,7 @@ def _example_clip(request: pytest.FixtureRequest) -> Path:
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a toy `run` and its `policy.safetensors`."""
-    from poise.recipes.track.policy import export_policy
+    from poise.jobs.track.policy import export_policy
     from toy_policy import toy_run
 
     folder = tmp_path_factory.mktemp("policy")

@@ -9,12 +9,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from speed.stance import Stance, polygon_margin, relaxed_stance
 
 from poise.body import BodyConfig, Humanoid
 from poise.kin import Kinematics, fit_ground, fit_humanoid, lowest_height
 from poise.motion import Clip, Skeleton
 from poise.sim import SimConfig
+from speed.stance import Stance, polygon_margin, relaxed_stance
 
 #: A fall: the centre of mass below this share of its height, or anything but the feet on the floor.
 FALLEN = 0.75

@@ -187,10 +187,10 @@ def test_frames_and_clips_that_are_not_there(trained: Path, tmp_path: Path, refu
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-@pytest.mark.parametrize("verb", ["imitate", "eval", "bench"])
+@pytest.mark.parametrize("verb", ["imitate", "eval"])
 def test_a_gpu_that_is_not_there(verb: str, tmp_path: Path, refused) -> None:
     path = put(tmp_path, "a.bvh", BVH)
-    more = {"imitate": [path, "-o", tmp_path / "out"], "eval": [tmp_path], "bench": []}[verb]
+    more = {"imitate": [path, "-o", tmp_path / "out"], "eval": [tmp_path]}[verb]
     refused(verb, *more, "--device", "cuda", words=("'cuda'", "CUDA", "--device cpu"))
     refused(verb, *more, "--device", "gpu", words=("'gpu'", "'cuda:0'"))
     assert not (tmp_path / "out").exists()

@@ -10,10 +10,10 @@ import pytest
 from tiny_clips import deepmimic, put
 
 from poise.cli.main import main
+from poise.jobs.perpetual.run import reopen
 from poise.learn import CloneConfig, PPOConfig
 from poise.recipes import perpetual
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
-from poise.recipes.perpetual.run import reopen
 
 MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
 

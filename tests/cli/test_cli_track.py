@@ -58,7 +58,7 @@ def test_motion_score_and_report(
 def test_a_motion_that_is_lost_is_learned(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from poise.recipes.track.policy import open_tracker
+    from poise.jobs.track.policy import open_tracker
 
     out = tmp_path / "made.bvh"
     argv = ["track", str(short), "--policy", str(file), "-o", str(out), "--threads", "1", "--learn"]

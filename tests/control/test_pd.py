@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from poise.body import BodyConfig
-from poise.control import Drive, PDTargets, stable_pd_torque
+from poise.control import PDTargets, stable_pd_torque
 from poise.errors import PoiseError
 from poise.kin import fit_humanoid
 from poise.motion import read_clip, trim
-from poise.sim import SimConfig
+from poise.sim import Drive, SimConfig
 
 
 def test_targets_by_hand():

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
-from poise.control import Drive, ExplicitResidual, ImplicitResidual
+from poise.control import ExplicitResidual, ImplicitResidual
 from poise.errors import PoiseError
-from poise.sim import CpuBackend
+from poise.sim import CpuBackend, Drive
 from poise.spatial import heading_quat, quat_rotate
 from toy_human import human
 

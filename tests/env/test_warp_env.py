@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from poise.control import Drive
 from poise.env import ImitationEnv
 from poise.eval import run_episodes
 from poise.learn import PPOConfig
 from poise.learn.train import Trainer
-from poise.sim import NanGuard, WarpBackend
+from poise.sim import Drive, NanGuard, WarpBackend
 from toy_human import swing
 from warp_device import WARP_DEVICE, needs_warp
 

@@ -11,7 +11,7 @@ import torch
 
 from poise.control import PDTargets
 from poise.env import Recovery, TaskConfig
-from poise.env.falls import Drop
+from poise.env.recovery.falls import Drop
 from poise.errors import PoiseError
 from poise.eval import recovery_card, trial_task, write_recovery
 from poise.eval.field_paper import PHC_RECOVERY

@@ -9,7 +9,7 @@ import torch
 from toy_point_env import PointEnv
 
 from poise.errors import PoiseError
-from poise.learn import PPOConfig, Trainer, beside
+from poise.learn import PPOConfig, Trainer, threaded_update
 from poise.nets import RunningNorm
 
 SMALL = PPOConfig(std=0.3, horizon=24, epochs=1, policy_hidden=(8,), value_hidden=(8,), minibatch=256)
@@ -36,9 +36,9 @@ def test_moments_say_what_observing_says():
 
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
-@pytest.mark.parametrize("worth", [1, beside.WORTH])
+@pytest.mark.parametrize("worth", [1, threaded_update.WORTH])
 def test_training_side_by_side_changes_no_number(products, worth, monkeypatch):
-    monkeypatch.setattr(beside, "WORTH", worth)
+    monkeypatch.setattr(threaded_update, "WORTH", worth)
     config = replace(SMALL, epochs=3, critic_warmup=1, products=products)
     states = []
     for threads in (1, 2):
@@ -52,8 +52,8 @@ def test_training_side_by_side_changes_no_number(products, worth, monkeypatch):
 
 def test_a_minibatch_in_two_parts_has_the_gradient_of_one(monkeypatch):
     grads = []
-    for worth in (1, beside.WORTH):
-        monkeypatch.setattr(beside, "WORTH", worth)
+    for worth in (1, threaded_update.WORTH):
+        monkeypatch.setattr(threaded_update, "WORTH", worth)
         # An odd number of rows, so that the parts are of different sizes.
         config = replace(SMALL, products="float32", minibatch=10**6, policy_lr=1e-9, horizon=7)
         trainer = Trainer(PointEnv(33, 0), config, seed=1)
@@ -73,7 +73,9 @@ def test_a_failure_in_the_second_part_is_told_and_no_thread_goes_on():
 
     parts = torch.arange(4).tensor_split(2)
     with pytest.raises(ValueError, match="second part"):
-        beside.mean_gradient(parts, [param], loss_and_terms, beside.Beside(), True)
+        threaded_update.mean_gradient(
+            parts, [param], loss_and_terms, threaded_update.ThreadedUpdate(), True
+        )
     assert param.grad is None
 
 

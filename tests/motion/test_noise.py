@@ -10,9 +10,9 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion import read_clip, resample
-from poise.motion.io.points import assemble_points
+from poise.motion.io.points.raw import assemble_points
+from poise.motion.io.points.trc import trc_points
 from poise.motion.io.raw import Options
-from poise.motion.io.trc import trc_points
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import (
     TRIANGULATED,

@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 
 from poise.errors import PoiseError
 from poise.motion import read_clip, write_clip
-from poise.motion.io.arrays import MAX_ARRAY_BYTES, Archive, npz_bytes
+from poise.motion.io.numpy.arrays import MAX_ARRAY_BYTES, Archive, npz_bytes
 
 
 def refusal(path: Path, **options: Any) -> str:

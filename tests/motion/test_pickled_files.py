@@ -18,8 +18,8 @@ from handmade_numpy_files import aist, poselib, save_npy, save_npz, save_pickle
 
 from poise.errors import PoiseError
 from poise.motion import read_clip, write_clip
-from poise.motion.io import pickles
-from poise.motion.io.pickles import load_restricted, loads_restricted
+from poise.motion.io.numpy import pickles
+from poise.motion.io.numpy.pickles import load_restricted, loads_restricted
 
 
 def same(a: Any, b: Any) -> bool:
@@ -165,7 +165,7 @@ def test_damaged_pickles_never_break_out() -> None:
 
 
 def test_no_instruction_is_known_that_calls_or_looks_up() -> None:
-    from poise.motion.io.pickles import _STEPS
+    from poise.motion.io.numpy.pickles import _STEPS
 
     known = {op.name for op in pickletools.opcodes}
     assert set(_STEPS) <= known

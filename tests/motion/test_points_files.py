@@ -10,12 +10,12 @@ import pytest
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip
-from poise.motion.io.c3d import c3d_points
-from poise.motion.io.points import assemble_points
-from poise.motion.io.points_arrays import HUMANML3D, array_points, mdm_points
-from poise.motion.io.points_csv import csv_points
+from poise.motion.io.points.arrays import HUMANML3D, array_points, mdm_points
+from poise.motion.io.points.c3d import c3d_points
+from poise.motion.io.points.csv import csv_points
+from poise.motion.io.points.raw import assemble_points
+from poise.motion.io.points.trc import trc_points
 from poise.motion.io.raw import Options
-from poise.motion.io.trc import trc_points
 from poise.motion.points import FitConfig, fit_clip, fit_distances
 
 # A standing person in a file's Y-up axes, facing +Z, left at +X, m.

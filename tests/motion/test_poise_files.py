@@ -12,7 +12,7 @@ from handmade_numpy_files import odd_clip, save_npz
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip, write_clip
-from poise.motion.io.motion_csv import columns
+from poise.motion.io.own.csv import columns
 
 
 def check_same(a: Clip, b: Clip) -> None:

@@ -20,7 +20,7 @@ from poise.spatial import quat_distance
 def pxr() -> Any:
     usd = pytest.importorskip("pxr.Usd")
     assert usd is not None
-    from poise.motion.io.usd_read import pxr_package
+    from poise.motion.io.usd.read import pxr_package
 
     return pxr_package()
 

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_library import library, tiny
 
 from poise.body import make_humanoid
-from poise.env.bodies import differing
+from poise.env.body_assignment import differing
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
+from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.kin import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual.eval import evaluate_clips
 from poise.recipes.perpetual.shapes import (
     GROUPS,
     BodyShapes,
@@ -27,8 +27,8 @@ from poise.recipes.perpetual.shapes import (
     scaled_table,
     shaped,
 )
-from poise.recipes.perpetual.stages import Course
 from poise.sim import CpuBackend
+from toy_library import library, tiny
 
 SHAPES = BodyShapes(count=3, seed=2)
 CONFIG = tiny(max_primitives=1, expert=False, style=None, shape=True)
@@ -174,7 +174,7 @@ def trained(folder: Path, imitation: Imitation, *stops: int) -> dict[str, torch.
     """The last checkpoint of a training that was stopped and resumed."""
     folder.mkdir()
     for stop in stops:
-        course = Course(imitation, folder, Until(iterations=6), 1, tensorboard=False, save_s=0.0)
+        course = StageTrainer(imitation, folder, Until(iterations=6), 1, tensorboard=False, save_s=0.0)
         while course.iteration < stop and not course.finished:
             course.iterate()
         course.save()
@@ -199,7 +199,8 @@ def test_a_training_resumes_bit_for_bit(imitation: Imitation, tmp_path: Path) ->
 
 def test_the_expert_knows_the_body(imitation: Imitation) -> None:
     """Inverse dynamics of a clip on body k are those of that body alone."""
-    from poise.env import Reference, make_plan
+    from poise.env import Reference
+    from poise.plan import make_plan
 
     r, c = imitation.reference, 4
     plan, body = make_plan(r), r.bodies[int(r.body[c])]

@@ -12,10 +12,10 @@ from poise.control import ExplicitResidual, ImplicitResidual
 from poise.env.terms import reward
 from poise.errors import PoiseError
 from poise.eval import run_episodes, start_frames
+from poise.jobs.runs import begin, reopen
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import paper
-from poise.recipes.session import begin, reopen
 from toy_human import swing
 
 

@@ -36,7 +36,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
     check_device(options.device)
     folder = run_folder(options.run)
-    from poise.recipes.session import reopen, score, trained_policy
+    from poise.jobs.runs import reopen, score, trained_policy
 
     with working("simulating every start frame"):
         imitation = reopen(folder)

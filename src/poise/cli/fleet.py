@@ -18,7 +18,7 @@ from poise.cli.progress import clock
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.recipes.fleet import FleetJob, FleetResult, Record
+    from poise.jobs.fleet import FleetJob, FleetResult, Record
 
 #: Options of `poise imitate` that are not for a sweep, and what is instead.
 _TAKEN = {
@@ -65,8 +65,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
     jobs = plan(o)
     for job in jobs:
         _check(job)
-    from poise.recipes.fleet import FLEET_FILE, read_table, run_fleet
-    from poise.recipes.workers import make_workers
+    from poise.jobs.fleet import FLEET_FILE, read_table, run_fleet
+    from poise.jobs.workers import make_workers
 
     with claimed(o.out):
         read_table(o.out)
@@ -92,7 +92,7 @@ def plan(o: Options) -> list[FleetJob]:
     Raises:
         PoiseError: no clip, or a seed or setting that cannot be understood.
     """
-    from poise.recipes.fleet import FleetJob, combinations
+    from poise.jobs.fleet import FleetJob, combinations
 
     settings = dict(_setting(text) for text in o.set)
     seeds = _seeds(o.seeds)

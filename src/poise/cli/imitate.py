@@ -9,7 +9,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.beginning import first_delivery
+from poise.cli.callbacks import first_delivery
 from poise.cli.console import say
 from poise.cli.options import Body, Reading, Training
 from poise.cli.progress import working
@@ -50,8 +50,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
         return job.stopped("Stopped; the training so far is saved.")
     if comm.rank:
         return 0
-    from poise.recipes.deliver import deliver
-    from poise.recipes.session import evaluate, learning_curve, trained_policy
+    from poise.jobs.deliver import deliver
+    from poise.jobs.runs import evaluate, learning_curve, trained_policy
 
     try:
         with working("simulating every start frame"):

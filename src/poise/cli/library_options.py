@@ -13,7 +13,7 @@ from tyro.conf import UseAppendAction, arg
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.recipes.library import LibraryConfig
+    from poise.jobs.library import LibraryConfig
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Library:
 
     def reading(self) -> LibraryConfig:
         """How the files of the library are read."""
-        from poise.recipes.library import LibraryConfig
+        from poise.jobs.library import LibraryConfig
 
         rates = []
         for pattern, text in _pairs("library-fps", self.library_fps, "cmu=120"):

@@ -9,7 +9,7 @@ import errno
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from poise import __version__
@@ -28,7 +28,6 @@ VERBS = {
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
-    "bench": "how fast the engine is against its limit, and whether its physics is true",
     "doctor": "what is wrong with a motion, and mend it; without a clip: is this machine ready",
 }
 _FIRST = (
@@ -46,13 +45,18 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command line (default: the process's own) and returns the exit code."""
-    argv = sys.argv[1:] if argv is None else list(argv)
+    given = sys.argv[1:] if argv is None else list(argv)
+    return guarded(lambda: _run(given))
+
+
+def guarded(work: Callable[[], int]) -> int:
+    """The exit code of `work`; every failure of it becomes one sentence."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             # A name that the terminal cannot show must not end the program.
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
-        code = _run(argv)
+        code = work()
         sys.stdout.flush()
         return code
     except SystemExit as stop:

@@ -62,8 +62,8 @@ def run_folder(path: Path) -> Path:
     Raises:
         PoiseError: there is no such folder.
     """
-    # The name of the run file stands in poise.recipes.session, whose import takes seconds.
-    from poise.recipes.session import RUN_FILE
+    # The name of the run file stands in poise.jobs.runs, whose import takes seconds.
+    from poise.jobs.runs import RUN_FILE
 
     if not path.exists():
         raise PoiseError("there is no such folder", path, "Give the folder of a result or a run")

@@ -32,7 +32,7 @@ class Primitives:
     """perpetual: rotations tells of places and rotations, keypoints of places alone."""
     recovery: bool = True
     """perpetual: fallen and far characters learn to get up and come back; so nobody does."""
-    ways: bool = True
+    recovery_clips: bool = True
     """perpetual: they follow ways that are made of the library's clips, where somebody gets up in it and
     somebody walks; so they are told a point to come back to, as in the paper."""
     multiplicative: bool = True
@@ -67,7 +67,7 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         raise PoiseError(
             "--paths are for the expert, and --no-expert does without", hint="Leave one out"
         )
-    from poise.env import PathConfig
+    from poise.plan import TrajOptConfig
     from poise.recipes.perpetual import Perpetual
 
     config = replace(
@@ -81,13 +81,13 @@ def settings(primitives: Primitives, training: Training, body: Body) -> Perpetua
         termination=primitives.termination,
         # What follows paths needs no help from the beginning.
         help_start=0.0 if primitives.paths else training.help_start,
-        paths=PathConfig(iterations=primitives.paths) if primitives.paths else None,
+        trajopt=TrajOptConfig(iterations=primitives.paths) if primitives.paths else None,
         seed=training.seed,
         expert=training.expert,
         body=body.config(),
     )
-    if not primitives.ways:
-        config = replace(config, recovering=replace(config.recovering, ways=0))
+    if not primitives.recovery_clips:
+        config = replace(config, recovering=replace(config.recovering, demonstrations=0))
     if not primitives.style:
         config = replace(config, style=None)
     return config if training.envs is None else replace(config, num_envs=training.envs)
@@ -100,7 +100,7 @@ def check_going_on(primitives: Primitives, body: Body, library: Library, returns
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
     free = ["recovery", "ways", "single", "going_on"]
-    if returns and primitives.recovery and primitives.ways and not primitives.single:
+    if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.append("max_primitives")
     own = {name: getattr(primitives, name) for name in free}
     plain = Primitives(**own)

@@ -13,9 +13,9 @@ from poise.cli.progress import clock, showing
 
 if TYPE_CHECKING:
     from poise.eval import RecoveryCard
+    from poise.jobs.perpetual.progress import Progress
+    from poise.jobs.perpetual.run import PerpetualResult
     from poise.recipes.imitation import Imitation
-    from poise.recipes.perpetual.progress import Progress
-    from poise.recipes.perpetual.run import PerpetualResult
 
 #: Clips that are named in the end.
 NAMED = 10

@@ -16,9 +16,9 @@ from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
 
 if TYPE_CHECKING:
+    from poise.jobs.runs import Evaluation
     from poise.learn import Policy
     from poise.recipes.imitation import Imitation
-    from poise.recipes.session import Evaluation
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> int:
     """Simulates one episode to its end and writes its report page."""
     folder = run_folder(options.run)
-    from poise.recipes.deliver import make_report
-    from poise.recipes.session import learning_curve, reopen, trained_policy
+    from poise.jobs.deliver import make_report
+    from poise.jobs.runs import learning_curve, reopen, trained_policy
     from poise.view import write_report
 
     with working("simulating"):
@@ -81,7 +81,7 @@ def _episode(
     import torch
 
     from poise.eval import run_episodes, score_rollouts
-    from poise.recipes.session import Evaluation, help_left
+    from poise.jobs.runs import Evaluation, help_left
 
     config = imitation.config
     limit, scale = help_left(imitation, meta)

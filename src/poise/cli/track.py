@@ -18,12 +18,12 @@ from poise.cli.results import print_card
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.env import SearchConfig
+    from poise.jobs.perpetual.progress import Progress
+    from poise.jobs.track import TrackConfig, Tracked
+    from poise.jobs.track.policy import Tracker
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
-    from poise.recipes.perpetual.progress import Progress
-    from poise.recipes.track import TrackConfig, Tracked
-    from poise.recipes.track.policy import Tracker
+    from poise.plan import SamplingConfig
 
 #: Failures that are named one by one.
 NAMED = 8
@@ -92,9 +92,9 @@ def run(options: Options, argv: Sequence[str]) -> int:
     out, motion = places(o.clip, o.out)
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
-    from poise.recipes.track import TrackConfig, track, write
-    from poise.recipes.track.noise import noise_of
-    from poise.recipes.track.policy import open_tracker, save_tracker
+    from poise.jobs.track import TrackConfig, track, write
+    from poise.jobs.track.noise import noise_of
+    from poise.jobs.track.policy import open_tracker, save_tracker
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
@@ -128,17 +128,17 @@ def run(options: Options, argv: Sequence[str]) -> int:
     return 0
 
 
-def searches(options: Options) -> SearchConfig | None:
+def searches(options: Options) -> SamplingConfig | None:
     """How a motion is looked for, if it is."""
-    from poise.env import SearchConfig
+    from poise.plan import SamplingConfig
 
     o = options
-    return SearchConfig(o.characters, rounds=o.rounds, seed=o.seed) if o.search else None
+    return SamplingConfig(o.characters, rounds=o.rounds, seed=o.seed) if o.search else None
 
 
 def look(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
     """The motion as it is found by a search."""
-    from poise.recipes.track import track
+    from poise.jobs.track import track
 
     began = time.monotonic()
     with showing("searching") as bar:
@@ -154,7 +154,7 @@ def look(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Trac
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
     from poise.cli.perpetual_shown import times
-    from poise.recipes.track.learning import learn
+    from poise.jobs.track.learning import learn
 
     o, when, rate = options, tracked.failures[0][1], tracker.config.sim.control_hz
     tell(f"The policy loses the motion at {when:.1f} s and learns it now, {o.learn:g} minutes at most.")
@@ -216,8 +216,8 @@ def outcome(tracked: Tracked, reset: bool) -> str:
 
 def read(path: Path, reading: Reading) -> Clip | Keypoints:
     """The motion in a file; keypoints stay keypoints."""
+    from poise.jobs.track.points import points_of
     from poise.motion.io.raw import Options as Stated
-    from poise.recipes.track.points import points_of
 
     clip = reading.read(path)
     if reading.ground is not None or reading.swap_sides:

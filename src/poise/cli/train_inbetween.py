@@ -42,8 +42,8 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
 
     import torch
 
+    from poise.jobs.inbetween import RUN_FILE, Inbetween, begin, train
     from poise.learn.between import BetweenTraining
-    from poise.recipes.inbetween import RUN_FILE, Inbetween, begin, train
 
     folder = library.folder("inbetween")
     if library.backwards:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
-from poise.cli.beginning import beginning
+from poise.cli.callbacks import beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Training
@@ -21,9 +21,9 @@ from poise.cli.progress import clock
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
+    from poise.jobs.track.policy import Tracker
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
-    from poise.recipes.track.policy import Tracker
 
 
 def run(
@@ -36,22 +36,22 @@ def run(
         raise PoiseError("the recipe perpetual trains in one process", hint=hint)
     training.check()
     config = settings(primitives, training, body)
+    from poise.jobs.perpetual.run import train
+    from poise.jobs.runs import RUN_FILE
     from poise.learn import Until
-    from poise.recipes.perpetual.run import train
-    from poise.recipes.session import RUN_FILE
 
     held = (out / RUN_FILE).exists()
     if held and not training.resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
     tracker = None
     if primitives.going_on is not None:
-        from poise.recipes.perpetual.run import going_on
-        from poise.recipes.track.policy import open_tracker
+        from poise.jobs.perpetual.run import going_on
+        from poise.jobs.track.policy import open_tracker
 
         check_going_on(primitives, body, library)
         tracker = open_tracker(primitives.going_on)
         # Whether --max-primitives has a say is known by the policy alone.
-        returns = tracker.ways is not None
+        returns = tracker.recovery_clips is not None
         check_going_on(primitives, body, library, returns)
         if training.envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
@@ -88,7 +88,7 @@ def begin(
     held: the run folder holds a run already, which then is all that is read. tracker: the policy that it
     goes on from.
     """
-    from poise.recipes.perpetual import run as perpetual_run
+    from poise.jobs.perpetual import run as perpetual_run
 
     folder = library.folder("perpetual")
     hold_out, never = ((p,) if p else () for p in (library.hold_out, library.never))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
-from poise.cli.beginning import First, beginning
+from poise.cli.callbacks import First, beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Body, Reading, Training
 from poise.cli.output import claimed
@@ -42,8 +42,8 @@ class Job:
 
     def start(self, comm: Comm) -> Imitation:
         """The task on every process: rank 0 begins the run, the others open its folder."""
+        from poise.jobs.runs import reopen
         from poise.learn.parallel import share_of, together
-        from poise.recipes.session import reopen
 
         with together(comm):
             self.training.check()
@@ -56,7 +56,7 @@ class Job:
     def begin(self) -> Imitation:
         """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""
         config = self.training.config(self.body)
-        from poise.recipes.session import RUN_FILE, begin
+        from poise.jobs.runs import RUN_FILE, begin
 
         held = (self.run / RUN_FILE).exists()
         if held and not self.training.resume:
@@ -87,8 +87,8 @@ class Job:
 
     def train(self, imitation: Imitation, comm: Comm, first: First | None = None) -> RunResult:
         """Trains until the limit or Ctrl-C; either way everything is saved. `first` gets the clone."""
+        from poise.jobs.runs import train
         from poise.learn import RunResult, Until
-        from poise.recipes.session import train
 
         until = Until(minutes=self.training.minutes, iterations=self.training.iterations)
         if self.training.device != "cpu":

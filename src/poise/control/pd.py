@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from poise.control.drive import Drive
 from poise.errors import PoiseError
+from poise.sim.drive import Drive
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from poise.control.drive import Drive
 from poise.errors import PoiseError
+from poise.sim.drive import Drive
 from poise.spatial import heading_quat, quat_rotate
 
 

@@ -6,16 +6,16 @@ import torch
 from torch import Tensor
 
 from poise.control import Wrench
-from poise.env.acting import Acting
-from poise.env.bodies import Bodies
-from poise.env.budget import HelpBudget
+from poise.env.actuation import Actuation
+from poise.env.bins import FailureRates
+from poise.env.body_assignment import BodyAssignment
 from poise.env.frame import Frame, Pose, placed
-from poise.env.means import Means
-from poise.env.moments import Hardness
-from poise.env.recoveries import Recoveries
-from poise.env.recovery import FALLEN, point_goal, root_distance, toward
+from poise.env.help import HelpBudget
+from poise.env.recovery.clock import RecoveryClock
+from poise.env.recovery.config import FALLEN, point_goal, root_distance, toward
 from poise.env.reference import FIELDS, Reference
 from poise.env.starts import Starts
+from poise.env.step_log import StepLog
 from poise.env.style import ClipFeatures, ClipWindows
 from poise.env.task import EnvStep, TaskConfig
 from poise.env.terms.evaluate import Seen, Terms, seen_by, sim_pose
@@ -45,11 +45,13 @@ class ImitationEnv:
         fused: bool = True,
     ):
         self.num_envs, self.device = backend.num_envs, backend.device
-        moments = reference.moments
-        practised = moments, task.hard, task.hard_over
+        bins = reference.bins
+        practised = bins, task.hard, task.adaptive_over
         self._starts = Starts(reference.length, weights, seed, task.first, *practised)
         self.reference = reference = reference.to(self.device)
-        self.hardness = Hardness(len(moments), self.device) if task.hard and task.auto_reset else None
+        self.failure_rates = (
+            FailureRates(len(bins), self.device) if task.hard and task.auto_reset else None
+        )
         self.backend, self.task, self.substeps = backend, task, substeps
         self.hinges = len(reference.humanoid.hinges)
         if backend.model.nu != self.hinges:
@@ -68,7 +70,7 @@ class ImitationEnv:
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.wrench: Wrench | None = None
         schedule = task.help if task.auto_reset and task.residual else None
-        groups = {"all": 1, "clip": len(reference.length), "moment": len(moments)}[task.help_by]
+        groups = {"all": 1, "clip": len(reference.length), "bin": len(bins)}[task.help_by]
         self.help = HelpBudget(schedule, here, groups)
         self._use_help()
         self.terms: dict[str, Tensor] = {}
@@ -78,19 +80,19 @@ class ImitationEnv:
         self._roots = torch.as_tensor(backend.model.body_rootid[1:], dtype=torch.long).to(here)
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        self._acting = Acting(backend, task.pd, task.residual, fused)
+        self._acting = Actuation(backend, task.pd, task.residual, fused)
         asking = (*task.obs, *task.rewards, *task.dones)
         self._torqued = any(getattr(term.fn, "uses_torque", False) for term in asking)
         self._torques = self._bind_torques()
-        self.recoveries: Recoveries | None = None
+        self.recoveries: RecoveryClock | None = None
         if task.recovery is not None:
-            self.recoveries = Recoveries(task.recovery, backend, reference.humanoid, task.pd, seed)
-        self._bodies: Bodies | None = None
+            self.recoveries = RecoveryClock(task.recovery, backend, reference.humanoid, task.pd, seed)
+        self._bodies: BodyAssignment | None = None
         if len(reference.bodies) > 1:
             if self.recoveries is not None:
                 # Falls are those of the first body, which all worlds still have.
                 _ = self.recoveries.falls
-            self._bodies = Bodies(backend, reference.bodies, reference.body)
+            self._bodies = BodyAssignment(backend, reference.bodies, reference.body)
         self._no_table, self._every = torch.zeros(n, 0, device=here), torch.arange(n, device=here)
         terms = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         self._terms = Terms(*terms, placed(task.style, here), self._frame_of, self._ends, here, fused)
@@ -124,24 +126,25 @@ class ImitationEnv:
     def _use_help(self) -> None:
         """Help of what is not drawn does not count."""
         used = self._starts.weights > 0
-        self.help.use(used[self.reference.moments.clip.cpu()] if self._by_moment else used)
+        self.help.use(used[self.reference.bins.clip.cpu()] if self._by_moment else used)
 
     @property
     def _by_moment(self) -> bool:
-        return self.task.help_by == "moment"
+        return self.task.help_by == "bin"
 
     def reset_to(self, clip: Tensor, frame: Tensor, kind: Tensor | None = None) -> Tensor:
         """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
 
         Frames past the end of a cyclic clip are where its later cycles are.
 
-        kind: `(N,)` kinds of `poise.env.recovery`, in a task with it; None begins tracked episodes.
+        kind: `(N,)` kinds of `poise.env.recovery.config`, in a task with it; None begins tracked
+        episodes.
         """
         self.clip.copy_(clip)
         self.frame.copy_(frame)
         self.age.zero_()
         self.action.zero_()
-        self._dress(None, self.clip)
+        self._assign_bodies(None, self.clip)
         start = self.reference.coordinates(self.clip, self.frame)
         if self.recoveries is not None:
             kinds = torch.zeros(self.num_envs, dtype=torch.long) if kind is None else kind
@@ -152,7 +155,7 @@ class ImitationEnv:
         self._aim()
         return self._observe() if hasattr(self, "num_obs") else torch.empty(0)
 
-    def take_up(self, reference: Reference, clip: Tensor, frame: Tensor) -> Tensor:
+    def set_goal(self, reference: Reference, clip: Tensor, frame: Tensor) -> Tensor:
         """Goes on with other motions of the same body, world i at `frame[i]` of `clip[i]`, both `(N,)`,
         wherever it stands; returns observations. For environments without automatic restarts."""
         self.reference = reference.to(self.device)
@@ -162,12 +165,12 @@ class ImitationEnv:
         return self._observe()
 
     def _restart(self, ids: Tensor) -> None:
-        odds = None if self.hardness is None else self.hardness.odds
+        odds = None if self.failure_rates is None else self.failure_rates.odds
         pick, frame = (x.to(self.device) for x in self._starts.draw(len(ids), odds))
         self.clip[ids], self.frame[ids] = pick, frame
         self.age[ids] = 0
         self.action[ids] = 0.0
-        self._dress(ids, pick)
+        self._assign_bodies(ids, pick)
         start, ahead = self.reference.coordinates(pick, frame), frame + 1
         if self.recoveries is not None:
             rng = self._starts.rng
@@ -177,7 +180,7 @@ class ImitationEnv:
         self._goal_rows[ids] = self.reference.rows(pick, ahead)
         self._goal[ids] = self.reference.gather_packed(pick, ahead)
 
-    def _dress(self, rows: Tensor | None, clip: Tensor) -> None:
+    def _assign_bodies(self, rows: Tensor | None, clip: Tensor) -> None:
         """Worlds `rows` take the bodies of `clip`, before their states are written."""
         if self._bodies is not None:
             self._bodies.take(rows, clip)
@@ -203,8 +206,8 @@ class ImitationEnv:
             )
         # A copy, since a restart clears its rows and the caller's actions are the caller's.
         self.action.copy_(actions)
-        row, moments = self._goal_rows, self.reference.moments
-        group = moments.of[row] if self._by_moment else self.clip
+        row, bins = self._goal_rows, self.reference.bins
+        group = bins.of[row] if self._by_moment else self.clip
         help_left = self.help.at(group)
         targets, rows = self.reference.hinges, row
         if self.recoveries is not None and self.task.pd.mode == "additive":
@@ -222,11 +225,13 @@ class ImitationEnv:
             apart = root_distance(self.reference.unpacked(ref).pos, self.backend.state.xpos[:, 1:])
             rng = self._starts.rng if self.task.auto_reset else None
             self.recoveries.judge(ends, apart, self.age >= self.task.horizon, rng)
-        if self.task.finish:
-            reward = torch.where(terminated & ~failed, reward * (1.0 + self.task.finish), reward)
+        if self.task.completion_bonus:
+            reward = torch.where(
+                terminated & ~failed, reward * (1.0 + self.task.completion_bonus), reward
+            )
         obs, more = final, self.recoveries and self.recoveries.shares()
         limit = self.help.limit(self._limit_n, group)
-        log = Means(self.terms, self.imitation, self.wrench, limit, more)
+        log = StepLog(self.terms, self.imitation, self.wrench, limit, more)
         if self.task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
             self._count(row, ids, failed, terminated)
@@ -240,13 +245,13 @@ class ImitationEnv:
     def _count(self, row: Tensor, ids: Tensor, failed: Tensor, terminated: Tensor) -> None:
         """Notes what became of the episodes in a step to `row (N,)`, after which those of `ids` end."""
         by_moment = self._by_moment and self.help.schedule is not None
-        if by_moment or self.hardness is not None:
-            seen = self.reference.moments.outcomes(row, self.age, failed, terminated & ~failed)
+        if by_moment or self.failure_rates is not None:
+            seen = self.reference.bins.outcomes(row, self.age, failed, terminated & ~failed)
             if self.recoveries is not None:
                 # Who recovers, or has recovered, has not been where its age says.
                 seen = seen.of(self.recoveries.kind == 0)
-            if self.hardness is not None:
-                self.hardness.add(seen)
+            if self.failure_rates is not None:
+                self.failure_rates.add(seen)
             if by_moment:
                 self.help.add(*seen)
         if not self._by_moment:
@@ -255,9 +260,9 @@ class ImitationEnv:
     def _ends(self, seen: Seen, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Which episodes failed, are terminated and are truncated."""
         # A clip that is done to its end is a finished task, whose remaining return is stated: as many
-        # steps like the last as `finish` says, since with nothing to come the last moments would not
-        # matter and characters would fall in them. To bootstrap there would rest on a state whose
-        # value is never learned, and the policy comes to exploit it.
+        # steps like the last as `completion_bonus` says, since with nothing to come the last moments
+        # would not matter and characters would fall in them. To bootstrap there would rest on a state
+        # whose value is never learned, and the policy comes to exploit it.
         done = self.reference.place(seen.ref).end > 0
         if self.task.recovery is not None:
             free = seen.recovery[:, 1] == 0
@@ -366,14 +371,14 @@ class ImitationEnv:
             "help": self.help.state(),
             "weights": self.weights,
             "rng": self._starts.rng.get_state(),
-            **({} if self.hardness is None else {"hardness": self.hardness.state()}),
+            **({} if self.failure_rates is None else {"hardness": self.failure_rates.state()}),
             **({} if self.recoveries is None else self.recoveries.state()),
         }
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continues from `state()`: exactly, or from the same positions and velocities where the state
         is that of another kind of backend (another number format), such as the GPU's."""
-        self._dress(None, state["clip"].to(self.device))
+        self._assign_bodies(None, state["clip"].to(self.device))
         if state["sim"].dtype == self.backend.state.qpos.dtype:
             self.backend.restore(state["sim"])
         else:
@@ -381,8 +386,8 @@ class ImitationEnv:
         for name in ("clip", "frame", "age", "action"):
             getattr(self, name).copy_(state[name])
         self.help.load_state(state["help"])
-        if self.hardness is not None and "hardness" in state:
-            self.hardness.load_state(state["hardness"])
+        if self.failure_rates is not None and "hardness" in state:
+            self.failure_rates.load_state(state["hardness"])
         if self.recoveries is not None:
             self.recoveries.load_state(state)
         self._aim()

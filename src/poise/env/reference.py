@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
+from poise.env.bins import MotionBins
 from poise.env.frame import Pose
-from poise.env.moments import Moments
 from poise.errors import PoiseError
 from poise.kin import Kinematics, cycle_step, cycle_velocity, qpos_velocity
 from poise.spatial import heading_quat, quat_mul, quat_rotate
@@ -95,7 +95,7 @@ class Reference:
         )
         self.any_cyclic = bool(self.cyclic.any())
         #: Its clips cut into moments.
-        self.moments = Moments.cut(self.length, self.cyclic, rate_hz)
+        self.bins = MotionBins.cut(self.length, self.cyclic, rate_hz)
         clip = torch.arange(len(motions)).repeat_interleave(self.length)
         frame = torch.arange(len(qpos)) - self.start[clip]
         end = (frame == self.length[clip] - 1) & ~self.cyclic[clip]
@@ -117,7 +117,7 @@ class Reference:
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 setattr(there, name, value.to(device))
-        there.moments = self.moments.to(device)
+        there.bins = self.bins.to(device)
         there._fast = Kinematics(self.humanoid.table, torch.float32, device)
         return there
 
@@ -131,8 +131,8 @@ class Reference:
         out.any_cyclic = any(p.any_cyclic for p in parts)
         rows = torch.tensor([0, *(len(p.qpos) for p in parts)]).cumsum(0).tolist()
         out._after = torch.cat([p._after + row for p, row in zip(parts, rows, strict=False)])
-        cut = Moments.cut(out.length.cpu(), out.cyclic.cpu(), self.rate_hz)
-        out.moments = cut.to(self.qpos.device)
+        cut = MotionBins.cut(out.length.cpu(), out.cyclic.cpu(), self.rate_hz)
+        out.bins = cut.to(self.qpos.device)
         return out
 
     def _poses(self, qpos: Tensor, qvel: Tensor, body: Tensor) -> Pose:

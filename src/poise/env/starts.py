@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from poise.env.moments import Moments
+from poise.env.bins import MotionBins
 from poise.errors import PoiseError
 
 #: Who practises a moment begins at most so many times its length before its middle.
@@ -35,12 +35,12 @@ class Starts:
         weights: Tensor | None = None,
         seed: int = 0,
         first: float = 0.0,
-        moments: Moments | None = None,
+        bins: MotionBins | None = None,
         hard: float = 0.0,
         over: Literal["clip", "library"] = "clip",
     ):
         self.length, self.first, self.hard, self.over = length.cpu(), first, hard, over
-        self.moments = None if moments is None else moments.to(torch.device("cpu"))
+        self.bins = None if bins is None else bins.to(torch.device("cpu"))
         for what, share in (("on frame 0", first), ("at hard moments", hard)):
             if not 0.0 <= share <= 1.0:
                 raise PoiseError(f"the share of starts {what} must lie in [0, 1], got {share}")
@@ -68,21 +68,23 @@ class Starts:
     def draw(self, count: int, odds: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(clip, frame) of `count` starts, `(count,)` each.
 
-        odds: `(G,)` float64 of the moments, such as `Hardness.odds`. The share `hard` of the starts lies
-        in the `RUN_UP` before the middle of a moment that is drawn by them among those of its clip, or
-        of all clips of odds above 0; where all are 0 it is begun as without.
+        odds: `(G,)` float64 of the moments, such as `FailureRates.odds`. The share `hard` of the starts
+        lies in the `RUN_UP` before the middle of a moment that is drawn by them among those of its
+        clip, or of all clips of odds above 0; where all are 0 it is begun as without.
         """
         pick = torch.multinomial(self._weights, count, replacement=True, generator=self.rng)
         span = (self.length[pick] - 1).double()
         u = torch.rand(count, dtype=torch.float64, generator=self.rng)
         frame = torch.minimum((u * span).long(), self.length[pick] - 2)
-        if self.hard and odds is not None and self.moments is not None:
-            pick, frame = self._practise(self.moments, pick, frame, odds)
+        if self.hard and odds is not None and self.bins is not None:
+            pick, frame = self._practise(self.bins, pick, frame, odds)
         if self.first:
             frame[torch.rand(count, generator=self.rng) < self.first] = 0
         return pick, frame
 
-    def _practise(self, m: Moments, pick: Tensor, frame: Tensor, odds: Tensor) -> tuple[Tensor, Tensor]:
+    def _practise(
+        self, m: MotionBins, pick: Tensor, frame: Tensor, odds: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Some of the starts anew, before moments that are drawn by their odds."""
         chance, where, before = torch.rand(3, len(pick), dtype=torch.float64, generator=self.rng)
         if self.over == "library":
@@ -95,9 +97,9 @@ class Starts:
         low, high = summed[first], summed[last + 1]
         # Rounding must not lead out of the clip.
         found = torch.searchsorted(summed, low + where * (high - low), right=True) - 1
-        moment = torch.minimum(torch.maximum(found, first), last)
-        clip, size = m.clip[moment], m.size[moment].double()
-        begun = (m.begin[moment] + (0.5 - before * RUN_UP) * size).long().clamp(min=0)
+        bin = torch.minimum(torch.maximum(found, first), last)
+        clip, size = m.clip[bin], m.size[bin].double()
+        begun = (m.begin[bin] + (0.5 - before * RUN_UP) * size).long().clamp(min=0)
         begun = torch.minimum(begun, self.length[clip] - 2)
         hard = (chance < self.hard) & (high > low)
         return torch.where(hard, clip, pick), torch.where(hard, begun, frame)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.control import HelpSchedule, PDTargets, Residual
 from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
-from poise.env.recovery import Recovery
+from poise.env.recovery.config import Recovery
 from poise.errors import PoiseError
 
 
@@ -44,16 +44,16 @@ class TaskConfig:
     obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
     of residual force, None for plain DeepMimic. help: how its limits change while episodes are
     counted, which is with auto_reset alone; None leaves them. help_by: whether "all" worlds have one
-    share of them left, or each "clip" or each "moment" of the clips its own, see `HelpBudget`.
-    horizon: control steps until an episode times out. finish: what a clip done to its end is worth, in
-    rewards of its last step; a discount g makes g / (1 - g) of a character that goes on as it ended.
-    first: share of the episodes that begin on their clip's frame 0, as evaluations do. hard: share of
-    the others that begin before moments in which episodes lately failed, those of the drawn clip or of
-    all clips as `hard_over` says, see `Starts`. style: what a motion prior sees of a frame, terms that
-    look at `frame.sim` alone, see `ImitationEnv.features`.
-    auto_reset: start a new episode where one ended (off while evaluating). recovery: falls and getting
-    up, being far and coming back as part of the episodes, see `poise.env.recovery`; None for episodes
-    that begin and stay on their clip.
+    share of them left, or each "clip" or each "bin" of the clips its own, see `HelpBudget`.
+    horizon: control steps until an episode times out. completion_bonus: what a clip done to its end is
+    worth, in rewards of its last step; a discount g makes g / (1 - g) of a character that goes on as it
+    ended. first: share of the episodes that begin on their clip's frame 0, as evaluations do. hard:
+    share of the others that begin before moments in which episodes lately failed, those of the drawn
+    clip or of all clips as `adaptive_over` says, see `Starts`. style: what a motion prior sees of a
+    frame, terms that look at `frame.sim` alone, see `ImitationEnv.features`. auto_reset: start a new
+    episode where one ended (off while evaluating). recovery: falls and getting up, being far and coming
+    back as part of the episodes, see `poise.env.recovery.config`; None for episodes that begin and stay
+    on their clip.
     """
 
     obs: tuple[ObsTerm, ...]
@@ -62,19 +62,19 @@ class TaskConfig:
     pd: PDTargets
     residual: Residual | None = None
     help: HelpSchedule | None = None
-    help_by: Literal["all", "clip", "moment"] = "all"
+    help_by: Literal["all", "clip", "bin"] = "all"
     horizon: int = 300
-    finish: float = 0.0
+    completion_bonus: float = 0.0
     first: float = 0.0
     hard: float = 0.0
-    hard_over: Literal["clip", "library"] = "clip"
+    adaptive_over: Literal["clip", "library"] = "clip"
     style: tuple[ObsTerm, ...] = ()
     auto_reset: bool = True
     recovery: Recovery | None = None
 
     def __post_init__(self) -> None:
-        if self.help_by not in ("all", "clip", "moment"):
-            what = f"help is given by 'all', 'clip' or 'moment', got '{self.help_by}'"
+        if self.help_by not in ("all", "clip", "bin"):
+            what = f"help is given by 'all', 'clip' or 'bin', got '{self.help_by}'"
             raise PoiseError(what, "TaskConfig")
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:

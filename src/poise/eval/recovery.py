@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv, Recovery, TaskConfig
-from poise.env.guide import Guide
-from poise.env.recovery import FALLEN, FAR
-from poise.env.ways import Ways
+from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.config import FALLEN, FAR
+from poise.env.recovery.controller import RecoveryController
 from poise.errors import PoiseError
 from poise.eval.field_paper import PHC_RECOVERY
 
@@ -124,7 +124,7 @@ def recovery_card(
     held: float = 0.5,
     seed: int = 4242,
     at_once: int = 250,
-    ways: Ways | None = None,
+    recovery_clips: RecoveryClips | None = None,
 ) -> RecoveryCard:
     """Trials of every kind with a deterministic policy.
 
@@ -134,7 +134,8 @@ def recovery_card(
             before the trials goes on standing on its last frame. It waits for the fallen as in training.
         near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
         at_once: trials that are simulated side by side.
-        ways: leads the policy back by them (`env.guide`), where the task is for that; by default it is
+        ways: leads the policy back by them (`env.recovery.controller`), where the task is for that; by
+        default it is
             told a point.
 
     Raises:
@@ -157,7 +158,7 @@ def recovery_card(
         steps = math.ceil(max(seconds) * rate) + stay - 1
         for kind in kinds:
             parts = -(-trials // env.num_envs)
-            trial = (clip, frame, KINDS[kind], steps, ways)
+            trial = (clip, frame, KINDS[kind], steps, recovery_clips)
             apart = [_trial(env, policy, *trial) for _ in range(parts)]
             back = back_after(torch.cat(apart)[:trials] < near, stay) / rate
             rows.append(_row(kind, back, seconds))
@@ -184,21 +185,27 @@ def back_after(near: Tensor, stay: int) -> Tensor:
 
 
 def _trial(
-    env: ImitationEnv, policy: Acts, clip: int, frame: int, kind: int, steps: int, ways: Ways | None
+    env: ImitationEnv,
+    policy: Acts,
+    clip: int,
+    frame: int,
+    kind: int,
+    steps: int,
+    recovery_clips: RecoveryClips | None,
 ) -> Tensor:
     """Mean distance of the bodies from their reference after each step, m `(N, steps)` on the CPU."""
-    many, reference, guide = env.clip.new_ones(env.num_envs), env.reference, None
+    many, reference, controller = env.clip.new_ones(env.num_envs), env.reference, None
     obs = env.reset_to(clip * many, frame * many, kind * many)
-    if ways is not None:
-        policy = guide = Guide(env, policy, ways)
-        obs = guide.lead(torch.arange(env.num_envs))
+    if recovery_clips is not None:
+        policy = controller = RecoveryController(env, policy, recovery_clips)
+        obs = controller.lead(torch.arange(env.num_envs))
     apart = []
     for _ in range(steps):
         obs = env.step(policy.act(obs)).final_obs
-        ref = reference.gather(clip * many, env.frame if guide is None else guide.frame)
+        ref = reference.gather(clip * many, env.frame if controller is None else controller.frame)
         apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
-    if guide is not None:
-        env.take_up(reference, clip * many, frame * many)
+    if controller is not None:
+        env.set_goal(reference, clip * many, frame * many)
     return torch.stack(apart, 1)
 
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.beside import Acting, Beside, mean_gradient, parts_of
 from poise.learn.config import PPOConfig
 from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
@@ -30,6 +29,7 @@ from poise.learn.state import (
     take,
     under,
 )
+from poise.learn.threaded_update import Acting, ThreadedUpdate, mean_gradient, parts_of
 from poise.nets import (
     MLP,
     GaussianPolicy,
@@ -119,7 +119,7 @@ class PPO:
         self._half = config.products == "bfloat16" or (
             config.products == "auto" and here and bfloat16_is_fast()
         )
-        self._beside = Beside()
+        self._beside = ThreadedUpdate()
 
     def value(self, obs: Tensor) -> Tensor:
         """V of normalised observations `(..., O)` in units of reward, `(...)`."""

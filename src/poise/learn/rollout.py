@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from poise.learn.beside import Acting
 from poise.learn.guard import check_finite
 from poise.learn.protocols import Style, VecEnv
+from poise.learn.threaded_update import Acting
 from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
 
 

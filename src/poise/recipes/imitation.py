@@ -9,14 +9,14 @@ from typing import Any, cast
 
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
-from poise.env.ways import Ways
+from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.kin import FitReport
 from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Style
 from poise.motion import ClipLibrary
-from poise.recipes.room import FEW, check_room, free_bytes, learner_bytes
+from poise.recipes.memory import FEW, check_memory, free_bytes, learner_bytes
 from poise.sim import NanGuard, make_backend
 
 
@@ -34,7 +34,7 @@ class Imitation:
     report: FitReport
     config: Any
     task: TaskConfig
-    ways: Ways | None = None
+    recovery_clips: RecoveryClips | None = None
 
     def env(
         self,
@@ -70,7 +70,7 @@ class Imitation:
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
         return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
 
-    def check_room(self, num_envs: int, device: str = "cpu") -> None:
+    def check_memory(self, num_envs: int, device: str = "cpu") -> None:
         """Raises a PoiseError that says how many characters fit, if `num_envs` do not.
 
         A GPU's memory is checked where its worlds are made.
@@ -86,7 +86,7 @@ class Imitation:
         finally:
             env.close()
         # A step gathers the reference and evaluates the terms in a few copies of the observations.
-        check_room(num_envs, state // few + learner + 40 * env.num_obs, free_bytes())
+        check_memory(num_envs, state // few + learner + 40 * env.num_obs, free_bytes())
 
     def trainer(
         self,
@@ -119,7 +119,7 @@ class Imitation:
             threads = max(1, len(os.sched_getaffinity(0)) // comm.local_size)
         if env is None:
             own = share_of(self.config.num_envs, comm)
-            self.check_room(own, device)
+            self.check_memory(own, device)
             seed = rank_seed(self.config.seed, rank)
             env = self.env(own, seed, threads=threads, dumps=dumps, device=device)
         if isinstance(style, AmpConfig):

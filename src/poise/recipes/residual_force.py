@@ -16,8 +16,10 @@ Yuan and Kitani, NeurIPS 2020; the motion imitation half.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 
@@ -38,6 +40,7 @@ from poise.kin.own_body import on_own_body
 from poise.learn import PPOConfig
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
+from poise.settings import Migration, from_data
 from poise.sim import SimConfig
 
 
@@ -56,9 +59,9 @@ class ResidualForce:
     done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
     residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
     that of the joints. 0.3 is the paper's; with the joints' 0.055 the help is hardly tried.
-    finish: a clip done to its end is worth what holding on as in its last step would be; without it the
-    last moments matter little and characters fall in them.
-    expert: start from a cloned expert (`recipes.expert`); without it PPO starts from nothing.
+    completion_bonus: a clip done to its end is worth what holding on as in its last step would be;
+    without it the last moments matter little and characters fall in them. expert: start from a cloned
+    expert (`jobs.warm_start`); without it PPO starts from nothing.
     """
 
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
@@ -72,7 +75,7 @@ class ResidualForce:
     faithful: Literal["paper", "code"] = "paper"
     done: Literal["bodies", "height"] = "bodies"
     residual_std: float = 0.3
-    finish: bool = True
+    completion_bonus: bool = True
     expert: bool = True
     num_envs: int = 512
     horizon: int = 300
@@ -132,10 +135,10 @@ def local_rewards(humanoid: Humanoid, faithful: str = "paper") -> tuple[RewardTe
     )
 
 
-def finish_worth(config: ResidualForce) -> float:
+def completion_bonus(config: ResidualForce) -> float:
     """Rewards of the last step that a finished clip is worth: g + g^2 + ... = g / (1 - g)."""
     gamma = config.ppo.gamma
-    return gamma / max(1.0 - gamma, 1.0 / config.horizon) if config.finish else 0.0
+    return gamma / max(1.0 - gamma, 1.0 / config.horizon) if config.completion_bonus else 0.0
 
 
 def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
@@ -163,7 +166,7 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
         residual=help_,
         help=schedule(config),
         horizon=config.horizon,
-        finish=finish_worth(config),
+        completion_bonus=completion_bonus(config),
     )
 
 
@@ -188,7 +191,16 @@ def paper(config: ResidualForce) -> ResidualForce:
         "sim": slow,
         "expert": False,
     }
-    return replace(config, ppo=PPOConfig.paper(), finish=False, **faithful)
+    return replace(config, ppo=PPOConfig.paper(), completion_bonus=False, **faithful)
+
+
+#: What earlier versions called the settings.
+MIGRATION = Migration(keys={"finish": "completion_bonus"})
+
+
+def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> ResidualForce:
+    """The settings that a run holds as JSON data, also of earlier versions."""
+    return from_data(ResidualForce, MIGRATION(data), where)
 
 
 #: What to expect of the default settings (see `benchmarks/first_light.json`).

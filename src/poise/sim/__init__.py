@@ -12,9 +12,9 @@ from poise.sim.config import CONES, INTEGRATORS, SOLVERS, SimConfig
 from poise.sim.contacts import add_contact_sensors, contact_columns
 from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
+from poise.sim.drive import Drive
 from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
 from poise.sim.make import check_device, make_backend
-from poise.sim.slopes import Slopes, driven, slopes
 from poise.sim.tangent import difference, displaced
 from poise.sim.warp import WarpBackend
 
@@ -26,12 +26,12 @@ __all__ = [
     "Backend",
     "Cause",
     "CpuBackend",
+    "Drive",
     "Failure",
     "NanGuard",
     "Replay",
     "SimConfig",
     "SimState",
-    "Slopes",
     "UnstableError",
     "WarpBackend",
     "add_contact_sensors",
@@ -43,8 +43,6 @@ __all__ = [
     "diagnose",
     "difference",
     "displaced",
-    "driven",
     "make_backend",
     "replay_dump",
-    "slopes",
 ]

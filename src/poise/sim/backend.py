@@ -9,8 +9,8 @@ import mujoco
 import torch
 from torch import Tensor
 
-from poise.control.drive import Drive
 from poise.errors import PoiseError, did_you_mean
+from poise.sim.drive import Drive
 
 STANDARD_FIELDS = ("qpos", "qvel", "time", "xpos", "xquat", "xipos", "subtree_com", "cvel")
 

@@ -8,11 +8,11 @@ import torch
 from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
-from poise.control.drive import Drive
 from poise.errors import PoiseError, did_you_mean
 from poise.sim.backend import SimState
 from poise.sim.checks import check_state, compile_model
 from poise.sim.contacts import contact_columns
+from poise.sim.drive import Drive
 
 State = tuple[Tensor, Tensor]
 _NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -221,8 +221,8 @@ class CpuBackend:
                 raise PoiseError(f"a row mask must be ({self._num_envs},), got {tuple(rows.shape)}")
             return torch.nonzero(rows)[:, 0].to(torch.int32).numpy(), None
         rows = rows.reshape(-1).long()
-        rising = len(rows) and bool((rows.diff() > 0).all())
-        if rising and rows[0] >= 0 and rows[-1] < self._num_envs:
+        get_up = len(rows) and bool((rows.diff() > 0).all())
+        if get_up and rows[0] >= 0 and rows[-1] < self._num_envs:
             return rows.to(torch.int32).numpy(), None
         values, order = rows.sort()
         if len(values) and (values[0] < 0 or values[-1] >= self._num_envs or (values.diff() == 0).any()):

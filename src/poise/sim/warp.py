@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.control.drive import Drive
 from poise.errors import PoiseError, did_you_mean
 from poise.sim.backend import STANDARD_FIELDS, SimState
 from poise.sim.checks import check_state, compile_model, row_index
 from poise.sim.contacts import contact_columns
+from poise.sim.drive import Drive
 from poise.sim.warp_model import WarpModel
 from poise.sim.warp_setup import (
     Capacity,

@@ -23,7 +23,7 @@ class Seen(NamedTuple):
     actuator, damper: what servos and joint damping exert, `(N, 0)` where no term asks for torques.
     ref, ahead: packed reference poses now and one control step later, see `Reference`. action
     `(N, A)`: the last one. age `(N)`: control steps since the episode began. recovery: the table of
-    `Recoveries`, `(N, 0)` in a task without.
+    `RecoveryClock`, `(N, 0)` in a task without.
     """
 
     qpos: Tensor

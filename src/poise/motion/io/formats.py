@@ -8,30 +8,38 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.io.amc import read_amc
-from poise.motion.io.bvh_read import read_bvh
-from poise.motion.io.bvh_write import write_bvh
-from poise.motion.io.c3d import looks_like_c3d, read_c3d
-from poise.motion.io.deepmimic import read_deepmimic
-from poise.motion.io.gltf_read import read_gltf
-from poise.motion.io.gltf_write import write_gltf
-from poise.motion.io.motion_csv import looks_like_csv, read_csv, write_csv
-from poise.motion.io.numpy_files import (
+from poise.motion.io.acclaim import read_amc
+from poise.motion.io.angles import (
+    looks_like_mot,
+    looks_like_robot,
+    read_deepmimic,
+    read_mot,
+    refuse_robot,
+)
+from poise.motion.io.bvh import read_bvh, write_bvh
+from poise.motion.io.gltf import read_gltf, write_gltf
+from poise.motion.io.named_arrays import (
     looks_like_npz,
     looks_like_pickle,
     read_npz,
     read_pickled,
     write_npz,
 )
-from poise.motion.io.opensim import looks_like_mot, read_mot
-from poise.motion.io.points_csv import looks_like_points_csv, read_points_csv
-from poise.motion.io.points_refused import looks_like_openpose, refuse_folder, refuse_openpose
+from poise.motion.io.own import looks_like_csv, read_csv, write_csv
+from poise.motion.io.points import (
+    looks_like_c3d,
+    looks_like_openpose,
+    looks_like_points_csv,
+    looks_like_trc,
+    read_c3d,
+    read_points_csv,
+    read_trc,
+    refuse_folder,
+    refuse_openpose,
+)
 from poise.motion.io.raw import Options, check_options
-from poise.motion.io.robots import looks_like_robot, refuse_robot
 from poise.motion.io.text import read_head, shown
-from poise.motion.io.trc import looks_like_trc, read_trc
-from poise.motion.io.usd_read import pxr_package, read_usd
-from poise.motion.io.usd_write import write_usd
+from poise.motion.io.usd import pxr_package, read_usd, write_usd
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
-"""Bounded reading of text files, and numbers with the place of every mistake."""
+"""Bounded reading of text files, numbers with the place of every mistake, files written whole."""
 
 from __future__ import annotations
 
+import os
+import secrets
 import stat
 from array import array
 from collections.abc import Iterable
@@ -187,3 +189,22 @@ def listed(items: Iterable[object], limit: int = 8) -> str:
     all_items = [str(i) for i in items]
     more = len(all_items) - limit
     return ", ".join(all_items[:limit]) + (f" and {more} more" if more > 0 else "")
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Writes a file, text as UTF-8, whole or not at all: beside its place, then into it."""
+    if path.is_dir():
+        raise PoiseError("this is a folder; name a file to write", path)
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with beside.open("xb") as file:
+            file.write(content if isinstance(content, bytes) else content.encode("utf-8"))
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        beside.unlink(missing_ok=True) if beside.parent.is_dir() else None
+        reason = error.strerror or str(error)
+        raise PoiseError(
+            f"the file cannot be written ({reason})", path, "Choose a folder you may write to"
+        ) from None

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from poise.body import BodyConfig
-from poise.env import PathConfig
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
+from poise.plan import TrajOptConfig
 from poise.recipes.perpetual.shapes import BodyShapes
+from poise.settings import Migration, from_data
 from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped where who lies must be told from who leans.
 WIDE = 30.0
+
+
+#: As what a stage learns recovery, see `Recovery.phc`.
+Recovers = Literal["primitive", "composer"]
 
 
 @dataclass(frozen=True)
@@ -28,18 +32,18 @@ class RecoveryPlan:
     primitive: which of them recovers: one of its "own", after those that track, or the "first", where
     that is a policy that goes on and can come back already.
     ways: demonstrations of coming back, made of the library's own clips where somebody gets up in it and
-    somebody walks, see `env.guide`; 0 learns to come back to a point, as the paper does. way_share: of
-    the episodes of who tracks and recovers, how many are of them.
-    trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
-    final_trials: with the finished policy. seconds: within which who is back is counted; the last one
-    decides. enough: share of all trials with which recovery is learned.
+    somebody walks, see `env.recovery.controller`; 0 learns to come back to a point, as the paper does.
+    demonstration_share: of the episodes of who tracks and recovers, how many are of them. trials: of
+    each kind of fail-state at every evaluation of a stage that learns recovery. final_trials: with the
+    finished policy. seconds: within which who is back is counted; the last one decides. enough: share
+    of all trials with which recovery is learned.
     """
 
     share: float = 0.15
     primitive: Literal["own", "first"] = "own"
     falls: int = 512
-    ways: int = 768
-    way_share: float = 0.5
+    demonstrations: int = 768
+    demonstration_share: float = 0.5
     trials: int = 32
     final_trials: int = 100
     seconds: tuple[float, ...] = (5.0, 10.0)
@@ -51,8 +55,11 @@ class RecoveryPlan:
             raise PoiseError(what, "RecoveryPlan")
         if min(self.falls, self.trials, self.final_trials) < 1 or not self.seconds:
             raise PoiseError("recovery needs falls, trials and seconds", "RecoveryPlan")
-        if self.ways < 0 or not 0 < self.way_share < 1:
-            what = f"got {self.ways} ways and a way_share of {self.way_share:g}"
+        if self.demonstrations < 0 or not 0 < self.demonstration_share < 1:
+            what = (
+                f"got {self.demonstrations} demonstrations and a demonstration_share of "
+                f"{self.demonstration_share:g}"
+            )
             raise PoiseError(what, "RecoveryPlan", "None or more, and a share between 0 and 1")
 
 
@@ -82,23 +89,23 @@ class Perpetual:
     hidden layers of the earlier ones. combine, weights: see `nets.Composer`.
     composer_clone: the composer first imitates for each clip the primitive that learned it.
     expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
-    frames of the library where that is None, see `perpetual.clone.clone_for`.
-    paths: the expert follows paths that need no help, which are searched first, see `env.paths`; None
-    takes inverse dynamics, which need help.
+    frames of the library where that is None, see `jobs.perpetual.cloning`.
+    trajopt: the expert follows trajectories that need no help, which are optimised first, see
+    `plan.trajopt`; None takes inverse dynamics, which need help.
     help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
     has ended at the share `help_share` of the stage's time, or before by success. help_by: success
-    is that of each "moment" of a clip, a second or so, which keeps or loses help of its own, of each
+    is that of each "bin" of a clip, a second or so, which keeps or loses help of its own, of each
     "clip", or of "all" episodes.
-    hard_starts: share of the episodes (but for those on frame 0) that begin up to two seconds before
-    where others lately failed; the rest begin anywhere, as in the paper. hard_over: such places of the
-    "clip" that was drawn, or of the whole "library", so that more is seen of long and hard clips.
-    residual_std: deviation of the noise on the residual action, in units of the limits.
+    adaptive_sampling: share of the episodes (but for those on frame 0) that begin up to two seconds
+    before where others lately failed; the rest begin anywhere, as in the paper. adaptive_over: such
+    places of the "clip" that was drawn, or of the whole "library", so that more is seen of long and
+    hard clips. residual_std: deviation of the noise on the residual action, in units of the limits.
     shares: where in the training the first and the last primitive end at the latest; with recovery, of
-    what `recovering.share` leaves.
-    evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of the
-    control steps. cooling: share of a stage's longest time, at its end, in which the policy's step size
-    falls evenly to a tenth; for steps of a fixed size, `ppo.kl_target=None`.
-    mining, convergence: what fails is trained more; when a stage has learned what it can.
+    what `recovering.share` leaves. evaluate_every: iterations between evaluations of the stage's clips;
+    0 has them take a tenth of the control steps. cooling: share of a stage's longest time, at its end,
+    in which the policy's step size falls evenly to a tenth; for steps of a fixed size,
+    `ppo.kl_target=None`. mining, convergence: what fails is trained more; when a stage has learned what
+    it can.
     """
 
     goal: Literal["rotations", "keypoints"] = "rotations"
@@ -124,12 +131,12 @@ class Perpetual:
     composer_hidden: tuple[int, ...] = (256, 128)
     composer_clone: bool = True
     expert: bool = True
-    paths: PathConfig | None = None
+    trajopt: TrajOptConfig | None = None
     help_start: float = 100.0
     help_share: float = 0.8
-    help_by: Literal["all", "clip", "moment"] = "moment"
-    hard_starts: float = 0.5
-    hard_over: Literal["clip", "library"] = "clip"
+    help_by: Literal["all", "clip", "bin"] = "bin"
+    adaptive_sampling: float = 0.5
+    adaptive_over: Literal["clip", "library"] = "clip"
     residual_std: float = 0.3
     shares: tuple[float, float] = (0.5, 0.8)
     evaluate_every: int = 0
@@ -169,15 +176,15 @@ class Perpetual:
         if self.goal == "keypoints" and self.action == "additive":
             what = "additive actions need the next frame's angles, of which keypoints tell nothing"
             raise PoiseError(what, hint="Take absolute actions, or rotations as the goal")
-        if not 0 <= self.hard_starts <= 1:
-            what = f"hard_starts must lie in [0, 1], got {self.hard_starts}"
+        if not 0 <= self.adaptive_sampling <= 1:
+            what = f"adaptive_sampling must lie in [0, 1], got {self.adaptive_sampling}"
             raise PoiseError(what, "Perpetual")
         if not 0 <= self.cooling <= 1:
             raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")
         if self.cooling and self.ppo.kl_target is not None:
             what = "cooling is for steps of a fixed size, and kl_target adapts them"
             raise PoiseError(what, "Perpetual", "Set kl_target=None, or leave cooling out")
-        if self.paths is not None and self.shapes.count > 1:
+        if self.trajopt is not None and self.shapes.count > 1:
             what = "paths are searched for one body, and there are several shapes"
             raise PoiseError(what, "Perpetual", "Leave one of the two out")
         if self.ppo.learn_std:
@@ -212,7 +219,7 @@ class Perpetual:
         )  # fmt: skip
         own = {
             "ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None, "num_envs": 2048,
-            "hard_over": "library", "mining": MiningConfig(rule="uniform"),
+            "adaptive_over": "library", "mining": MiningConfig(rule="uniform"),
         }  # fmt: skip
         return cls(action="additive", **(own | changes))
 
@@ -233,36 +240,20 @@ class Perpetual:
         return 0.0
 
 
-def to_json(config: Perpetual) -> dict[str, Any]:
-    """The settings as JSON data."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+#: What earlier versions called the settings, and what their runs did that name none.
+MIGRATION = Migration(
+    keys={
+        "hard_starts": "adaptive_sampling",
+        "hard_over": "adaptive_over",
+        "paths": "trajopt",
+        "recovering.ways": "recovering.demonstrations",
+        "recovering.way_share": "recovering.demonstration_share",
+    },
+    values={"help_by": {"moment": "bin"}},
+    absent={"recovery": False, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip"},
+)
 
 
-def from_json(data: Mapping[str, Any]) -> Perpetual:
-    """Settings from JSON data.
-
-    Raises:
-        PoiseError: they are of another version.
-    """
-    # The types of what may be left out; runs of before there was something did without.
-    types = replace(Perpetual(), clone=CloneConfig(), paths=PathConfig())
-    old = {"recovery": False, "help_by": "all", "hard_starts": 0.0, "hard_over": "clip"}
-    try:
-        return _filled(types, old | dict(data))
-    except (TypeError, KeyError, AttributeError) as problem:
-        raise PoiseError(
-            f"the run was made by another version of Poise ({problem})", hint="Train it again"
-        ) from None
-
-
-def _filled(default: Any, data: Mapping[str, Any]) -> Any:
-    """A dataclass of the default's type; its own dataclasses are filled likewise, lists are tuples."""
-    values = {
-        k: _filled(getattr(default, k), v) if isinstance(v, Mapping) else _tuples(v)
-        for k, v in data.items()
-    }
-    return type(default)(**values)
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Perpetual:
+    """The settings that a run or a policy file holds as JSON data, also of earlier versions."""
+    return from_data(Perpetual, MIGRATION(data), where)

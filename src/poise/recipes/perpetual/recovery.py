@@ -1,25 +1,17 @@
-"""What recovery is learned on, and how well it goes: PHC's Q^loco and its fail-states.
+"""What a library tells of recovery: clips that walk or stand, a frame that stands, recovery clips.
 
-The paper picks walking and running by hand for its recovery primitive, so that the motion prior knows
-nothing else; here rules do.
+The paper picks walking and running by hand for its recovery primitive (Q^loco), so that the motion prior
+knows nothing else; here rules do.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
-from poise.env import Acts, Reference
-from poise.env.falls import fall_states
-from poise.errors import PoiseError
-from poise.eval import RecoveryCard, recovery_card, trial_task
-from poise.learn import PolicyBundle
-from poise.recipes.imitation import Imitation
+from poise.env import Reference
+from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
 from poise.recipes.perpetual.config import Perpetual
-from poise.recipes.perpetual.eval import bare_env
-from poise.sim import make_backend
 
 #: Of those of who stands, between which the root's height and above which the body's top stay in a clip
 #: that walks or stands.
@@ -30,8 +22,6 @@ STANDS = 0.7
 ROOT_SPEED, LIMB_SPEED = 2.5, 0.7
 #: s: shorter clips are no walk.
 SECONDS = 1.0
-#: Distance from the reference, m, at which trials far from it begin (PHC, Sec. 4.2).
-FAR = 3.0
 
 
 def walking_clips(reference: Reference) -> Tensor:
@@ -75,46 +65,8 @@ def _standing(heights: Tensor) -> Tensor:
     return heights.kthvalue(1 + int(STANDS * (len(heights) - 1))).values
 
 
-def check_falls(imitation: Imitation, count: int = 32) -> None:
-    """Lets some characters fall, so that a body that never comes to lie is known before the training.
-
-    Raises:
-        PoiseError: they do not.
-    """
-    recovery = imitation.task.recovery
-    if recovery is None:
-        return
-    backend = make_backend(imitation.humanoid.model, count, "cpu", threads=1)
-    try:
-        drop = replace(recovery.drop, count=min(count, recovery.drop.count))
-        fall_states(backend, imitation.humanoid, imitation.task.pd, drop, int(imitation.config.seed))
-    except PoiseError as problem:
-        hint = "Train without recovery: --no-recovery"
-        raise PoiseError(problem.what, "recovery", hint) from None
-    finally:
-        backend.close()
-
-
-def try_recovery(
-    imitation: Imitation, policy: Acts, trials: int, threads: int = 0, device: str = "cpu"
-) -> RecoveryCard:
-    """Trials of every kind of fail-state against a reference that stands, without help.
-
-    imitation: with the task of a stage that learns recovery. The same falls and directions every time.
-    """
-    config: Perpetual = imitation.config
-    clip, frame = standing(imitation.reference)
-    if isinstance(policy, PolicyBundle):
-        policy = policy.copy().to(device)
-    ways = imitation.ways
-    tried = replace(imitation, task=trial_task(imitation.task, FAR, trials, ways is not None))
-    return recovery_card(
-        lambda worlds: bare_env(tried, worlds, 0.0, threads, device),
-        policy, trials, method=config.method, clip=clip, frame=frame, seconds=config.recovering.seconds,
-        ways=ways,
-    )  # fmt: skip
-
-
-def back(card: RecoveryCard) -> tuple[int, int]:
-    """How many of how many trials of all kinds were back in the last of the card's times."""
-    return sum(round(r.within[-1] * r.trials) for r in card.rows), sum(r.trials for r in card.rows)
+def known_recovery_clips(config: Perpetual, reference: Reference) -> RecoveryClips | None:
+    """What a library knows of coming back; None where recovery is not learned by it."""
+    if not (config.recovery and config.recovering.demonstrations) or config.shapes.count > 1:
+        return None
+    return find_recovery_clips(reference, standing(reference), walking_clips(reference))

@@ -8,7 +8,7 @@ as everywhere (`body.scaling.Strength`).
 
 Every clip is retargeted onto the bodies that do it, so that feet stand where they stood, and counts as a
 clip of its own, "walk@3" on body 3: episodes, hard negatives and evaluations need know nothing of it. A
-world takes the body of the clip whose episode it begins (`env.bodies`).
+world takes the body of the clip whose episode it begins (`env.body_assignment`).
 
     imitation = shaped(build(library, config), BodyShapes(count=8), lambda body: task(config, body))
 """

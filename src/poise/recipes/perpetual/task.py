@@ -7,14 +7,14 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | Sec. 3.1 s^p, s^g-rot, s^g-kp, beta               | `env.terms.phc_obs`                         |
 | Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.terms.phc_reward`, `learn.Amp`         |
 | Sec. 3.1 relaxed early termination                | `env.terms.done`, `all_but_feet`            |
-| Sec. 3.2 progressive primitives, hard negatives   | `recipes.perpetual.plan` and `.stages`  |
+| Sec. 3.2 progressive primitives, hard negatives   | `jobs.perpetual.stage_order` and `.stages`  |
 | Alg. 1, line 3: until success no longer improves  | `learn.converge`, `learn.mining`            |
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
 | fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_recovery`    |
-| P^(F) on Q^loco; interleaved recovery             | `recipes.perpetual.recovery`                |
-| in place of them, by default: ways back           | `env.guide`, `recipes.perpetual.returning`  |
+| P^(F) on Q^loco; interleaved recovery             | `jobs.perpetual.recovery`                |
+| in place of them, by default: recovery clips      | `jobs.perpetual.demonstrations`             |
 | Eqs. 5, 6 multiplicative composer                 | `learn.compose`, `nets.Composer`            |
-| Sec. 4, success: mean distance within 0.5 m       | `recipes.perpetual.eval`                    |
+| Sec. 4, success: mean distance within 0.5 m       | `jobs.perpetual.evaluation`                    |
 | the authors' later single network                 | `Perpetual.single`                          |
 
 What is ours: the first primitive begins as a clone of a scripted expert, a residual force helps at first
@@ -38,9 +38,8 @@ from poise.kin import fit_humanoid
 from poise.kin.own_body import on_own_body
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual.config import Perpetual, RecoveryPlan
-from poise.recipes.perpetual.progress import Recovers
-from poise.recipes.perpetual.returning import known_ways
+from poise.recipes.perpetual.config import Perpetual, Recovers, RecoveryPlan
+from poise.recipes.perpetual.recovery import known_recovery_clips
 from poise.recipes.perpetual.shapes import shaped
 
 __all__ = ["RECIPE", "Perpetual", "RecoveryPlan", "build", "stage_task", "task"]
@@ -75,10 +74,10 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         help_by=config.help_by,
         horizon=config.horizon,
         # As many of the last rewards as a character that goes on would earn: g + g^2 + ...
-        finish=gamma / max(1.0 - gamma, 1.0 / config.horizon),
+        completion_bonus=gamma / max(1.0 - gamma, 1.0 / config.horizon),
         first=config.first,
-        hard=config.hard_starts,
-        hard_over=config.hard_over,
+        hard=config.adaptive_sampling,
+        adaptive_over=config.adaptive_over,
         style=phc_obs.style_terms(humanoid) if config.style else (),
         recovery=recovery,
     )
@@ -102,7 +101,7 @@ def _help(config: Perpetual) -> SuccessHelp:
     which a moment is judged. There are many more moments than clips, so that each is decided less often
     and by more.
     """
-    if config.help_by == "moment":
+    if config.help_by == "bin":
         return SuccessHelp(lower_at=0.8, raise_at=0.6, factor=0.93)
     return SuccessHelp()
 
@@ -138,12 +137,12 @@ def build(
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
-    ways = known_ways(config, reference)
-    if ways is None:
+    recovery_clips = known_recovery_clips(config, reference)
+    if recovery_clips is None:
         # Who knows ways back must practise a point goal by a primitive of its own.
         config = replace(config, recovering=replace(config.recovering, primitive="own"))
-    own = task(config, humanoid, guided=ways is not None)
-    built = Imitation(library, humanoid, reference, report, config, own, ways)
+    own = task(config, humanoid, guided=recovery_clips is not None)
+    built = Imitation(library, humanoid, reference, report, config, own, recovery_clips)
     return shaped(built, config.shapes, lambda body: task(config, body))
 
 

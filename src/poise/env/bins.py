@@ -1,0 +1,153 @@
+"""Clips cut into moments of about a second, and how often episodes fail in each.
+
+A long clip is rarely hard all over: where it fails it mostly fails within the same second. What is known
+of moments says where episodes are to begin (`Starts`) and which of them still need help (`HelpBudget`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+#: How long a moment lasts, nearly.
+BIN_S = 1.0
+#: Control steps of all worlds after which failures are counted up, and what is then left of older ones.
+EVERY, KEPT = 64, 0.9
+#: Outcomes without a failure that every moment is taken to have had.
+PRIOR = 5.0
+#: With which odds a moment is practised that always fails; one that fails half of the time has 0.3.
+STILL = 0.1
+
+
+class Outcomes(NamedTuple):
+    """What one control step says of moments: `bin (K,)`, and float64 `ended`, `failed (K,)`, 1 where
+    a character has come through it or failed, and 1 where it failed."""
+
+    bin: Tensor
+    ended: Tensor
+    failed: Tensor
+
+    def of(self, worlds: Tensor) -> Outcomes:
+        """Those of `worlds (N,)` bool alone; K is 2 N."""
+        kept = worlds.repeat(2).double()
+        return Outcomes(self.bin, self.ended * kept, self.failed * kept)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBins:
+    """The moments of all clips, one after another: G of them, in a reference of R rows.
+
+    clip, begin, size: `(G,)`, whose they are, the frame they begin on, and their frames. offset, count:
+    `(C,)`, the first moment of each clip, and how many it has. of, into: `(R,)`, the moment of each row
+    and the frames since it began. last: `(R,)` bool, its last frame. before: `(G,)`, the one that comes
+    before it, which for the first one of a clip is its last.
+    """
+
+    clip: Tensor
+    begin: Tensor
+    size: Tensor
+    offset: Tensor
+    count: Tensor
+    of: Tensor
+    into: Tensor
+    last: Tensor
+    before: Tensor
+
+    @classmethod
+    def cut(cls, length: Tensor, cyclic: Tensor, rate_hz: float, seconds: float = BIN_S) -> MotionBins:
+        """MotionBins of equal length, as near `seconds` as goes.
+
+        length: `(C,)` frames at `rate_hz`, at least 3. cyclic: `(C,)` bool, clips whose last frame is
+        their first, one cycle later.
+        """
+        frames = length - cyclic.long()
+        count = (frames.double() / (seconds * rate_hz)).round().long().clamp(min=1)
+        offset, start = count.cumsum(0) - count, length.cumsum(0) - length
+        clip = torch.arange(len(length)).repeat_interleave(count)
+        number = torch.arange(len(clip)) - offset[clip]
+        # Frame f is in moment f * count // frames.
+        ends = [-(-(k * frames[clip]) // count[clip]) for k in (number, number + 1)]
+        begin, size = ends[0], ends[1] - ends[0]
+        row_clip = torch.arange(len(length)).repeat_interleave(length)
+        frame = torch.arange(len(row_clip)) - start[row_clip]
+        frame = torch.minimum(frame, frames[row_clip] - 1)
+        of = offset[row_clip] + frame * count[row_clip] // frames[row_clip]
+        into = frame - begin[of]
+        before = torch.where(number > 0, torch.arange(len(clip)) - 1, (offset + count - 1)[clip])
+        return cls(clip, begin, size, offset, count, of, into, into == size[of] - 1, before)
+
+    def __len__(self) -> int:
+        return len(self.clip)
+
+    def to(self, device: torch.device) -> MotionBins:
+        """The same on another device."""
+        return MotionBins(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
+        """What a step says that brought N worlds to `row (N,)`.
+
+        A moment has been done when the one after it has, or the clip: who fails has mostly lost balance
+        before. So a failure counts in its own moment and in the one before, if the episode has been
+        there; that one is done, if the episode has seen half of it, when its successor is left.
+
+        age: `(N,)` control steps since the episodes began. failed, done: `(N,)` bool, which failed, and
+        which came to the end of their clips.
+        """
+        now, into = self.of[row], self.into[row]
+        before = self.before[now]
+        there = age - into
+        passed = self.last[row] & (2 * there >= self.size[before]) & (there > 0)
+        earlier = torch.where(failed, there > 0, passed)
+        ended = torch.cat((failed | done, earlier)).double()
+        fell = torch.cat((failed, failed & earlier)).double()
+        return Outcomes(torch.cat((now, before)), ended, fell)
+
+    def by_clip(self, values: Tensor, most: bool = False) -> Tensor:
+        """The mean, or the most, of the values `(G,)` of each clip's moments: `(C,)`."""
+        out = values.new_zeros(len(self.count))
+        how = "amax" if most else "mean"
+        return out.scatter_reduce(0, self.clip.to(values.device), values, how, include_self=False)
+
+
+class FailureRates:
+    """How often episodes failed in each of G moments lately.
+
+    Attributes: `odds (G,)` float64 on the CPU, with which moments are to be practised: f (1 + `STILL` -
+    f) of the share f that failed, most where about every second one fails. What always fails is not
+    dwelled on, nor given up.
+    """
+
+    def __init__(self, bins: int, device: torch.device | str = "cpu"):
+        self._counts = torch.zeros(2, bins, dtype=torch.float64, device=device)
+        self.steps = 0
+        self._rate()
+
+    def add(self, seen: Outcomes) -> None:
+        """One control step of all worlds."""
+        # Zeros and ones are added, so that their order, which a GPU does not keep, makes no difference.
+        self._counts.index_add_(1, seen.bin, torch.stack((seen.ended, seen.failed)))
+        self.steps += 1
+        if self.steps % EVERY == 0:
+            self._rate()
+            self._counts *= KEPT
+
+    def _rate(self) -> None:
+        ended, failed = self._counts.cpu()
+        share = failed / (ended + PRIOR)
+        self.odds = share * (1.0 + STILL - share)
+
+    def state(self) -> Tensor:
+        """What `load_state` takes: float64 `(1 + 3 G)`."""
+        return torch.cat((torch.tensor([self.steps]).double(), self.odds, self._counts.cpu().flatten()))
+
+    def load_state(self, state: Tensor) -> None:
+        """Goes on from `state()`; from that of other moments as if nothing were known."""
+        bins = self._counts.shape[1]
+        if len(state) != 1 + 3 * bins:
+            return
+        self.steps, own = int(state[0]), state[1:].cpu().reshape(3, bins)
+        self.odds = own[0].clone()
+        self._counts.copy_(own[1:])

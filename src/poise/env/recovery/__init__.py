@@ -1,0 +1,1 @@
+"""Recovery: falls and far starts in episodes, recovery clips, and the planner that leads back."""

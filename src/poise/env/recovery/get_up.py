@@ -1,0 +1,142 @@
+"""From lying to standing: by which of a library's clips, and from which of its frames on."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.env.recovery.clips import RecoveryClips
+from poise.kin import Kinematics, lowest_height
+from poise.spatial import quat_distance, quat_mul, quat_rotate, slerp
+from poise.spatial.turns import turned, yaw_quat
+
+#: s that a blend takes, and m of the distance between poses that are blended in a second more.
+BLEND_S, BLEND_SPEED = 0.4, 1.5
+#: Times as fast as in its clip is got up, as somebody who wants to be back.
+QUICK = 1.25
+#: m: poses that are no farther apart are the same.
+SAME = 0.01
+#: m: no limb that would reach into the floor lifts who is blended higher.
+LIFT = 0.12
+#: m that a rad of the bodies' rotations counts, and a s that is up later, where poses are compared.
+TURNED, LATER = 0.3, 0.1
+#: Of the height of who stands: where the root is no higher above its lowest, somebody still lies.
+ENTERS = 0.1
+
+
+class GetUpPlanner:
+    """How the characters of a library get up from anywhere.
+
+    Of all clips that get up, the one is taken that has the frame nearest to how somebody lies, from
+    there on. A library needs one from the back and one from the belly.
+    """
+
+    def __init__(self, recovery_clips: RecoveryClips, table: BodyTable, rate_hz: float):
+        self.recovery_clips, self.table, self.rate_hz = recovery_clips, table, rate_hz
+        self.ups = [_sooner(clip, QUICK) for clip in recovery_clips.ups]
+        self._ups = [Poses(table, clip) for clip in self.ups]
+        # A clip is entered while its root lies: what comes later needs what came before.
+        for up in self._ups:
+            height = up.pos[:, 0, 2]
+            up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
+
+    def up(self, start: Tensor) -> Tensor:
+        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up."""
+        lying, clips = Poses(self.table, start[None]), self.ups
+        costs = [
+            # Of two frames alike the later one is up sooner.
+            lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
+            for up, clip in zip(self._ups, clips, strict=True)
+        ]
+        which = min(range(len(clips)), key=lambda k: float(costs[k].min()))
+        entry = int(self._ups[which].rows[int(costs[which].argmin())])
+        clip = self._laid(start, clips[which][entry:])
+        return torch.cat((self._lifted(self.blend(start, clip[0]))[:-1], clip))
+
+    def blend(self, a: Tensor, b: Tensor) -> Tensor:
+        """`(T, 7 + n)` from one pose to another, the longer the farther they are apart."""
+        return self.out_of(a, b.expand(self._between(a, b), -1))
+
+    def out_of(self, pose: Tensor, frames: Tensor) -> Tensor:
+        """Frames of which the first ones come out of a pose, more of them the farther it is apart."""
+        count = self._between(pose, frames[0])
+        if count == 1:
+            return frames
+        first = frames[:count]
+        share = smooth(torch.arange(len(first), dtype=torch.float64) / (count - 1))
+        return torch.cat((mixed(pose.expand(len(first), -1), first, share), frames[count:]))
+
+    def _between(self, a: Tensor, b: Tensor) -> int:
+        """Frames from one pose to another; 1 where they are the same."""
+        gap = float(Poses(self.table, a[None]).apart(Poses(self.table, b[None])))
+        return round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)) + 1 if gap > SAME else 1
+
+    def _lifted(self, frames: Tensor) -> Tensor:
+        """Frames raised or lowered until they touch the floor, by no more than `LIFT` m up."""
+        body, out = Kinematics(self.table)(frames), frames.clone()
+        lift = -lowest_height(self.table, body.pos, body.quat).amin(-1)
+        out[:, 2] += lift.clamp(max=LIFT)
+        return out
+
+    def _laid(self, onto: Tensor, frames: Tensor) -> Tensor:
+        """Frames moved and turned so that the first lies on the pose `onto`."""
+        own, there = (Poses(self.table, q[None]) for q in (frames[0], onto))
+        return turned(frames, float(there.turn(own)), own.centre[0], there.centre[0])
+
+
+class Poses:
+    """Poses that are compared, wherever they stand and whichever way they face.
+
+    Args:
+        qpos: `(P, 7 + n)` of a body `table`.
+    """
+
+    def __init__(self, table: BodyTable, qpos: Tensor):
+        body = Kinematics(table)(qpos)
+        self.quat, self.centre = body.quat, body.pos[..., :2].mean(1)
+        self.pos, self.rows = body.pos.clone(), torch.arange(len(qpos))
+        self.pos[..., :2] -= self.centre.unsqueeze(1)
+
+    def keep(self, those: Tensor) -> None:
+        """Only some rows, `(P,)` bool; `rows` says which of all they are."""
+        for name in ("pos", "quat", "centre", "rows"):
+            setattr(self, name, getattr(self, name)[those])
+
+    def turn(self, other: Poses) -> Tensor:
+        """`(P, Q)` rad about Z that lay each pose of `other` best on each of these."""
+        p, q = self.pos[:, None, :, :2], other.pos[None, :, :, :2]
+        cross = (q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]).sum(-1)
+        return torch.atan2(cross, (p * q).sum((-1, -2)))
+
+    def apart(self, other: Poses) -> Tensor:
+        """`(P, Q)` m: how far bodies are apart and, `TURNED` m for a rad, how they are turned."""
+        turn = self.turn(other)
+        out = torch.empty_like(turn)
+        # Row by row, since all pairs of all bodies are many.
+        for i, angles in enumerate(turn):
+            yaw = yaw_quat(angles).unsqueeze(1).expand_as(other.quat)
+            far = (quat_rotate(yaw, other.pos) - self.pos[i]).norm(dim=-1)
+            faces = quat_distance(quat_mul(yaw, other.quat), self.quat[i].expand_as(yaw))
+            out[i] = (far + TURNED * faces).mean(-1)
+        return out
+
+
+def _sooner(qpos: Tensor, times: float) -> Tensor:
+    """The same motion `times` as fast, to its last frame."""
+    last = len(qpos) - 1
+    at = torch.linspace(0, last, max(2, round(last / times) + 1), dtype=torch.float64)
+    low = at.long().clamp(max=last - 1)
+    return mixed(qpos[low], qpos[low + 1], at - low)
+
+
+def mixed(a: Tensor, b: Tensor, share: Tensor) -> Tensor:
+    """Frames `(T, 7 + n)` between those of `a` and of `b`, by the shares `(T)` of `b`."""
+    out = torch.lerp(a, b, share.unsqueeze(-1))
+    out[:, 3:7] = slerp(a[:, 3:7], b[:, 3:7], share)
+    return out
+
+
+def smooth(share: Tensor) -> Tensor:
+    """Shares from 0 to 1 that begin and end without speed, s^2 (3 - 2 s)."""
+    return share * share * (3 - 2 * share)

@@ -1,0 +1,175 @@
+"""What a user gets: the simulated motion on the skeleton that came in, the score, the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poise import __version__
+from poise.eval import ScoreCard, clip_figures, write_score
+from poise.jobs.runs import Evaluation
+from poise.kin import hold_feet, lowest_height, qpos_to_clip
+from poise.motion import Clip, resample
+from poise.motion.io import home_suffix, write_clip
+from poise.recipes.imitation import Imitation
+from poise.view import Report, Shape, Track, write_report
+
+
+def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0) -> Clip:
+    """The simulated motion of clip `index` on its own skeleton, at the clip's own frame rate.
+
+    The simulation runs at the control rate; the clip is resampled to the source's rate so that it
+    drops into the place of the original, at the same height above the floor.
+    """
+    recording = evaluation.recordings[index]
+    source = imitation.library.clips[recording.clip]
+    rate = imitation.reference.rate_hz
+    frames = min(len(recording.qpos), int(imitation.reference.length[recording.clip]))
+    template = resample(source, rate)
+    motion = qpos_to_clip(
+        recording.qpos[:frames],
+        imitation.humanoid.table,
+        source.skeleton,
+        rate,
+        template if template.frames == frames else None,
+        source.name,
+    )
+    out = resample(motion, source.fps)
+    missing = source.frames - out.frames
+    if not 0 < missing <= np.ceil(source.fps / rate):
+        return out
+    # The source may end between two control steps; its last moment holds the last simulated pose.
+    tail = np.minimum(np.arange(source.frames), out.frames - 1)
+    return out.replaced(root_pos=out.root_pos[tail], rot=out.rot[tail])
+
+
+@dataclass(frozen=True, eq=False)
+class Delivery:
+    """paths: of what was written, by name. card: the score card as it was written. notes: what was done
+    to the motions beyond simulating them, in sentences."""
+
+    paths: dict[str, Path]
+    card: ScoreCard
+    notes: tuple[str, ...]
+
+
+def deliver(
+    imitation: Imitation,
+    evaluation: Evaluation,
+    out: Path,
+    curve: dict[str, np.ndarray],
+    motion: Path | None = None,
+    hold: bool = True,
+) -> Delivery:
+    """Writes the motion, `score.json` and `report.html` into `out`.
+
+    The motion is `simulated.bvh`, or has the suffix of its source's format, see `home_suffix`. A library
+    gets one `simulated_<clip>` file per clip; the report shows the first clip.
+
+    Args:
+        motion: the file for a single clip's motion, in the format of its suffix, in place of that in
+            `out`.
+        hold: standing feet are held to the spot (`kin.hold_feet`): contacts of a simulation are soft,
+            so soles creep, rock and sink by millimetres. Score and report show the simulation itself;
+            what holding did stands in them as well.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths: dict[str, Path] = {}
+    figures, notes = [], []
+    for k, recording in enumerate(evaluation.recordings):
+        single = len(evaluation.recordings) == 1
+        name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
+        clip = simulated_clip(imitation, evaluation, k)
+        if hold:
+            clip, found = _held(imitation, evaluation, recording.clip, clip)
+            figures.append(found)
+            notes += _sentences(found)
+        paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"
+        write_clip(clip, paths[name])
+    card = replace(evaluation.card, delivered=tuple(figures))
+    paths["score"] = write_score(card, out / "score.json")
+    paths["report"] = out / "report.html"
+    report = make_report(imitation, replace(evaluation, card=card), curve)
+    write_report(replace(report, notes=(*report.notes, *notes)), paths["report"])
+    return Delivery(paths, card, tuple(notes))
+
+
+def _held(
+    imitation: Imitation, evaluation: Evaluation, index: int, clip: Clip
+) -> tuple[Clip, dict[str, Any]]:
+    """The clip with its feet held, and figures of the source, the simulation and of what is delivered.
+
+    The source is judged on the floor that its soles tell; its penetration, on that of the file.
+    """
+    table, r = imitation.humanoid.table, evaluation.rollouts
+    joints = tuple(row.joint for row in table.rows)
+    held, moved = hold_feet(clip, table)
+    source = imitation.library.clips[index]
+    found: dict[str, Any] = {"clip": source.name}
+    found |= {"held_mean_mm": moved.mean_mm, "held_max_mm": moved.max_mm}
+    if r.shapes is not None and r.feet:
+        ground = -imitation.report.ground[index].lift_m
+        of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
+        found |= {name: clip_figures(c, joints, r.shapes, r.feet, floor) for name, c, floor in of}
+    return held, found
+
+
+def _sentences(found: dict[str, Any]) -> list[str]:
+    if "delivered" not in found or not found["held_max_mm"] > 0.05:
+        return []
+
+    def three(key: str, digits: int) -> str:
+        before, between, after = (found[k][key] for k in ("source", "simulated", "delivered"))
+        return f"{after:.{digits}f} (simulated {between:.{digits}f}, the clip {before:.{digits}f})"
+
+    return [
+        f"{found['clip']}: standing feet are held in place in the written motion: they slide at "
+        f"{three('foot_slide_mm_per_s', 0)} mm/s and sink by {three('penetration_mm', 1)} mm; ankles "
+        f"moved by {found['held_mean_mm']:.0f} mm on average, {found['held_max_mm']:.0f} at most."
+    ]
+
+
+def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, np.ndarray]) -> Report:
+    """The report page of the first clip's episode from its first frame."""
+    recording, r = evaluation.recordings[0], evaluation.rollouts
+    row, frames = recording.row, len(recording.qpos)
+    pos, ref = r.pos[row, :frames].numpy(), r.ref_pos[row, :frames].numpy()
+    table, source = imitation.humanoid.table, imitation.library.clips[recording.clip]
+    card = evaluation.card
+    error = np.linalg.norm((pos - pos[:, :1]) - (ref - ref[:, :1]), axis=-1).mean(-1) * 1000
+    low = lowest_height(table, r.pos[row, :frames], r.quat[row, :frames]).numpy()
+    helped = imitation.config.method != "deepmimic"
+    return Report(
+        title=f"{source.name}, simulated",
+        subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and "
+        f"{len(imitation.humanoid.hinges)} hinges, {imitation.humanoid.mass:.0f} kg",
+        shapes=tuple(
+            Shape(i, g.kind, g.size, g.pos, g.quat) for i, b in enumerate(table.rows) for g in b.geoms
+        ),
+        bodies=imitation.humanoid.bodies,
+        reference=Track("reference", ref, r.ref_quat[row, :frames].numpy()),
+        simulated=Track("simulation", pos, r.quat[row, :frames].numpy()),
+        fps=r.fps,
+        force=r.force[row, :frames].sum(1).numpy() if helped else None,
+        torque=r.torque[row, :frames].sum(1).numpy() if helped else None,
+        error_mm=error,
+        error_global_mm=np.linalg.norm(pos - ref, axis=-1).mean(-1) * 1000,
+        contacts=low[:, list(imitation.humanoid.feet)] < 0.015,
+        score=card.to_dict(),
+        curve=curve,
+        notes=(*source.skeleton.source.notes, *imitation.report.sentences()),
+        facts={
+            "clip": source.name,
+            "format": source.skeleton.source.format,
+            "frames": f"{source.frames} at {source.fps:.5g} fps",
+            "height": f"{table.height_m:.2f} m",
+            "mass": f"{imitation.humanoid.mass:.1f} kg",
+            "method": card.method,
+            "training": f"{card.seconds:.0f} s, {card.samples:,} samples",
+            "seed": str(card.seed),
+            "version": __version__,
+        },
+    )

@@ -1,0 +1,276 @@
+"""In-betweening networks from a folder of clips: Harvey et al. 2020, and a transformer.
+
+| paper | here |
+|---|---|
+| Harvey et al., section 3: the recurrent transition network | `nets.rtn`, `learn.rtn` |
+| its windows, split by actor, L2Q, L2P, NPSS | `motion.windows`, `metrics.inbetween`, `eval.inbetween` |
+| Skeleton2Humanoid, Eqs. 1 to 4: test-time adaptation | `learn.adapt` |
+| delta to interpolation (Oreshkin et al.), relative times (Qin et al.) | `nets.between` |
+
+A run folder holds `frames.safetensors` (the packed library), `run.safetensors` (settings),
+`checkpoint.safetensors`, the log, and at the end `model.safetensors`.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from poise.errors import PoiseError
+from poise.eval.inbetween import Protocol, TestSet, deviation, evaluate, test_set
+from poise.jobs.inbetween.data import library_bank
+from poise.jobs.library import LibraryConfig
+from poise.kin.feet.contact import standing_labels
+from poise.learn.between import BetweenObjective, BetweenTraining
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint
+from poise.learn.frames import FrameData, Sampler
+from poise.learn.inbetween import BlockStats, InbetweenTrainer, Objective, train_inbetween
+from poise.learn.model import MODEL, InbetweenModel, make_net, save_model
+from poise.learn.rtn import RTNObjective, RTNTraining
+from poise.learn.state import make_generator
+from poise.motion import Clip, Skeleton
+from poise.motion.mirror import joined, mirrored
+from poise.motion.pack import pack_clips
+from poise.motion.windows import FrameBank, step_contacts
+from poise.nets.between import Between, BetweenConfig
+from poise.nets.rtn import RTN, RTNConfig
+from poise.nets.transition import Layout
+from poise.settings import from_data, to_data
+from poise.spatial import normalize
+
+Contacts = Literal["harvey", "two-stage", "floor"]
+RUN_FILE = "run.safetensors"
+FRAMES = "frames.safetensors"
+
+
+@dataclass(frozen=True)
+class Inbetween:
+    """Settings of one network's training.
+
+    net: transformer or rtn. final, validation: regular expressions in the names of clips that are kept
+    apart (see `eval.inbetween.Protocol`); final clips are never read by training or choices.
+    contacts: whose labels the network learns: Harvey et al.'s or Skeleton2Humanoid's, which tell from
+    steps alone, or "floor", of slow feet near it, for recordings whose feet slide.
+    ema: of the averaged weights that are used.
+    mirror: whether it learns from every clip in a mirror, too. stretch: windows are drawn up to so many
+    times faster and slower than recorded.
+    onto: a motion file on whose skeleton all clips are brought by `library_of`, which also cuts what
+    nobody can do alone on a floor. reading: how it reads them; given alone, all come onto the skeleton
+    that most seconds are on. By default clips of the most common skeleton are taken as they are.
+    """
+
+    net: Literal["transformer", "rtn"] = "transformer"
+    name: str = "library"
+    final: str = r"(?!)"
+    validation: str | None = None
+    contacts: Contacts = "harvey"
+    fps: float = 30.0
+    seed: int = 0
+    ema: float = 0.999
+    mirror: bool = False
+    stretch: float = 1.0
+    onto: str | None = None
+    reading: LibraryConfig | None = None
+    between: BetweenConfig = field(default_factory=BetweenConfig)
+    between_training: BetweenTraining = field(default_factory=BetweenTraining)
+    rtn: RTNConfig = field(default_factory=RTNConfig)
+    rtn_training: RTNTraining = field(default_factory=RTNTraining)
+
+    @property
+    def protocol(self) -> Protocol:
+        """The split and the windows by which it is scored."""
+        return Protocol(self.name, self.final, self.validation)
+
+    @property
+    def batch(self) -> int:
+        """Windows per step."""
+        return (self.between_training if self.net == "transformer" else self.rtn_training).batch
+
+    @property
+    def longest(self) -> int:
+        """The longest gap that is trained."""
+        return self.between_training.longest if self.net == "transformer" else self.rtn.longest
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A library ready to learn from: training frames, the bank of all clips, the validation windows
+    (None where no clip is held out), and L2P's deviation."""
+
+    config: Inbetween
+    bank: FrameBank
+    data: FrameData
+    validation: TestSet | None
+    notes: tuple[str, ...] = ()
+
+
+def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> Task:
+    """The split of a library, its statistics and labels."""
+    protocol = config.protocol
+    train = protocol.split(bank, "train")
+    # What never moves in a library has no deviation to divide by.
+    std = deviation(train, protocol).clamp_min(1e-3)
+    layout = Layout(bank.parents, bank.feet, bank.facing)
+    if config.mirror:
+        train = joined(train, mirrored(train))
+    data = frame_data(train, layout, std, config.contacts)
+    held = None
+    if config.validation is not None:
+        held = test_set(protocol.split(bank, "validation"), std, protocol)
+    return Task(config, bank, data, held, notes)
+
+
+def frame_data(bank: FrameBank, layout: Layout, std: torch.Tensor, rule: Contacts) -> FrameData:
+    """A bank as float32 tensors with contact labels per clip."""
+    points = bank.positions()[:, list(bank.feet)]
+    parts = points.split(torch.diff(bank.first).tolist())
+    if rule == "floor":
+        labels = standing_labels(parts, bank.fps)
+    else:
+        labels = [step_contacts(part, rule) for part in parts]
+    return FrameData(
+        layout, bank.root.float(), bank.rot.float(), torch.cat(labels).float(), bank.offsets.float(),
+        bank.first, std.float(),
+    )  # fmt: skip
+
+
+def objective(task: Task, steps: int) -> Objective:
+    """A fresh network, calibrated to the data, with how it learns."""
+    c = task.config
+    net = make_net(c.net, task.data.layout, c.between if c.net == "transformer" else c.rtn, c.seed)
+    sampler = Sampler(task.data)
+    drawn = sampler.draw(512, min(40, c.longest + 5), make_generator(c.seed, "calibration"))
+    net.calibrate(drawn.root, drawn.rot, drawn.offsets)
+    if isinstance(net, Between):
+        return BetweenObjective(net, c.between_training, task.data.std, steps)
+    critics = make_generator(c.seed, "critics")
+    return RTNObjective(net, c.rtn_training, task.data.std, steps, critics)
+
+
+def steps_in(task: Task, minutes: float, trials: int = 6) -> int:
+    """How many steps this machine makes in `minutes`, measured on a network that is thrown away."""
+    own = objective(task, 1000)
+    sampler, generator = Sampler(task.data), torch.Generator().manual_seed(0)
+    # A late step is a dear one where transitions grow longer.
+    own.step(sampler, 600, generator)
+    begun = time.perf_counter()
+    for k in range(trials):
+        own.step(sampler, 600 + k, generator)
+    return max(20, int(60 * minutes / ((time.perf_counter() - begun) / trials)))
+
+
+def begin(
+    folder: Path, library: Path, config: Inbetween, minutes: float, steps: int | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Task, int]:  # fmt: skip
+    """Reads the library (once; then its packed frames) and fixes the number of steps.
+
+    Returns:
+        The task, and the steps of the whole training: those of the run that is in the folder, else
+        `steps`, else as many as fit into `minutes` here.
+
+    Raises:
+        PoiseError: the folder holds a run with other settings, or no clip can be used.
+    """
+    run = folder / RUN_FILE
+    said = to_data(config)
+    if run.exists():
+        _, meta = load_checkpoint(run)
+        if from_data(Inbetween, meta.get("config", {}), run) != from_data(Inbetween, said):
+            hint = "Resume it as it is or choose another folder"
+            raise PoiseError("the folder holds a run with other settings", folder, hint)
+        steps = int(meta["steps"])
+    how = (config.onto, config.reading)
+    bank, notes = library_bank(library, folder / FRAMES, config.fps, tell, *how)
+    task = prepare(bank, config, notes)
+    steps = steps or steps_in(task, minutes)
+    if not run.exists():
+        save_checkpoint(run, {}, {"kind": "inbetween run", "config": said, "steps": steps})
+    return task, steps
+
+
+def train(
+    task: Task, folder: Path, steps: int, minutes: float | None = None,
+    on_block: Callable[[BlockStats], bool | None] | None = None, tensorboard: bool = True,
+    validate_every: int = 1000,
+) -> tuple[InbetweenModel, BlockStats | None, bool]:  # fmt: skip
+    """Trains, or goes on training, in `folder`; the averaged network is written as a model.
+
+    minutes: of this call; the schedule still is that of all `steps`.
+    """
+    c = task.config
+    meta = {"config": to_data(c), "clips": len(task.bank.clips)}
+    trainer = InbetweenTrainer(
+        objective(task, steps),
+        task.data,
+        c.seed,
+        steps,
+        c.batch,
+        ema=c.ema,
+        metadata=meta,
+        stretch=c.stretch,
+    )
+    check = None if task.validation is None else validation(task)
+    stats, stopped = train_inbetween(
+        trainer, folder, minutes, on_block, check, validate_every, tensorboard=tensorboard
+    )
+    model = as_model(task, trainer)
+    save_model(folder / MODEL, model)
+    return model, stats, stopped
+
+
+def as_model(task: Task, trainer: InbetweenTrainer) -> InbetweenModel:
+    """The averaged network with what is needed to use it."""
+    net, c = copy.deepcopy(trainer.averaged).eval(), task.config
+    assert isinstance(net, Between | RTN)
+    meta: dict[str, Any] = {
+        "name": c.name, "seed": c.seed, "step": trainer.step, "steps": trainer.steps,
+        "seconds": round(trainer.seconds, 1), "clips": len(task.bank.clips),
+    }  # fmt: skip
+    bones = task.data.offsets.mean(0)
+    names, shown = task.bank.names, pack_clips([example_of(task.bank)])
+    return InbetweenModel(c.net, net, names, bones, c.fps, c.longest, 10, meta, shown)
+
+
+def example_of(bank: FrameBank, frames: int = 90) -> Clip:
+    """Poses of the longest clip, evenly spread, on its own bones: they show how the skeleton stands."""
+    sizes = torch.diff(bank.first)
+    c = int(sizes.argmax())
+    rows = bank.first[c] + torch.linspace(0, int(sizes[c]) - 1, min(frames, int(sizes[c]))).long()
+    skeleton = Skeleton(bank.names, bank.parents, bank.offsets[c].double().numpy(), bank.ends)
+    root, rot = bank.root[rows].double().numpy(), normalize(bank.rot[rows].double()).numpy()
+    return Clip(skeleton, root, rot, bank.fps, "example")
+
+
+def validation(task: Task, lengths: tuple[int, ...] = (5, 15, 30)) -> Callable[..., Mapping[str, float]]:
+    """Figures of a network on the validation windows."""
+    held = task.validation
+    if held is None:
+        raise PoiseError("no clip is held out for validation")
+
+    def check(net: Any) -> dict[str, float]:
+        rows = evaluate(net, held, lengths)
+        out = {f"l2p_{r.length}": r.l2p for r in rows} | {f"l2q_{r.length}": r.l2q for r in rows}
+        return {k: v for k, v in out.items() if math.isfinite(v)}
+
+    return check
+
+
+def small(config: Inbetween) -> Inbetween:
+    """A network that trains in minutes, for trials and tests."""
+    return replace(
+        config,
+        between=BetweenConfig(width=64, layers=2, heads=4, feedforward=128, latent=4),
+        rtn=RTNConfig(hidden=64, encoder=(64, 32), decoder=(64, 32)),
+    )
+
+
+#: Expected figures: see `benchmarks/inbetween.md`, which `benchmarks/inbetween.py` writes.
+RECIPE = {"name": "inbetween", "config": Inbetween, "build": prepare, "expected": {}}

@@ -1,0 +1,264 @@
+"""One clip of a library: read, cleaned, brought onto the library's skeleton and floor, or left out."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import torch
+
+from poise.body import BodyConfig, BodyTable, generate_table, read_mjcf
+from poise.errors import PoiseError
+from poise.jobs.library.files import MotionFile, check_patterns, matches
+from poise.jobs.library.report import ClipNote
+from poise.kin import retarget
+from poise.kin.coords import clip_to_qpos
+from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
+from poise.kin.doctor.clean import clean_clip
+from poise.kin.feet.level import level_feet
+from poise.kin.fk import Kinematics
+from poise.kin.flight import rate_sentence
+from poise.kin.ground import GroundFit, fit_heights
+from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
+
+_T = TypeVar("_T")
+#: Words in a file's name or folder that tell what no floor bears.
+WORDS = (
+    *("swim", "swimming", "underwater", "climb", "climbing", "ladder", "hanging", "chair", "stool"),
+    *("sofa", "bicycle", "bike", "skateboard", "trampoline", "stilts"),
+)
+
+
+@dataclass(frozen=True)
+class LibraryConfig:
+    """How a library is made.
+
+    min_frames: shorter clips are left out (PHC's converter: 10). min_cut_s: what is left of a cut clip
+    must last so long. rules: see `AloneRules`. words: see `WORDS`. max_unlike_deg: mean angle between
+    the limbs before and after retargeting beyond which a clip is left out.
+    keep: regular expressions of clips that are taken whole whatever the rules say. leave_out: of clips
+    that are not taken. skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
+    rates: (pattern, frames per second) pairs for files that state none or a wrong one. allow_pickle:
+    pickled files that are given by name are read too. level: feet are turned to stand flat on the
+    humanoid's soles, see `level_feet`, which motion that is not simulated has no need of. mirror: each
+    clip is taken in a mirror, too. backwards: of clips that are taken backwards, too; see `images`.
+    """
+
+    min_frames: int = 10
+    min_cut_s: float = 1.0
+    rules: AloneRules = field(default_factory=AloneRules)
+    words: tuple[str, ...] = WORDS
+    max_unlike_deg: float = 20.0
+    keep: tuple[str, ...] = ()
+    leave_out: tuple[str, ...] = ()
+    skeletons: tuple[tuple[str, str], ...] = ()
+    rates: tuple[tuple[str, float], ...] = ()
+    allow_pickle: bool = False
+    level: bool = True
+    mirror: bool = False
+    backwards: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        taken = (*self.keep, *self.leave_out, *self.backwards)
+        check_patterns((*taken, *(p for p, _ in (*self.skeletons, *self.rates))))
+        if self.min_frames < 3:
+            raise PoiseError(f"min_frames must be at least 3, got {self.min_frames}")
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The skeleton that all clips come onto, a clip that shows how it stands, and its body."""
+
+    skeleton: Skeleton
+    example: Clip | None
+    table: BodyTable
+    words: str
+
+
+class Taken(NamedTuple):
+    """A clip that was read and cleaned, at the library's rate, with its file, rate and repairs."""
+
+    file: MotionFile
+    clip: Clip
+    fps: float
+    repairs: tuple[str, ...]
+
+
+def read_all(
+    files: Sequence[MotionFile], fps: float, config: LibraryConfig, tell: Callable[[str], None]
+) -> tuple[list[Taken], dict[str, ClipNote]]:
+    """Every clip that can be read and is long enough, and by name a note on each of the others.
+
+    Raises:
+        PoiseError: no file can be used.
+    """
+    read: list[Taken] = []
+    notes: dict[str, ClipNote] = {}
+    for k, file in enumerate(files, 1):
+        got = _read(file, fps, config)
+        if isinstance(got, ClipNote):
+            notes[file.name] = got
+        else:
+            read.append(got)
+        if k % 100 == 0:
+            tell(f"{k} of {len(files)} files read")
+    if not read:
+        first = next(iter(notes.values()))
+        raise PoiseError(f"none of the {len(files)} files can be used", None, first.sentence())
+    return read, notes
+
+
+def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNote:
+    note = ClipNote(file.name, file.subject, str(file.path), "left out")
+    if matches(config.leave_out, file.name, file.subject):
+        return replace(note, rule="by hand", reason="it was to be left out")
+    is_amc = file.path.suffix.lower() == ".amc"
+    rule = "unreadable"
+    try:
+        clip = read_clip(
+            file.path,
+            skeleton=_stated(config.skeletons, file.name) if is_amc else None,
+            fps=_stated(config.rates, file.name),
+            allow_pickle=config.allow_pickle,
+        )
+        note = replace(note, seconds=clip.seconds, notes=clip.skeleton.source.notes)
+        rule = "not human"
+        cleaned, report = clean_clip(clip)
+        rule = "short"
+        resampled = resample(cleaned, fps).replaced(name=file.name)
+    except PoiseError as problem:
+        return replace(note, rule=rule, reason=str(problem).rstrip("."))
+    if resampled.frames < config.min_frames:
+        reason = (
+            f"it has {resampled.frames} frames at {fps:g} per second, fewer than {config.min_frames}"
+        )
+        return replace(note, rule="short", reason=reason)
+    word = _telling_word(file.name, config.words)
+    if word and not matches(config.keep, file.name, file.subject):
+        return replace(note, rule="word", reason=f"its name says '{word}'")
+    return Taken(file, resampled, clip.fps, tuple(report.sentences()))
+
+
+def _stated(pairs: Sequence[tuple[str, _T]], name: str) -> _T | None:
+    return next((value for p, value in pairs if re.search(p, name, re.IGNORECASE)), None)
+
+
+def _telling_word(name: str, words: Sequence[str]) -> str:
+    said = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
+    return next((w for w in words if w in said), "")
+
+
+def shape_of(skeleton: Skeleton) -> tuple:
+    return skeleton.names, skeleton.parents, skeleton.offsets.tobytes()
+
+
+def target_of(
+    onto: Skeleton | Clip | Target | Path | str | None, clips: Sequence[Clip], body: BodyConfig
+) -> Target:
+    """The skeleton that was asked for, or the one on which most of the motion is."""
+    if isinstance(onto, Target):
+        return onto
+    if body.mjcf is not None and onto is None:
+        onto = body.mjcf
+    if isinstance(onto, str | Path):
+        path = Path(onto)
+        if path.suffix.lower() == ".xml":
+            own = read_mjcf(path, body.damping)
+            return Target(own.skeleton, None, own.table, f"the body of {path.name}")
+        onto = read_clip(path)
+    if onto is None:
+        return _most_common(clips, body)
+    skeleton, example = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
+    table = generate_table(skeleton, body, [] if example is None else [example])
+    named = "the skeleton that was given" if example is None else f"the skeleton of '{example.name}'"
+    return Target(skeleton, example, table, named)
+
+
+def _most_common(clips: Sequence[Clip], body: BodyConfig) -> Target:
+    """The bones with the most seconds, among those of the hierarchy with the most seconds."""
+    trees: Counter[tuple] = Counter()
+    bones: Counter[tuple] = Counter()
+    for clip in clips:
+        shape = shape_of(clip.skeleton)
+        trees[shape[:2]] += clip.seconds  # type: ignore[assignment]
+        bones[shape] += clip.seconds  # type: ignore[assignment]
+    ranked = sorted(bones, key=lambda s: (-trees[s[:2]], -bones[s]))
+    problem: PoiseError | None = None
+    for shape in ranked:
+        example = next(c for c in clips if shape_of(c.skeleton) == shape)
+        try:
+            table = generate_table(example.skeleton, body, [example])
+        except PoiseError as error:
+            problem = problem or error
+            continue
+        words = f"the skeleton of '{example.name}', on which most of the library is"
+        return Target(example.skeleton, example, table, words)
+    assert problem is not None
+    raise problem
+
+
+def place(
+    taken: Taken, example: Clip, target: Target, config: LibraryConfig
+) -> tuple[Clip | None, ClipNote]:
+    """A clip on the target and on the floor, without what no humanoid can do alone; and its note.
+
+    example: a clip on the same skeleton that tells how it stands.
+    """
+    file, clip = taken.file, taken.clip
+    note = ClipNote(
+        file.name, file.subject, str(file.path), "left out", seconds=clip.seconds,
+        repairs=taken.repairs, notes=clip.skeleton.source.notes,
+    )  # fmt: skip
+    keep = matches(config.keep, file.name, file.subject)
+    try:
+        if shape_of(clip.skeleton) != shape_of(target.skeleton):
+            clip, report = retarget(clip, target.example or target.skeleton, example=example)
+            note = replace(
+                note, retargeted=True, scale=report.scale, direction_deg=report.direction_deg,
+                slide_mm_s=report.slide_mm_s[1],
+            )  # fmt: skip
+    except PoiseError as problem:
+        return None, replace(note, rule="not human", reason=str(problem).rstrip("."))
+    if note.direction_deg > config.max_unlike_deg and not keep:
+        reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
+        return None, replace(note, rule="unlike", reason=reason)
+    clip, fit = set_down(clip, target, config)
+    note = replace(note, lift_m=fit.lift_m)
+    # The file's own rate is what a doubt is about, at whatever rate the library is.
+    doubt = rate_sentence(fit.flights, taken.fps)
+    if doubt and not keep:
+        reason = doubt.partition(";")[0]
+        return None, replace(note, rule="rate", reason=reason[0].lower() + reason[1:])
+    return _alone(clip, target, note, config, keep)
+
+
+def set_down(clip: Clip, target: Target, config: LibraryConfig) -> tuple[Clip, GroundFit]:
+    """A clip on the target's skeleton, with its feet flat on the floor."""
+    if config.level:
+        clip = level_feet(clip, target.table).onto(clip)
+    # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
+    body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
+    fit = fit_heights(target.table, body.pos, body.quat, clip.fps)
+    return shifted(clip, (0.0, 0.0, fit.lift_m)), fit
+
+
+def _alone(
+    clip: Clip, target: Target, note: ClipNote, config: LibraryConfig, keep: bool
+) -> tuple[Clip | None, ClipNote]:
+    """The longest stretch that needs no more than a floor."""
+    found = () if keep else not_alone(clip, target.table, config.rules)
+    first, stop = longest_alone(clip, found) if found else (0, clip.frames)
+    if found:
+        worst = max(found, key=lambda f: f.seconds)
+        note = replace(note, rule=worst.kind, reason=worst.sentence(clip.fps))
+        if stop - first < max(config.min_frames, config.min_cut_s * clip.fps):
+            return None, note
+        clip = trim(clip, first, stop)
+    # The floor is known now, so that a part of a clip in which no foot stands is not set down anew.
+    made = clip.replaced(skeleton=target.skeleton.with_source(ground_m=0.0), name=note.name)
+    kept = (first / clip.fps, (stop - 1) / clip.fps)
+    return made, replace(note, state="cut" if found else "kept", kept_s=kept, frames=stop - first)

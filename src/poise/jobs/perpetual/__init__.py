@@ -1,0 +1,1 @@
+"""Training of the perpetual controller in stages, in a run folder."""

@@ -1,0 +1,279 @@
+"""A run of the perpetual controller in a folder: begun, trained to its end, evaluated, opened again.
+
+run/
+    run.safetensors         the clips and the settings, all that the run needs to be rebuilt
+    checkpoint.safetensors  the stage in progress with everything that decides what comes next
+    primitive-K.safetensors each primitive as it was when its stage ended; recovery.safetensors likewise
+    policy.safetensors      the policy of the finished run
+    log.csv, success.csv    the learning curve; every evaluation of every clip
+    result.json             what the finished run came to, without help
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from poise.body import BodyConfig, BodyTable
+from poise.errors import PoiseError
+from poise.jobs.library.clips import Target
+from poise.jobs.library.folder import LibraryConfig, library_of, split
+from poise.jobs.perpetual.progress import Progress, Stage
+from poise.jobs.perpetual.result import RESULT, PerpetualResult, finish
+from poise.jobs.perpetual.stage_trainer import StageTrainer
+from poise.jobs.runs import FINAL, RUN_FILE
+from poise.jobs.warm_start import TrainingCallbacks
+from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint, save_checkpoint
+from poise.learn.run import interruptible
+from poise.motion import ClipLibrary
+from poise.motion.pack import pack_clips, unpack_clips
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual.config import WIDE, config_of
+from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
+from poise.settings import to_data
+
+#: Least step size where a policy that is done learns to come back.
+ANEW = 1e-4
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What a policy has cost that a run goes on from, and the body it moves (`Tracker.target`)."""
+
+    samples: int
+    seconds: float
+    target: Target
+
+
+def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
+    """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
+    who learns, with which seed, and whether and how recovery is learned. Where it is, the policy stays
+    as it is, the first primitive of more, unless one network is to learn both. Observations are clipped
+    no nearer than at `WIDE` deviations.
+
+    returns: the policy comes back by ways already, so that more primitives learn what it fails, and none
+    of its own is needed for recovery.
+
+    Raises:
+        PoiseError: the policy is made of primitives.
+    """
+    if not policy.single and policy.multiplicative:
+        raise PoiseError(
+            "the policy is made of primitives and a composer, which are frozen and cannot go on",
+            hint="Go on from a single network, or resume its run",
+        )
+    done = {"expert": False, "trajopt": None, "help_start": 0.0}
+    asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery")}
+    asked["recovering"] = replace(policy.recovering, demonstrations=wanted.recovering.demonstrations)
+    ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
+    if wanted.recovery:
+        # What the policy ended with is too careful for who learns something new.
+        ppo = replace(ppo, policy_lr=max(ppo.policy_lr, ANEW))
+    if wanted.recovery and not wanted.single:
+        # Primitives have the sizes of the network that becomes the first of them.
+        asked |= {"single": False, "multiplicative": True, "progressive": True}
+        if returns and wanted.recovering.demonstrations:
+            asked["recovering"] = replace(asked["recovering"], primitive="first")
+            asked["max_primitives"] = wanted.max_primitives
+        hidden = policy.single_hidden if policy.single else ppo.policy_hidden
+        ppo = replace(ppo, policy_hidden=hidden)
+    return replace(policy, ppo=ppo, **done, **asked)
+
+
+def clips_of(
+    folder: Path,
+    body: BodyConfig,
+    hold_out: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
+    tell: Callable[[str], None] = lambda _: None,
+    onto: Path | Target | None = None,
+    config: LibraryConfig | None = None,
+) -> tuple[ClipLibrary, tuple[str, ...]]:
+    """The clips of a folder on one skeleton, see `library_of`, and sentences on what became of them.
+
+    hold_out: clips and performers that are not learned from, see `split`. leave_out: regular expressions
+    of clips that are not even read. onto: a motion file or an MJCF body whose skeleton all clips come
+    onto, or the body of a policy; by default that on which most of the library is. config: how files
+    are read.
+    """
+    config = replace(config or LibraryConfig(), leave_out=tuple(leave_out))
+    library, report = library_of(folder, onto, config=config, body=body, tell=tell)
+    notes = tuple(report.sentences())
+    if not hold_out:
+        return library, notes
+    parts = split(library, hold_out)
+    return parts.train, (*notes, f"{len(parts.test)} clips are held out.")
+
+
+def begin(
+    folder: Path,
+    library: ClipLibrary,
+    config: Perpetual,
+    source: str = "",
+    device: str = "cpu",
+    earlier: Earlier | None = None,
+) -> Imitation:
+    """Builds the task and writes the run file; a folder that holds another run is refused.
+
+    source: where the clips are from, by which `resume` knows them. earlier: the training that the run
+    goes on from; a single clip will do for that.
+
+    Raises:
+        PoiseError: a single clip, another run in the folder, a library on another skeleton than the
+            policy's body, or not enough memory.
+    """
+    if len(library) < 2 and earlier is None:
+        raise PoiseError(
+            f"a library needs at least 2 clips, and there is only '{library.names[0]}'",
+            hint="Use poise imitate for a single clip",
+        )
+    path, said = folder / RUN_FILE, to_data(config)
+    tensors, notes = pack_clips(library.clips)
+    notes = json.loads(json.dumps(notes))
+    if path.exists():
+        meta = _checked(folder, said, source)
+        if meta["clips"] != notes:
+            raise PoiseError(
+                f"the folder holds a run of other clips ({len(meta['clips'])}, here {len(notes)})",
+                folder,
+                "Give the library it was begun with, or choose another folder",
+            )
+    table = None
+    if earlier is not None:
+        table = earlier.target.table
+        if not library.clips[0].skeleton.same_bones(earlier.target.skeleton):
+            raise PoiseError(
+                "the clips are on another skeleton than the policy's body",
+                hint="Bring them onto it: library_of(folder, tracker.target)",
+            )
+    imitation = build(library, config, table)
+    imitation.check_memory(config.num_envs, device)
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        meta = {"kind": "run", "recipe": RECIPE["name"], "config": said, "clips": notes}
+        meta |= {"source": source, "character": imitation.humanoid.identity}
+        if earlier is not None:
+            meta["earlier"] = {"samples": earlier.samples, "seconds": earlier.seconds}
+            meta["table"] = earlier.target.table.to_dict()
+        save_checkpoint(path, tensors, meta)
+    return imitation
+
+
+def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu") -> Imitation:
+    """The task of the run in a folder, from that folder alone, if it has these settings.
+
+    Raises:
+        PoiseError: other settings, another source of clips, or another recipe.
+    """
+    _checked(folder, to_data(config), source)
+    imitation = _rebuilt(folder)
+    imitation.check_memory(config.num_envs, device)
+    return imitation
+
+
+def _checked(folder: Path, config: dict[str, Any], source: str) -> dict[str, Any]:
+    """What the run file says, unless it is that of another run."""
+    _, meta = load_checkpoint(folder / RUN_FILE)
+    if meta.get("recipe") != RECIPE["name"]:
+        raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
+    # As this version reads it, so that a run of an older one is compared in what it knew, too.
+    found = to_data(config_of(meta["config"]))
+    # How long the expert was cloned is over and done; a run keeps its own.
+    names = sorted(k for k in config if k != "clone" and config[k] != found[k])
+    if names:
+        raise PoiseError(
+            f"the folder holds a run with other settings ({', '.join(names)})",
+            folder,
+            "Resume it as it is or choose another folder",
+        )
+    if meta["source"] != source:
+        raise PoiseError(
+            f"the folder holds a run on the library {meta['source'] or 'of a program'}",
+            folder,
+            "Give that library, or choose another folder",
+        )
+    return meta
+
+
+def reopen(folder: Path) -> Imitation:
+    """The task of an existing run as its latest policy knows it, rebuilt from its folder alone.
+
+    A policy that has not come to recovery yet must not see point goals; its `config` is without.
+    """
+    imitation = _rebuilt(folder)
+    config: Perpetual = imitation.config
+    if not config.recovery or _knows_recovery(folder):
+        return imitation
+    config = replace(config, recovery=False)
+    return replace(imitation, config=config, task=task(config, imitation.humanoid), recovery_clips=None)
+
+
+def _rebuilt(folder: Path) -> Imitation:
+    tensors, meta = load_checkpoint(folder / RUN_FILE)
+    library = ClipLibrary(tuple(unpack_clips(tensors, meta["clips"])))
+    table = BodyTable.from_dict(meta["table"]) if "table" in meta else None
+    return build(library, config_of(meta["config"], folder / RUN_FILE), table)
+
+
+def _knows_recovery(folder: Path) -> bool:
+    """Whether the stage of a run's latest policy learned to recover."""
+    path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
+    if not path.exists():
+        return True
+    said = load_checkpoint(path)[1]["metadata"]
+    if path.name == FINAL:
+        return bool(said["recovers"])
+    return Stage(**said["course"]["stage"]).recovers is not None
+
+
+def train(
+    imitation: Imitation,
+    folder: Path,
+    until: Until,
+    on_iteration: Callable[[Progress], bool | None] | None = None,
+    threads: int = 0,
+    tensorboard: bool = True,
+    device: str = "cpu",
+    beginning: TrainingCallbacks | None = None,
+    save_s: float = 30.0,
+    trained: PolicyBundle | None = None,
+) -> PerpetualResult:
+    """Trains all stages, or goes on with them, until nothing fails or a limit is reached.
+
+    Args:
+        until: limits of all stages together, over all resumed runs.
+        on_iteration: called after each; returning False ends the call as Ctrl-C does.
+        device: "cpu" or "cuda"; no part of the run.
+        save_s: seconds between checkpoints, beside those at evaluations.
+        trained: a policy that a new run goes on from; a run in progress has its own.
+
+    Ctrl-C ends it after the present iteration with a checkpoint, a second one at once.
+    """
+    stages = StageTrainer(
+        imitation, folder, until, threads, device, tensorboard, beginning, save_s, trained
+    )
+    last, asked = None, False
+    try:
+        if not (stages.finished or stages.share >= 1):
+            # What is in it is no longer the policy of a finished run.
+            for name in (FINAL, RESULT):
+                (folder / name).unlink(missing_ok=True)
+        with interruptible() as interrupt:
+            while not (stages.finished or stages.share >= 1 or interrupt.is_set() or asked):
+                last = stages.iterate()
+                try:
+                    asked = on_iteration is not None and on_iteration(last) is False
+                except KeyboardInterrupt:
+                    interrupt.set()
+            interrupted = asked or interrupt.is_set()
+        if last is not None:
+            stages.save()
+        stopped = interrupted and not stages.finished and stages.share < 1
+        results, card = (None, None) if stopped else finish(stages)
+        done = (stages.finished, stages.primitives, results, card)
+        return PerpetualResult(last, stopped, *done)
+    finally:
+        stages.close()

@@ -1,0 +1,303 @@
+"""The stage machine: a library's training goes from stage to stage all by itself.
+
+Which stage follows which is said by `plan`, when one ends by `judge`, how one begins
+by `next`. A checkpoint is the whole machine between two iterations; a new stage replaces the
+checkpoint of the last one in one step, so that a run that was killed anywhere goes on as if nothing had
+happened.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from poise.env import ImitationEnv
+from poise.jobs.perpetual.demonstrations import odds
+from poise.jobs.perpetual.divergence import DivergenceRetry
+from poise.jobs.perpetual.evaluation import History
+from poise.jobs.perpetual.progress import Progress, Stage, share_of
+from poise.jobs.perpetual.recovery import check_falls
+from poise.jobs.perpetual.stage_evaluation import Judge, Judged
+from poise.jobs.perpetual.stage_initialisation import (
+    DUMPS,
+    begin_first,
+    begin_stage,
+    critic_of,
+    make_trainer,
+    members_of,
+)
+from poise.jobs.perpetual.stage_order import (
+    ends,
+    first_recovers,
+    following,
+    is_over,
+    lasts,
+    most_help,
+    primitives,
+)
+from poise.jobs.perpetual.stage_record import StageRecord
+from poise.jobs.warm_start import TrainingCallbacks
+from poise.learn import (
+    LATEST,
+    Amp,
+    Log,
+    PolicyBundle,
+    Trainer,
+    Until,
+    WarmStart,
+    load_checkpoint,
+    load_policy,
+)
+from poise.learn.checkpoint import remove_partial
+from poise.learn.state import make_generator, prefixed, under
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual.task import Perpetual
+
+#: What is left of the policy's step size at the end of a stage that cools.
+COLD = 0.1
+
+
+class StageTrainer:
+    """A library's training in a run folder; begins it, or goes on from its checkpoint.
+
+    until: limits of the whole training, of which every stage has its part. save_s: seconds between two
+    checkpoints, beside those after evaluations; 0 saves after every iteration. trained: a policy that a
+    new run goes on from.
+    """
+
+    def __init__(
+        self,
+        imitation: Imitation,
+        folder: Path,
+        until: Until,
+        threads: int = 0,
+        device: str = "cpu",
+        tensorboard: bool = True,
+        tell: TrainingCallbacks | None = None,
+        save_s: float = 30.0,
+        trained: PolicyBundle | None = None,
+    ):
+        self.imitation, self.folder, self.until = imitation, folder, until
+        self.config: Perpetual = imitation.config
+        self.threads, self.device, self.save_s = threads, device, save_s
+        self.tensorboard = tensorboard
+        self.dumps, self.tell = folder / DUMPS, tell or TrainingCallbacks()
+        self.stage_record = StageRecord(self.config, imitation.reference.length)
+        self.finished, self.before, self.begun = False, 0, (0, 0.0)
+        self.troubles = DivergenceRetry()
+        if (folder / LATEST).exists():
+            self._load()
+            remove_partial(folder)
+        else:
+            check_falls(imitation)
+            stage, start = begin_first(imitation, threads, folder, self.tell, trained)
+            warm = start is not None and (start.critic is not None or trained is not None)
+            if stage.kind == "recovery":
+                self.stage_record.begin(members_of(stage, torch.zeros(0), imitation))
+            self._enter(stage, start, warm, 1.0)
+            # What the clone has cost is no time with help.
+            self.begun = self.trainer.samples, self.trainer.seconds
+        self.history = History(folder, imitation.library.names, self.iteration)
+        self.judge = Judge(imitation, self.stage_record, self.history, threads, device)
+        self.log = Log(folder, self.iteration, tensorboard)
+        self._saved_at = time.monotonic()
+        if not (folder / LATEST).exists():
+            if trained is not None and first_recovers(self.config):
+                # It is the first primitive as it is: what it fails is for the next one.
+                self._advance(self._judge(over=True))
+            self.save()
+
+    # --- where it stands ----------------------------------------------------------------------
+
+    @property
+    def env(self) -> ImitationEnv:
+        """The stage's worlds."""
+        env = self.trainer.env
+        assert isinstance(env, ImitationEnv)
+        return env
+
+    @property
+    def iteration(self) -> int:
+        """Iterations of all stages."""
+        return self.before + self.trainer.iteration
+
+    @property
+    def share(self) -> float:
+        """How much of the whole training is done, 0 to 1."""
+        return share_of(self.until, self.iteration, self.trainer.samples, self.trainer.seconds)
+
+    @property
+    def help(self) -> float:
+        """What is left of the residual force's limits, 0 to 1, where most is left."""
+        return self.env.help.now if self.imitation.task.residual is not None else 0.0
+
+    @property
+    def helps(self) -> float | Tensor:
+        """What is left of it in each group of `Perpetual.help_by`, or a number for all."""
+        if self.imitation.task.residual is None or self.stage.recovers is not None:
+            return 0.0
+        return self.env.help.left
+
+    @property
+    def primitives(self) -> int:
+        """Primitives of tracking that were begun; 0 for a network that learns all clips at once."""
+        return primitives(self.config, self.stage)
+
+    @property
+    def recovers(self) -> bool:
+        """Whether the stage's policy learned to recover."""
+        given = first_recovers(self.config) and self.stage.number == 1
+        return given or self.stage.recovers is not None
+
+    @property
+    def began(self) -> float:
+        """The share of the whole training at which this stage began."""
+        return share_of(self.until, self.before, *self.begun)
+
+    def policy(self) -> PolicyBundle:
+        """The stage's policy that did best, or the present one before any was evaluated."""
+        policy = self.trainer.policy()
+        if self.stage_record.best:
+            policy.load_state(self.stage_record.best)
+        return policy
+
+    # --- training -----------------------------------------------------------------------------
+
+    def iterate(self) -> Progress:
+        """One iteration, with the evaluation, the next stage and the checkpoint that are due."""
+        stage, judged, follows = self.stage, None, None
+        self._limit_help()
+        self._cool()
+        stats, trouble = self.troubles.iterate(self.trainer, self._go_back)
+        self._limit_help()
+        iteration, share, help_n = self.iteration, self.share, self.help * self.config.help_start
+        row = stats.row() | {"iteration": iteration, "stage": stage.number}
+        seen = self.stage_record.seen
+        every = self.judge.every(stage, self.trainer.rollout.samples)
+        over = share >= ends(self.config, stage, self.began)
+        if over or self.trainer.iteration % every == 0:
+            judged = self._judge(over)
+            self.troubles.lately = 0
+            seen = self.stage_record.seen
+            row |= judged.row()
+            if is_over(self.config, stage, judged.decision, share):
+                follows = self._advance(judged)
+        self.log.write(row)
+        if judged is not None or time.monotonic() - self._saved_at >= self.save_s:
+            self.save()
+        results, card = (judged.clips, judged.recovery) if judged is not None else (None, None)
+        shown = (help_n, results, card, follows, trouble)
+        return Progress(stage, iteration, stats, share, *seen, *shown)
+
+    def _go_back(self, trouble: int) -> None:
+        """To the last checkpoint, and on with other draws."""
+        self.trainer.load(self.folder / LATEST)
+        self.log.close()
+        self.log = Log(self.folder, self.iteration, self.tensorboard)
+        noise = self.trainer.ppo.noise
+        draws = make_generator(self.config.seed, f"after trouble {trouble}", noise.device)
+        noise.set_state(draws.get_state())
+        self.env.reseed(int(draws.initial_seed()))
+        self.save()
+
+    def _limit_help(self) -> None:
+        """No more help, on any clip, than the stage's time allows."""
+        if self.imitation.task.residual is None:
+            return
+        most = most_help(self.config, self.stage, self.began, self.share)
+        if most == 0.0:
+            self.env.help.schedule = None
+        self.env.help.cap(most)
+
+    def _cool(self) -> None:
+        """Smaller steps towards the stage's end, see `Perpetual.cooling`."""
+        cooling, end = self.config.cooling, ends(self.config, self.stage, self.began)
+        if cooling and end > self.began:
+            left = (end - self.share) / (end - self.began)
+            self.trainer.ppo.scale_lr(min(1.0, max(left / cooling, COLD)))
+
+    def _judge(self, over: bool) -> Judged:
+        """Evaluates the present policy. over: the stage's time is."""
+        judged = self.judge.judge(self.stage, self.trainer.policy(), self.helps, over, self.iteration)
+        self._use_odds()
+        return judged
+
+    # --- stages -------------------------------------------------------------------------------
+
+    def _advance(self, judged: Judged) -> Stage | None:
+        """Ends the stage; the next one, or None where there is none."""
+        stage, stage_record, t = self.stage, self.stage_record, self.trainer
+        member, policy = stage_record.mining.member.clone(), self.policy()
+        hard = torch.zeros_like(member) if judged.decision == "solved" else stage_record.hard
+        follows = following(self.config, stage, bool(hard.any()))
+        if stage.kind == "primitive":
+            stage_record.owner[member] = stage.number - 1
+        if stage.kind in ("primitive", "recovery") and not lasts(self.config, stage):
+            about = {"stage": stage.name, "clips": int(member.sum()), "hard": int(hard.sum())}
+            name = stage.name.replace(" ", "-")
+            policy.save(self.folder / f"{name}.safetensors", t.character, about)
+        if follows is None:
+            self.finished = True
+            return None
+        before = WarmStart(policy, critic_of(t), t.samples, t.seconds)
+        where = (self.threads, self.dumps, self.tell)
+        start = begin_stage(before, self.imitation, follows, stage_record.owner, *where)
+        # A composer and what recovers learn without help; a primitive's clips keep what they have.
+        scale = self.helps if follows.kind == "primitive" else 0.0
+        self.before, self.begun = self.iteration, (start.samples, start.seconds)
+        self.env.close()
+        stage_record.begin(members_of(follows, hard, self.imitation))
+        self._enter(follows, start, True, scale)
+        if isinstance(self.trainer.style, Amp) and isinstance(t.style, Amp):
+            # The discriminator goes on, as in the paper.
+            self.trainer.style.load_learned(t.style.state())
+        return follows
+
+    def _enter(self, stage: Stage, start: WarmStart | None, warm: bool, scale: float | Tensor) -> None:
+        """Makes the stage's trainer, with the share `scale` of the help, or each group's own `(G,)`."""
+        self.stage, self.warm = stage, warm
+        where = (self.threads, self.dumps, self.device)
+        self.trainer: Trainer = make_trainer(self.imitation, stage, start, warm, *where)
+        self.env.help.set(scale)
+        self._use_odds()
+
+    def _use_odds(self) -> None:
+        """Clips are drawn by what is known of them."""
+        library, length = self.stage_record.mining.weights(), self.env.reference.length
+        self.env.weights = odds(self.imitation, self.stage, library, length)
+
+    # --- persistence --------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Writes the checkpoint: the trainer and everything that decides what comes next."""
+        self.log.flush()
+        self.trainer.metadata["course"] = {
+            "stage": asdict(self.stage), "warm": self.warm, "before": self.before,
+            "begun": list(self.begun), "troubles": [self.troubles.total, self.troubles.lately],
+            "finished": self.finished, "ledger": self.stage_record.facts(),
+        }  # fmt: skip
+        self.trainer.save(self.folder / LATEST, prefixed("ledger", self.stage_record.state()))
+        self._saved_at = time.monotonic()
+
+    def _load(self) -> None:
+        path = self.folder / LATEST
+        tensors, meta = load_checkpoint(path)
+        said: dict[str, Any] = meta["metadata"]["course"]
+        self.stage_record.load(under("ledger", tensors), said["ledger"])
+        samples, seconds = said["begun"]
+        self.before, self.begun, self.finished = said["before"], (samples, seconds), said["finished"]
+        self.troubles = DivergenceRetry(*said["troubles"])
+        # A trainer takes the sizes and the action noise from the policy it starts with.
+        start = WarmStart(load_policy(path))
+        self._enter(Stage(**said["stage"]), start, said["warm"], 1.0)
+        self.trainer.load(path)
+
+    def close(self) -> None:
+        """Frees the worlds and closes the log."""
+        self.log.close()
+        self.env.close()

@@ -1,0 +1,46 @@
+"""A motion that the policy loses is looked for by many characters at once, see `plan.sampling`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from poise.env import Acts
+from poise.jobs.perpetual.evaluation import bare_env
+from poise.jobs.track.policy import Tracker
+from poise.jobs.track.replay import Replay
+from poise.plan import SamplingConfig, SamplingControl, SamplingResult
+from poise.recipes.imitation import Imitation
+
+
+def search(
+    tracker: Tracker,
+    imitation: Imitation,
+    config: SamplingConfig,
+    clip: int = 0,
+    threads: int = 0,
+    show: Callable[[int, int], None] | None = None,
+) -> SamplingResult:
+    """Looks for one of a task's motions with the tracker's policy, without help.
+
+    threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
+    """
+    # Worlds that lose the motion may go bad; they are left behind.
+    env = bare_env(imitation, config.characters, 0.0, threads, "cpu", rewards=True)
+    try:
+        return SamplingControl(env, tracker.policy, config, tracker.value, clip).run(show)
+    finally:
+        env.close()
+
+
+def sentence(found: SamplingResult, config: SamplingConfig, rate_hz: float) -> str:
+    """What the search came to."""
+    much = f"{config.characters} characters looked for it, {found.tries:,} control steps, without help"
+    if found.whole:
+        return f"The policy alone loses the motion; {much}, and found it to its end."
+    at = found.reached / rate_hz
+    return f"The policy alone loses the motion; {much}, and came as far as {at:.1f} s."
+
+
+def replay(found: SamplingResult, policy: Acts) -> Replay:
+    """Does what was found, and from where it was lost what the policy does."""
+    return Replay(found.actions[: found.reached].clone(), policy)

@@ -1,0 +1,328 @@
+"""A trained controller tracks any motion: no training, no help, one episode from its first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body.humanoid import make_humanoid
+from poise.env import Acts, ImitationEnv, Reference
+from poise.errors import PoiseError
+from poise.eval import run_episodes, score_rollouts
+from poise.eval.judged import judge
+from poise.jobs.deliver import simulated_clip
+from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.runs import Evaluation
+from poise.jobs.track.crowd import crowd_env, places
+from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.points import fitted, follow
+from poise.jobs.track.policy import Tracker
+from poise.jobs.track.recovering import Losses, with_returns
+from poise.jobs.track.searching import replay, search, sentence
+from poise.kin.fit import widen
+from poise.metrics import mpjpe_global, success_rule
+from poise.motion import Clip, ClipLibrary
+from poise.motion.keypoints import Keypoints
+from poise.motion.noise import Noise, perturb_clip, perturb_points
+from poise.plan import SamplingConfig, SamplingResult
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import task
+
+#: Characters in one world.
+MOST = 64
+#: Which failure ends tracking: a mean distance of 0.5 m.
+RULE = "phc"
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """How a motion is tracked.
+
+    noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
+    failed is put back onto the reference. recover: it gets up, comes back and goes on, while the motion
+    waits, see `env.recovery.controller`; for one character. smooth_hz: cut-off of a low-pass on
+    keypoints. count: characters who do the motion side by side in one world, see `track.crowd`. search:
+    a motion that the policy loses is looked for, see `plan.sampling`; for one character.
+    search_threads: of it, 0 is all cores. threads: of the physics.
+    """
+
+    noise: tuple[Noise, ...] = ()
+    seed: int = 0
+    reset_on_fail: bool = False
+    recover: bool = False
+    smooth_hz: float | None = None
+    count: int = 1
+    search: SamplingConfig | None = None
+    search_threads: int = 0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= MOST:
+            raise PoiseError(f"there can be 1 to {MOST} characters, got {self.count}")
+        if self.recover and (self.reset_on_fail or self.count > 1):
+            what = "several characters" if self.count > 1 else "one that is put back onto the motion"
+            raise PoiseError(f"only a single character comes back by itself, not {what}")
+        if self.search and (self.recover or self.reset_on_fail or self.count > 1):
+            what = "several characters" if self.count > 1 else "one that comes or is put back"
+            raise PoiseError(f"a motion is searched for a single character, not {what}")
+
+
+@dataclass(frozen=True)
+class Clean:
+    """An input with noise, and the character that followed it, beside the motion without noise.
+
+    noise_mm: mean distance of the bodies in the input. off_mm: that of the character, up to where it
+    failed. succeeded: whether the character stayed within 0.5 m of the motion without noise.
+    """
+
+    noise_mm: float
+    off_mm: float
+    succeeded: bool
+
+    def sentence(self) -> str:
+        """The figures in words."""
+        return (
+            f"The score is that against the input with noise, which moved the bodies by "
+            f"{self.noise_mm:.0f} mm on average; the character is {self.off_mm:.0f} mm from the motion "
+            "without noise."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What came of tracking.
+
+    imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
+    placed: the motion on the body. failures: (character, seconds) of each failure in the order of time;
+    without `reset_on_fail` and `recover` at most one per character. clean: what the noise changed, None
+    without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
+    was lost and found again; None where it was not. found: with `search`, what that came to; None where
+    the policy alone did not lose the motion.
+    """
+
+    tracker: Tracker
+    imitation: Imitation
+    evaluation: Evaluation
+    placed: Placed
+    failures: tuple[tuple[int, float], ...]
+    clean: Clean | None
+    notes: tuple[str, ...]
+    losses: Losses | None = None
+    found: SamplingResult | None = None
+
+    @property
+    def failed_s(self) -> tuple[float, ...]:
+        """Seconds at which the first character failed."""
+        return tuple(t for who, t in self.failures if who == 0)
+
+    def motion(self, character: int = 0) -> Clip:
+        """The simulated motion on the body's skeleton, as it was simulated."""
+        return simulated_clip(self.imitation, self.evaluation, character)
+
+
+def track(
+    tracker: Tracker,
+    motion: Clip | Keypoints,
+    config: TrackConfig | None = None,
+    show: Callable[[int, int], None] | None = None,
+) -> Tracked:
+    """Tracks a motion from its first frame to its last with the deterministic policy, without help.
+
+    show: is told how many control steps of how many are searched.
+
+    Keypoints reach a policy with goals of keypoints frame by frame (`kin.retarget`); any other
+    policy gets the clip that is fitted to them.
+
+    Raises:
+        PoiseError: a motion that no human makes or that is too short, see `place`.
+    """
+    config = config or TrackConfig()
+    clip, points = _input(motion, config)
+    placed = place(clip, tracker)
+    imitation = imitation_of(tracker, [placed])
+    notes = list(placed.notes)
+    if points is not None:
+        notes += follow(tracker, placed, points, imitation.reference, config.smooth_hz)
+    goals = imitation.reference.pose.pos
+    if config.count > 1:
+        imitation = side_by_side(imitation, config.count)
+    acts, losses, found = tracker.policy, None, None
+    if config.search and loses(tracker, imitation):
+        found = search(tracker, imitation, config.search, 0, config.search_threads, show)
+        acts = replay(found, acts)
+        notes.append(sentence(found, config.search, imitation.reference.rate_hz))
+    if config.recover and (back := with_returns(tracker, placed, imitation, config.threads)):
+        placed, imitation, acts, losses = back
+    keeper = Keeper(acts, config.reset_on_fail)
+
+    def make_env(worlds: int) -> ImitationEnv:
+        if worlds > 1:
+            keeper.env = crowd_env(imitation, worlds)
+        else:
+            keeper.env = imitation.env(1, auto_reset=False, threads=config.threads, help_scale=0.0)
+        check_fits(tracker, keeper.env)
+        return keeper.env
+
+    all_of_them = torch.arange(config.count)
+    starts = torch.zeros_like(all_of_them)
+    rollouts, recordings = run_episodes(make_env, keeper, all_of_them, starts, cycles=1)
+    about, rate = tracker.about, imitation.reference.rate_hz
+    card = score_rollouts(
+        rollouts,
+        rule=RULE,
+        method=tracker.config.method + (", searched" if found else ""),
+        seconds=float(about.get("seconds", 0.0)),
+        samples=int(about.get("samples", 0)),
+        seed=tracker.config.seed,
+    )
+    judged = judge(rollouts, success_rule(RULE))
+    failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
+    frames = sorted({*keeper.fallen, *failed}, key=lambda x: (x[1], x[0]))
+    clean = None
+    if config.noise:
+        seen = rollouts.pos[0], goals
+        clean = _beside_clean(tracker, motion, judged.mask[0], *seen, config)
+        notes.append(clean.sentence())
+    if float(about.get("help_n", 0.0)) > 0:
+        notes.append(
+            f"The policy is that of an unfinished training that still helped by up to "
+            f"{float(about['help_n']):.0f} N; here nothing helps."
+        )
+    evaluation = Evaluation(card, rollouts, recordings)
+    times = tuple((who, frame / rate) for who, frame in frames)
+    if losses is not None:
+        times = tuple((0, t) for t in losses.lost)
+    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, found)
+
+
+def loses(tracker: Tracker, imitation: Imitation) -> bool:
+    """Whether the policy alone loses a task's first motion."""
+    first = torch.zeros(1, dtype=torch.long)
+    results = evaluate_clips(imitation, tracker.policy, first, 0.0, 1)
+    return not bool(results.succeeded)
+
+
+def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
+    """Motions on the tracker's body as one task; the report is that of the first.
+
+    Hinges whose range a motion leaves are widened where no action is measured by the ranges: whoever
+    begins beyond one would be thrown back into it.
+    """
+    humanoid, config = tracker.humanoid, tracker.config
+    motions = [p.qpos for p in placed]
+    if config.widens and widen(humanoid.table, motions, 0.0)[1]:
+        table, _ = widen(humanoid.table, motions, config.body.margin)
+        humanoid = make_humanoid(humanoid.skeleton, table)
+        config.sim.apply(humanoid.model)
+    library = ClipLibrary(tuple(p.clip for p in placed), (1.0,) * len(placed))
+    names = [p.clip.name for p in placed]
+    reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)
+    own = task(config, humanoid, guided=tracker.recovery_clips is not None)
+    return Imitation(library, humanoid, reference, placed[0].report, config, own, tracker.recovery_clips)
+
+
+def side_by_side(imitation: Imitation, count: int) -> Imitation:
+    """The first motion `count` times, each some metres from the others; clips are called NAME-1, ..."""
+    clip, reference = imitation.library.clips[0], imitation.reference
+    names = [f"{clip.name}-{k + 1}" for k in range(count)]
+    moves = np.pad(places(count), ((0, 0), (0, 1)))
+    motions = []
+    for move in moves:
+        qpos = reference.qpos.numpy().copy()
+        qpos[:, :3] += move
+        motions.append(qpos)
+    made = Reference(reference.humanoid, motions, reference.rate_hz, names)
+    # Goals that came from keypoints are no function of the coordinates.
+    pose = reference.pose
+    many = {f.name: torch.cat([getattr(pose, f.name)] * count) for f in fields(pose)}
+    shift = torch.tensor(moves).repeat_interleave(len(reference.qpos), 0).to(pose.pos)
+    many["pos"] = many["pos"] + shift[:, None]
+    many["com"] = many["com"] + shift
+    many["qpos"] = made.pose.qpos
+    made.pose = replace(pose, **many)
+    report = imitation.report
+    each = ("fps", "flights", "clean", "cycles", "ground", "joint_error_mm")
+    copies = {name: getattr(report, name) * count for name in each}
+    report = replace(report, names=tuple(names), **copies)
+    clips = ClipLibrary(tuple(clip.replaced(name=n) for n in names), (1.0,) * count)
+    return replace(imitation, library=clips, reference=made, report=report)
+
+
+def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
+    """Refuses a policy whose observations or actions are not those of its body here.
+
+    Raises:
+        PoiseError: it was trained for another body, or by another version of Poise.
+    """
+    have = (tracker.policy.num_obs, tracker.policy.num_actions)
+    need = (env.num_obs, env.num_actions)
+    if have != need:
+        env.close()
+        raise PoiseError(
+            f"the policy takes {have[0]} observations and gives {have[1]} actions, and its body here "
+            f"has {need[0]} and {need[1]}",
+            hint="It was trained for another body or by another version of Poise; export it anew",
+        )
+
+
+class Keeper:
+    """A policy that puts characters back onto the reference before it acts, where they failed.
+
+    resets: off, it only acts. fallen: (world, frame) of every failure that it mended.
+    """
+
+    def __init__(self, policy: Acts, resets: bool):
+        self.policy, self.resets = policy, resets
+        self.env: ImitationEnv | None = None
+        self.fallen: list[tuple[int, int]] = []
+        self._limit_mm = success_rule(RULE).limit_m * 1000.0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
+        env = self.env
+        if self.resets and env is not None:
+            ref = env.reference.gather(env.clip, env.frame).pos
+            failed = ~(mpjpe_global(env.pose().pos, ref) <= self._limit_mm)
+            if bool(failed.any()):
+                obs = self._mend(env, failed, obs)
+        return self.policy.act(obs)
+
+    def _mend(self, env: ImitationEnv, failed: Tensor, obs: Tensor) -> Tensor:
+        rows = failed.nonzero().flatten()
+        self.fallen += [(int(i), int(env.frame[i])) for i in rows]
+        clip, frame, before = env.clip.clone(), env.frame.clone(), env.backend.snapshot()
+        fresh = env.reset_to(clip, frame)
+        others = (~failed).nonzero().flatten()
+        if len(others):
+            # Starting anew is for all worlds at once; the others go on from where they were.
+            env.backend.restore(before[others], others)
+        return torch.where(failed[:, None], fresh, obs)
+
+
+def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoints | None]:
+    """The motion with noise as a clip, and as keypoints where it is."""
+    if isinstance(motion, Keypoints):
+        if config.noise:
+            motion = perturb_points(motion, config.noise, config.seed)
+        return fitted(motion, config.smooth_hz), motion
+    clip = motion
+    return (perturb_clip(clip, config.noise, config.seed) if config.noise else clip), None
+
+
+def _beside_clean(
+    tracker: Tracker, motion: Clip | Keypoints, judged: Tensor, sim: Tensor, noisy: Tensor,
+    config: TrackConfig,
+) -> Clean:  # fmt: skip
+    """The character `sim (T, B, 3)` beside the motion without noise, in the frames `judged (T)`."""
+    clean, _ = _input(motion, replace(config, noise=()))
+    pos = imitation_of(tracker, [place(clean, tracker)]).reference.pose.pos
+    # A gap at an end of noisy keypoints may have cut some frames off.
+    frames = min(len(pos), len(sim), len(noisy))
+    pos, sim, noisy, kept = pos[:frames], sim[:frames], noisy[:frames], judged[:frames]
+    off = mpjpe_global(sim, pos)
+    won = bool((off <= success_rule(RULE).limit_m * 1000.0).all())
+    return Clean(float(mpjpe_global(noisy, pos).mean()), float(off[kept].mean()), won)

@@ -1,0 +1,182 @@
+"""How a run starts: a scripted expert is scored and cloned, and PPO goes on from the clone.
+
+The clone is saved as the run's first checkpoint, so that a killed run goes on from it bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from poise.env import ImitationEnv
+from poise.eval import ScoreCard, run_episodes, score_rollouts, start_frames
+from poise.learn import (
+    LATEST,
+    CloneConfig,
+    CloneStats,
+    PolicyBundle,
+    PPOConfig,
+    Trainer,
+    VecEnv,
+    WarmStart,
+    clone,
+    load_checkpoint,
+)
+from poise.learn.parallel import ALONE, Comm, any_of, together
+from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
+from poise.recipes.imitation import Imitation
+from poise.sim import UnstableError
+
+#: Start frames of a first look; the final evaluation takes every one.
+FIRST_STARTS = 64
+#: The expert acts in no more worlds than these; more of them teach little more.
+CLONE_WORLDS = 512
+
+
+@dataclass(frozen=True)
+class TrainingCallbacks:
+    """Who is told what before PPO begins.
+
+    expert: the expert's own score. round: each round of cloning. cloned: the clone, once it is saved.
+    failed: why the run begins without an expert. path: each iteration of a search for paths, and of how
+    many it is one.
+    """
+
+    expert: Callable[[ScoreCard], None] | None = None
+    round: Callable[[CloneStats], None] | None = None
+    cloned: Callable[[PolicyBundle, WarmStart], None] | None = None
+    failed: Callable[[str], None] | None = None
+    path: Callable[[TrajOptStats, int], None] | None = None
+
+
+def start_training(
+    imitation: Imitation,
+    folder: Path,
+    threads: int = 0,
+    tell: TrainingCallbacks | None = None,
+    comm: Comm = ALONE,
+    device: str = "cpu",
+) -> Trainer:
+    """The run's trainer: fresh, from a cloned expert, or set up as the checkpoint in `folder` was.
+
+    Of several processes the first clones, and the others take over what it learned. The expert acts on
+    the CPU, whatever the `device` that PPO then uses.
+    """
+    tell = tell or TrainingCallbacks()
+    make = partial(_trainer, imitation, threads, folder / "dumps", comm, device)
+    if (folder / LATEST).exists():
+        warm = load_checkpoint(folder / LATEST)[1].get("metadata", {}).get("start") == "expert"
+        return make(None, warm)
+    if not imitation.config.expert:
+        return make(None, False)
+    start = None
+    with together(comm):
+        if comm.rank == 0:
+            try:
+                start = clone_expert(imitation, threads, folder / "dumps", tell)
+            except UnstableError as problem:
+                # A motion that throws the expert off may still be learned from nothing.
+                if tell.failed is not None:
+                    tell.failed(str(problem))
+    if not any_of(comm, start is not None):
+        return make(None, False)
+    trainer = make(start, True)
+    trainer.share_start()
+    trainer.save(folder / LATEST)
+    if tell.cloned is not None and start is not None:
+        tell.cloned(trainer.policy(), start)
+    return trainer
+
+
+def clone_expert(
+    imitation: Imitation,
+    threads: int = 0,
+    dumps: Path | None = None,
+    tell: TrainingCallbacks | None = None,
+    config: CloneConfig | None = None,
+    start: PolicyBundle | None = None,
+    paths: Trajectories | None = None,
+) -> WarmStart:
+    """Scores the expert and clones it into a policy of the recipe's networks and observation.
+
+    start: the policy that is taught, see `learn.clone`; a new perceptron by default. paths: what the
+    teacher follows in place of the expert, without help.
+    """
+    tell, plan = tell or TrainingCallbacks(), None if paths else make_plan(imitation.reference)
+    if tell.expert is not None and plan is not None:
+        tell.expert(score_expert(imitation, plan))
+    worlds = min(imitation.config.num_envs, CLONE_WORLDS)
+    env = imitation.env(worlds, threads=threads, dumps=dumps)
+    # The expert plans with the whole limit, which no success takes away while it is watched.
+    env.help.schedule = None
+    try:
+        return clone(
+            cast(VecEnv, env),
+            LqrTeacher(env, paths) if paths else Expert(env, plan=plan),
+            config,
+            imitation.ppo(),
+            imitation.config.seed,
+            tell.round,
+            start,
+        )[0]
+    finally:
+        env.close()
+
+
+def score_expert(imitation: Imitation, plan: Plan | None = None) -> ScoreCard:
+    """The expert's own score card over `FIRST_STARTS` start frames."""
+    config, acts = imitation.config, _Acts(imitation, plan)
+    clip, frame = some_starts(imitation)
+    limit = imitation.task.residual.limit_n if imitation.task.residual else 0.0
+    rollouts, _ = run_episodes(acts.env, acts, clip, frame, limit, limit)
+    return score_rollouts(rollouts, method="expert", seed=config.seed)
+
+
+def some_starts(imitation: Imitation, most: int = FIRST_STARTS) -> tuple[Tensor, Tensor]:
+    """(clip, frame) of at most `most` start frames, evenly spread, frame 0 of the first clip first."""
+    clip, frame = start_frames(imitation.reference)
+    picks = torch.linspace(0, len(clip) - 1, min(most, len(clip))).long()
+    return clip[picks], frame[picks]
+
+
+def finetuning(ppo: PPOConfig) -> PPOConfig:
+    """The same settings for a policy that is good already: small steps, the critic first."""
+    return replace(ppo, policy_lr=min(ppo.policy_lr, 1e-4), critic_warmup=max(ppo.critic_warmup, 2))
+
+
+def _trainer(
+    imitation: Imitation,
+    threads: int,
+    dumps: Path,
+    comm: Comm,
+    device: str,
+    start: WarmStart | None,
+    warm: bool,
+) -> Trainer:
+    ppo = finetuning(imitation.ppo()) if warm else None
+    how: dict[str, Any] = {"start": "expert"} if warm else {}
+    with together(comm):
+        return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)
+
+
+class _Acts:
+    """An expert for the environment that the evaluation makes."""
+
+    def __init__(self, imitation: Imitation, plan: Plan | None):
+        self.imitation, self.plan = imitation, plan
+        self.expert: Expert | None = None
+
+    def env(self, num_envs: int) -> ImitationEnv:
+        env = self.imitation.env(num_envs, auto_reset=False)
+        self.expert = Expert(env, plan=self.plan)
+        return env
+
+    def act(self, obs: Tensor) -> Tensor:
+        assert self.expert is not None
+        return self.expert.act(obs)

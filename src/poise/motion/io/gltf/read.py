@@ -1,0 +1,151 @@
+"""A glTF animation as a clip: skinned or plain node trees, .glb or .gltf."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.motion.io.gltf.clock import clock, number_of
+from poise.motion.io.gltf.file import GltfFile, load_gltf
+from poise.motion.io.gltf.tracks import Take, choose_take
+from poise.motion.io.gltf.tree import Tree, choose_joints, read_tree
+from poise.motion.io.nodes import base_of, checked_unit, even, rigid_bones, unique_names
+from poise.motion.io.raw import Options, RawMotion, assemble
+
+_EVEN_SCALE = 1e-2
+
+
+def read_gltf(path: Path, options: Options) -> Clip:
+    """A glTF 2.0 clip (.glb, .gltf).
+
+    Local node rotations are the clip's local rotations. The transforms of nodes above the root
+    joint, such as an armature's scale of 0.01, and constant scales are baked into the bones and the
+    root's path, and remembered for `write_gltf`. Of several animations the longest is taken, or
+    `options.take`. glTF is in metres and Y up; a body of no human size is taken for centimetres or
+    another unit, with a note.
+    """
+    file = load_gltf(path)
+    tree = read_tree(file)
+    notes: list[str] = []
+    take = choose_take(file, tree, options.take, notes)
+    targeted = take.nodes("translation", "rotation")
+    moving = take.nodes("translation", "rotation", varying=True)
+    joints = choose_joints(tree, file, targeted, moving, notes)
+    joints = _without_still_roots(tree, joints, take, moving)
+    raw = _raw_motion(file, tree, take, joints, options, notes)
+    return assemble(raw, options)
+
+
+def _without_still_roots(tree: Tree, joints: list[int], take: Take, moving: set[int]) -> list[int]:
+    """Leaves out root joints that never move and carry one joint, which does the travelling.
+
+    They become static nodes above the root, and come back when the clip is written.
+    """
+    travelling = take.nodes("translation", varying=True)
+    while joints[0] not in moving:
+        below = [j for j in joints if tree.parents[j] == joints[0]]
+        if len(below) != 1 or below[0] not in travelling:
+            break
+        joints = joints[1:]
+    return joints
+
+
+def _raw_motion(
+    file: GltfFile, tree: Tree, take: Take, joints: list[int], options: Options, notes: list[str]
+) -> RawMotion:
+    above = tree.line(joints[0])[:-1]
+    used = [
+        take.tracks[n, p] for n in joints for p in ("translation", "rotation") if (n, p) in take.tracks
+    ]
+    when, fps = clock(take, used, options.fps, file, notes)
+    place = {n: _channel(tree, take, n, "translation", when) for n in (*above, *joints)}
+    turn = {n: _channel(tree, take, n, "rotation", when) for n in (*above, *joints)}
+    scale = {n: _scale(tree, take, n, file, notes) for n in (*above, *joints)}
+    names = unique_names([tree.names[j] for j in joints], notes)
+    index = {node: j for j, node in enumerate(joints)}
+    parents = tuple(index.get(tree.parents[n], -1) if j else -1 for j, n in enumerate(joints))
+    base = base_of([(place[n][0], turn[n][0], scale[n]) for n in above])
+    bones = rigid_bones(
+        names,
+        parents,
+        [place[n] for n in joints],
+        [turn[n] for n in joints],
+        [scale[n] for n in joints],
+        base,
+        notes,
+    )
+    own = take.extras
+    kept = {
+        "above": [
+            [tree.names[n], place[n][0].tolist(), turn[n][0].tolist(), scale[n].tolist()] for n in above
+        ],
+        "scale": [even(scale[n]) for n in joints],
+        "rest": tree.turn[joints].tolist(),
+        "root": tree.place[joints[0]].tolist(),
+        "still": bones.still,
+        "take": take.name,
+    }
+    unit_m = checked_unit("glTF", 1.0, "Y", names, parents, bones, options, file.path, notes)
+    return RawMotion(
+        format="gltf",
+        path=file.path,
+        names=names,
+        parents=parents,
+        offsets=bones.offsets,
+        ends=_ends(file, joints),
+        root_pos=bones.root_pos,
+        rot=bones.rot,
+        fps=fps,
+        channels=(),
+        frame_time=number_of(own.get("frame_time")),
+        unit_m=unit_m,
+        up_axis="Y",
+        travel_joint=None if bones.travel is None else names[bones.travel],
+        cyclic=own.get("cyclic") is True,
+        notes=tuple(notes),
+        strays=bones.strays,
+        extra=(("gltf", json.dumps(kept)),),
+        whole="fps" in own,
+    )
+
+
+def _channel(tree: Tree, take: Take, node: int, path: str, when: np.ndarray) -> np.ndarray:
+    """`(T or 1, n)` values of a node's channel, or of its rest pose where it has none."""
+    track = take.tracks.get((node, path))
+    if track is None:
+        return (tree.place if path == "translation" else tree.turn)[node][None]
+    return track.at(when) if track.varies() else track.keys()[:1]
+
+
+def _scale(tree: Tree, take: Take, node: int, file: GltfFile, notes: list[str]) -> np.ndarray:
+    """`(3,)` a node's constant scale; an animated one is told and replaced by its median."""
+    name, track = tree.names[node], take.tracks.get((node, "scale"))
+    value = tree.scale[node] if track is None else np.median(track.keys(), axis=0)
+    if track is not None and np.ptp(track.keys(), axis=0).max() > _EVEN_SCALE * np.abs(value).max():
+        notes.append(f"The scale of '{name}' is animated; its median was taken for all frames")
+    if value.min() <= 0:
+        what = "mirrors space" if value.min() < 0 else "is zero"
+        raise PoiseError(f"the scale of node '{name}' {what}, which no body can follow", file.path)
+    if value.max() > (1 + _EVEN_SCALE) * value.min():
+        notes.append(
+            f"The scale of '{name}' differs between its axes; below its children the mean is used"
+        )
+    return value
+
+
+def _ends(file: GltfFile, joints: list[int]) -> tuple[tuple[int, tuple[float, float, float]], ...]:
+    """Bone tips that Poise wrote beside the nodes, in file units."""
+    out: list[tuple[int, tuple[float, float, float]]] = []
+    for j, node in enumerate(joints):
+        extras = file.doc.nodes[node].extras
+        tips = extras.get("poise_ends") if isinstance(extras, dict) else None
+        for tip in tips if isinstance(tips, list) else []:
+            if isinstance(tip, list) and len(tip) == 3 and all(type(x) in (int, float) for x in tip):
+                x, y, z = (float(v) for v in tip)
+                if max(abs(x), abs(y), abs(z)) < 1e6:
+                    out.append((j, (x, y, z)))
+    return tuple(out)

@@ -1,0 +1,211 @@
+"""The animation of a glTF file: which one, its samplers, and all channels at one rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from poise.errors import PoiseError
+from poise.motion.io.gltf.accessor import index_of, read_accessor
+from poise.motion.io.gltf.file import GltfFile
+from poise.motion.io.gltf.tree import Tree
+from poise.motion.io.text import MAX_VALUE, listed, shown
+from poise.spatial import normalize, slerp
+
+_KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
+_MODES = ("LINEAR", "STEP", "CUBICSPLINE")
+
+
+@dataclass(frozen=True)
+class Track:
+    """One channel: key times `(K,)` s, and values `(K, n)`, or `(3K, n)` for CUBICSPLINE (in-tangent,
+    value, out-tangent). Quaternions are wxyz."""
+
+    times: np.ndarray
+    values: np.ndarray
+    mode: str
+
+    def keys(self) -> np.ndarray:
+        """`(K, n)` values at the keys."""
+        return self.values[1::3] if self.mode == "CUBICSPLINE" else self.values
+
+    def varies(self) -> bool:
+        """Whether the value differs between keys by more than float32 noise."""
+        keys = self.values
+        if self.mode == "CUBICSPLINE":
+            if np.abs(self.values[0::3]).max() + np.abs(self.values[2::3]).max() > 1e-6:
+                return True
+            keys = self.keys()
+        if keys.shape[1] == 4:
+            keys = keys * np.where((keys * keys[:1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+        return bool(np.ptp(keys, axis=0).max() > 1e-6 * max(1.0, float(np.abs(keys).max())))
+
+    def at(self, when: np.ndarray) -> np.ndarray:
+        """`(T, n)` values at sorted times, held before the first key and after the last."""
+        turn = self.values.shape[1] == 4
+        if len(self.times) == 1:
+            return np.tile(self.keys()[0], (len(when), 1))
+        i = np.clip(np.searchsorted(self.times, when, side="right") - 1, 0, len(self.times) - 2)
+        span = self.times[i + 1] - self.times[i]
+        u = np.clip((when - self.times[i]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+        if self.mode == "STEP":
+            # A time on the last key belongs to it.
+            return self.values[np.where(u >= 1.0, i + 1, i)]
+        if self.mode == "CUBICSPLINE":
+            return self._hermite(i, u[:, None], span[:, None], turn)
+        a, b = self.values[i], self.values[i + 1]
+        if turn:
+            return slerp(torch.tensor(a), torch.tensor(b), torch.tensor(u)).numpy()
+        return a + u[:, None] * (b - a)
+
+    def _hermite(self, i: np.ndarray, u: np.ndarray, span: np.ndarray, turn: bool) -> np.ndarray:
+        """glTF 2.0, appendix C: p(u) = (2u3-3u2+1) v0 + d(u3-2u2+u) b0 + (3u2-2u3) v1 + d(u3-u2) a1."""
+        v0, b0 = self.values[3 * i + 1], self.values[3 * i + 2]
+        a1, v1 = self.values[3 * (i + 1)], self.values[3 * (i + 1) + 1]
+        u2, u3 = u * u, u * u * u
+        out = (2 * u3 - 3 * u2 + 1) * v0 + span * (u3 - 2 * u2 + u) * b0
+        out = out + (3 * u2 - 2 * u3) * v1 + span * (u3 - u2) * a1
+        return normalize(torch.tensor(out)).numpy() if turn else out
+
+
+@dataclass(frozen=True)
+class Take:
+    """The chosen animation: `(node, path) -> Track`, its name, and Poise's own `extras`."""
+
+    name: str
+    tracks: dict[tuple[int, str], Track]
+    extras: dict[str, Any]
+
+    def nodes(self, *paths: str, varying: bool = False) -> set[int]:
+        """Nodes with a channel of one of `paths`."""
+        return {
+            n for (n, p), track in self.tracks.items() if p in paths and (not varying or track.varies())
+        }
+
+
+def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]) -> Take:
+    """The animation of that name or number (from 0), or else the longest that moves nodes."""
+    animations = file.doc.animations
+    names = [str(a.name or f"animation {i}") for i, a in enumerate(animations)]
+    numbered = [f"{i} {shown(name)}" for i, name in enumerate(names)]
+    if not animations:
+        raise PoiseError("the file holds no animation", file.path, "Export it with its animation")
+    if wanted is not None:
+        picked = [i for i, n in enumerate(names) if n == wanted] or [
+            i for i in range(len(names)) if str(i) == wanted
+        ]
+        if not picked:
+            raise PoiseError(
+                f"it has no animation {shown(wanted)}",
+                file.path,
+                f"Known, by number or name: {listed(numbered, 20)}",
+            )
+        return _take(file, tree, picked[0], names[picked[0]])
+    times: dict[int, np.ndarray] = {}
+    spans = [_span(file, tree, i, times) for i in range(len(names))]
+    best = int(np.argmax(spans))
+    if spans[best] < 0:
+        raise PoiseError("no animation of the file moves or turns a node", file.path)
+    if len(names) > 1:
+        others = listed((n for i, n in enumerate(numbered) if i != best), 6)
+        notes.append(
+            f"Of {len(names)} animations the longest, {numbered[best]} ({spans[best]:.2f} s), was "
+            f"taken; the others are {others}"
+        )
+    return _take(file, tree, best, names[best])
+
+
+def _channels(file: GltfFile, tree: Tree, index: int) -> Iterator[tuple[str, int, str, Any]]:
+    """What to call it, node, path and sampler of each channel that moves, turns or scales a node."""
+    animation = file.doc.animations[index]
+    for c, channel in enumerate(animation.channels or []):
+        what = f"channel {c} of animation {shown(str(animation.name or index))}"
+        target = channel.target
+        path = None if target is None else target.path
+        # Channels without a node belong to extensions; weights move no joint.
+        if target is None or target.node is None or not isinstance(path, str) or path not in _KINDS:
+            continue
+        node = index_of(target.node, tree.names, f"the target of {what}", file)
+        samplers = animation.samplers or []
+        yield what, node, path, samplers[index_of(channel.sampler, samplers, what, file)]
+
+
+def _span(file: GltfFile, tree: Tree, index: int, known: dict[int, np.ndarray]) -> float:
+    """Seconds from the first to the last key, -1 where the animation moves and turns nothing."""
+    first, last = np.inf, -1.0
+    for what, _, path, sampler in _channels(file, tree, index):
+        if path != "scale":
+            times = _key_times(file, sampler.input, what, known)
+            first, last = min(first, times[0]), max(last, times[-1])
+    return float(last - first) if last >= first else -1.0
+
+
+def _take(file: GltfFile, tree: Tree, index: int, name: str) -> Take:
+    tracks: dict[tuple[int, str], Track] = {}
+    known: dict[int, np.ndarray] = {}
+    for what, node, path, sampler in _channels(file, tree, index):
+        mode = sampler.interpolation or "LINEAR"
+        if mode not in _MODES:
+            raise PoiseError(f"{what} has the unknown interpolation {shown(str(mode))}", file.path)
+        times = _key_times(file, sampler.input, what, known)
+        values = read_accessor(file, sampler.output, _KINDS[path], f"the values of {what}")
+        _check_values(values, times, mode, path, tree.names[node], file)
+        if path == "rotation":
+            values = _wxyz(values, mode, times, tree.names[node], file)
+        if (node, path) in tracks:
+            raise PoiseError(f"{what} moves the {path} of node '{tree.names[node]}' again", file.path)
+        tracks[node, path] = Track(times, values, mode)
+    animation = file.doc.animations[index]
+    extras = animation.extras if isinstance(animation.extras, dict) else {}
+    own = extras.get("poise")
+    return Take(name, tracks, own if isinstance(own, dict) else {})
+
+
+def _key_times(file: GltfFile, index: object, what: str, known: dict[int, np.ndarray]) -> np.ndarray:
+    """`(K,)` s, read once per accessor."""
+    if type(index) is int and index in known:
+        return known[index]
+    times = read_accessor(file, index, "SCALAR", f"the times of {what}")[:, 0]
+    if not (np.abs(times) <= MAX_VALUE).all():
+        key = int(np.argmin(np.abs(times) <= MAX_VALUE))
+        raise PoiseError(f"{what} has no usable time at key {key}", file.path)
+    if (np.diff(times) < 0).any():
+        key = int(np.argmax(np.diff(times) < 0)) + 1
+        raise PoiseError(f"{what} goes back in time at key {key} ({times[key]:.4g} s)", file.path)
+    known[int(index)] = times  # type: ignore[call-overload]
+    return times
+
+
+def _check_values(
+    values: np.ndarray, times: np.ndarray, mode: str, path: str, name: str, file: GltfFile
+) -> None:
+    per_key = 3 if mode == "CUBICSPLINE" else 1
+    if len(values) != per_key * len(times):
+        raise PoiseError(
+            f"the {path} of node '{name}' has {len(values)} values for {len(times)} keys", file.path
+        )
+    bad = ~(np.abs(values) <= MAX_VALUE).all(-1)
+    if bad.any():
+        key = int(np.argmax(bad)) // per_key
+        raise PoiseError(
+            f"the {path} of joint '{name}' is no usable number at key {key} ({times[key]:.4g} s)",
+            file.path,
+        )
+
+
+def _wxyz(values: np.ndarray, mode: str, times: np.ndarray, name: str, file: GltfFile) -> np.ndarray:
+    """Quaternions from xyzw; keys (but not tangents) are brought to unit length."""
+    out = np.ascontiguousarray(values[:, [3, 0, 1, 2]])
+    keys = out[1::3] if mode == "CUBICSPLINE" else out
+    norm = np.linalg.norm(keys, axis=-1)
+    if norm.min() < 1e-3:
+        key = int(norm.argmin())
+        raise PoiseError(
+            f"the rotation of joint '{name}' has no length at key {key} ({times[key]:.4g} s)", file.path
+        )
+    keys /= norm[:, None]
+    return out

@@ -1,0 +1,254 @@
+"""The node tree of a glTF file: parents, local transforms, and which nodes are joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from poise.errors import PoiseError
+from poise.motion.io.gltf.accessor import index_of
+from poise.motion.io.gltf.file import GltfFile
+from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, shown
+from poise.spatial import matrix_to_quat
+
+MAX_DEPTH = 1000
+"""Deeper node trees are refused."""
+
+_SHEAR = 1e-3
+
+
+@dataclass(frozen=True)
+class Tree:
+    """All nodes of a file in its units: local transforms T R S of the rest pose.
+
+    names: `N` names as written, made up where there is none. parents: -1 for roots.
+    children: in file order. tops: the scene root above each node.
+    place `(N, 3)`, turn `(N, 4)` wxyz, scale `(N, 3)`. solid: nodes that carry a mesh or a camera.
+    """
+
+    names: list[str]
+    parents: list[int]
+    children: list[list[int]]
+    tops: list[int]
+    place: np.ndarray
+    turn: np.ndarray
+    scale: np.ndarray
+    solid: list[bool]
+
+    def line(self, node: int) -> list[int]:
+        """The node and its ancestors, from the root down."""
+        out = [node]
+        while self.parents[out[-1]] >= 0:
+            out.append(self.parents[out[-1]])
+        return out[::-1]
+
+    def below(self, node: int) -> list[int]:
+        """The node and everything below it, depth first in file order."""
+        out, stack = [], [node]
+        while stack:
+            out.append(stack.pop())
+            stack += reversed(self.children[out[-1]])
+        return out
+
+
+def read_tree(file: GltfFile) -> Tree:
+    """The node tree; cycles, nodes with two parents and unusable transforms are refused."""
+    nodes = file.doc.nodes
+    if not nodes:
+        raise PoiseError("the file has no nodes, so there is nothing that could move", file.path)
+    names = [_name(node.name, i, file) for i, node in enumerate(nodes)]
+    parents, children, tops = _links(file, names)
+    place, turn, scale = (np.zeros((len(nodes), 3)), np.zeros((len(nodes), 4)), np.ones((len(nodes), 3)))
+    turn[:, 0] = 1.0
+    for i, node in enumerate(nodes):
+        where = f"{file.path}, node '{names[i]}'"
+        if node.matrix is not None:
+            place[i], turn[i], scale[i] = _decomposed(_vector(node.matrix, 16, "matrix", where), where)
+            continue
+        if node.translation is not None:
+            place[i] = _vector(node.translation, 3, "translation", where)
+        if node.scale is not None:
+            scale[i] = _vector(node.scale, 3, "scale", where)
+        if node.rotation is not None:
+            x, y, z, w = _vector(node.rotation, 4, "rotation", where)
+            norm = np.linalg.norm((w, x, y, z))
+            if norm < 1e-3:
+                raise PoiseError("its rotation is a quaternion of no length", where)
+            turn[i] = np.array((w, x, y, z)) / norm
+    solid = [node.mesh is not None or node.camera is not None for node in nodes]
+    return Tree(names, parents, children, tops, place, turn, scale, solid)
+
+
+def _name(value: object, index: int, file: GltfFile) -> str:
+    if value is None or value == "":
+        return f"node_{index}"
+    if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
+        raise PoiseError(f"node {index} has the unusable name {shown(str(value))}", file.path)
+    return value
+
+
+def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]], list[int]]:
+    """Parents, children and the scene root of each node."""
+    nodes = file.doc.nodes
+    parents = [-1] * len(nodes)
+    children: list[list[int]] = []
+    for i, node in enumerate(nodes):
+        below = node.children or []
+        if not isinstance(below, list):
+            raise PoiseError(f"the children of node '{names[i]}' are no list", file.path)
+        children.append([])
+        for value in below:
+            child = index_of(value, nodes, f"a child of node '{names[i]}'", file)
+            if parents[child] >= 0:
+                raise PoiseError(f"node '{names[child]}' has two parents", file.path)
+            parents[child] = i
+            children[i].append(child)
+    # With one parent each, a node that no root reaches lies on a cycle or below one.
+    reached = [i for i, parent in enumerate(parents) if parent < 0]
+    tops, depth = list(range(len(nodes))), [0] * len(nodes)
+    for i in reached:
+        reached += children[i]
+        for child in children[i]:
+            tops[child], depth[child] = tops[i], depth[i] + 1
+    if len(reached) < len(nodes):
+        lost = next(iter(set(range(len(nodes))) - set(reached)))
+        raise PoiseError(f"the nodes around '{names[lost]}' form a cycle", file.path)
+    if max(depth) > MAX_DEPTH:
+        raise PoiseError(f"its nodes are nested {max(depth)} deep, more than any body's", file.path)
+    return parents, children, tops
+
+
+def _vector(value: object, size: int, what: str, where: str) -> np.ndarray:
+    if not isinstance(value, list) or len(value) != size:
+        raise PoiseError(f"its {what} must have {size} numbers", where)
+    if not all(type(x) in (int, float) and abs(x) <= MAX_VALUE for x in value):
+        raise PoiseError(f"its {what} holds something that is no usable number", where)
+    return np.array(value, dtype=np.float64)
+
+
+def _decomposed(m: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Translation, rotation and scale of a column-major 4x4 matrix."""
+    matrix = m.reshape(4, 4).T
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    if scale.min() < 1e-9:
+        raise PoiseError("its matrix flattens space", where)
+    turn = matrix[:3, :3] / scale
+    if np.linalg.det(turn) < 0:
+        raise PoiseError("its matrix mirrors space, which a body cannot do", where)
+    if np.abs(turn.T @ turn - np.eye(3)).max() > _SHEAR:
+        raise PoiseError("its matrix shears space", where, "Apply the transform before exporting")
+    return matrix[:3, 3], matrix_to_quat(torch.tensor(turn)).numpy(), scale
+
+
+def choose_joints(
+    tree: Tree, file: GltfFile, targeted: set[int], moving: set[int], notes: list[str]
+) -> list[int]:
+    """The nodes that become joints, parents first.
+
+    The joints of the skin that the animation moves (and of the skins that share joints with it);
+    without a skin, the animated nodes and what hangs on them. Nodes between joints and moving
+    nodes above them belong to the joints.
+
+    Args:
+        targeted: nodes with translation or rotation channels. moving: those whose channels vary.
+    """
+    skin = _skin_joints(tree, file, targeted)
+    wanted = set(skin) if skin else _biggest_tree(tree, targeted, notes)
+    _check_count(len(wanted), file)
+    for node in list(wanted):
+        above = tree.line(node)[:-1]
+        first = next((a for a in above if a in moving), None)
+        if first is not None:
+            wanted.add(first)
+    wanted = _one_tree(tree, wanted, notes)
+    lines = [tree.line(node) for node in wanted]
+    depth = _shared_depth(lines)
+    joints = {node for line in lines for node in line[depth - 1 :]}
+    root = lines[0][depth - 1]
+    if not skin:
+        joints |= _hanging_on(tree, joints)
+    _check_count(len(joints), file)
+    order = [j for j in skin if j in joints]
+    if len(order) == len(joints) and _parents_first(tree, order, root):
+        return order
+    return [node for node in tree.below(root) if node in joints]
+
+
+def _check_count(count: int, file: GltfFile) -> None:
+    if count > MAX_JOINTS:
+        raise PoiseError(f"it has {count} joints, more than the {MAX_JOINTS} allowed", file.path)
+
+
+def _skin_joints(tree: Tree, file: GltfFile, targeted: set[int]) -> list[int]:
+    """The joints of the most animated skin, then those of the skins that share joints with it."""
+    skins: list[list[int]] = []
+    for i, skin in enumerate(file.doc.skins):
+        if not isinstance(skin.joints, list):
+            raise PoiseError(f"the joints of skin {i} are no list", file.path)
+        skins.append([index_of(j, tree.names, f"a joint of skin {i}", file) for j in skin.joints])
+    if not skins:
+        return []
+    out = max(skins, key=lambda joints: (len(targeted & set(joints)), len(joints)))
+    if not targeted & set(out):
+        return []
+    out, known = list(dict.fromkeys(out)), set(out)
+    for joints in skins:
+        if known & set(joints):
+            out += [j for j in dict.fromkeys(joints) if j not in known]
+            known |= set(joints)
+    return out
+
+
+def _biggest_tree(tree: Tree, targeted: set[int], notes: list[str]) -> set[int]:
+    """The targeted nodes under the scene root that has most of them (cameras have their own)."""
+    groups: dict[int, set[int]] = {}
+    for node in targeted:
+        groups.setdefault(tree.tops[node], set()).add(node)
+    best = max(groups.values(), key=len)
+    others = sorted(tree.names[n] for n in targeted - best)
+    if others:
+        notes.append(
+            f"{len(others)} animated nodes outside the figure were left out, such as '{others[0]}'"
+        )
+    return best
+
+
+def _one_tree(tree: Tree, wanted: set[int], notes: list[str]) -> set[int]:
+    """The wanted nodes under the scene root that has most of them."""
+    groups: dict[int, set[int]] = {}
+    for node in wanted:
+        groups.setdefault(tree.tops[node], set()).add(node)
+    best = max(groups.values(), key=len)
+    if len(groups) > 1:
+        notes.append(f"{len(wanted) - len(best)} joints that hang on no common node were left out")
+    return best
+
+
+def _shared_depth(lines: Sequence[list[int]]) -> int:
+    """How many nodes, from the scene's root down, all lines share."""
+    depth = 0
+    for level in zip(*lines, strict=False):
+        if len(set(level)) > 1:
+            break
+        depth += 1
+    return depth
+
+
+def _hanging_on(tree: Tree, joints: Iterable[int]) -> set[int]:
+    """What hangs on the joints, down to nodes that carry a mesh or a camera."""
+    out: set[int] = set()
+    stack = [child for joint in joints for child in tree.children[joint]]
+    while stack:
+        node = stack.pop()
+        if node not in out and not tree.solid[node]:
+            out.add(node)
+            stack += tree.children[node]
+    return out
+
+
+def _parents_first(tree: Tree, order: Sequence[int], root: int) -> bool:
+    place = {node: i for i, node in enumerate(order)}
+    return all(n == root or place.get(tree.parents[n], len(order)) < i for i, n in enumerate(order))

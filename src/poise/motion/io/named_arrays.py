@@ -1,0 +1,113 @@
+"""NumPy archives and pickles: what they hold decides who reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.motion.io.angles import is_opensim, read_loco
+from poise.motion.io.numpy import (
+    is_amass_clip,
+    is_poselib,
+    is_smpl,
+    read_poselib,
+    read_smpl,
+    write_amass,
+)
+from poise.motion.io.numpy.arrays import NPY_MAGIC, Archive, first_member, npy_header
+from poise.motion.io.numpy.pickles import ASK, load_restricted
+from poise.motion.io.own import read_poise_npz, write_poise_npz
+from poise.motion.io.own.npz import MARK
+from poise.motion.io.points import is_mdm, is_points, read_mdm, read_points_arrays
+from poise.motion.io.raw import Options
+from poise.motion.io.text import listed, shown
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Named arrays that are a motion: what they are called, how they are known, who reads them."""
+
+    name: str
+    holds: Callable[[Mapping[str, Any]], bool]
+    read: Callable[[Mapping[str, Any], Path, Options], Clip]
+
+
+def _is_qpos(data: Mapping[str, Any]) -> bool:
+    return any(k in data for k in ("qpos", "dof_pos", "joint_pos", "dof"))
+
+
+def _refuse_qpos(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+    raise PoiseError(
+        "it holds the joint angles of a robot (qpos), which mean nothing without the robot's model",
+        path,
+        "Give the human motion it was made from",
+    )
+
+
+KINDS: tuple[Kind, ...] = (
+    Kind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
+    Kind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
+    Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
+    Kind("keypoints (positions, names, fps)", is_points, read_points_arrays),
+    Kind("results of the motion diffusion model (motion, lengths)", is_mdm, read_mdm),
+    Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
+    Kind("a robot's joint angles", _is_qpos, _refuse_qpos),
+)
+"""Named arrays that are known, whether they come from `.npz`, `.npy` or `.pkl`; first match reads."""
+
+
+def looks_like_npz(head: bytes) -> bool:
+    """Whether a file's first bytes are those of a zip that begins with an array."""
+    return first_member(head).endswith(b".npy")
+
+
+def looks_like_pickle(head: bytes) -> bool:
+    """Whether a file's first bytes are those of a pickle (protocol 2 or later) or of a `.npy`."""
+    return head.startswith(NPY_MAGIC) or (head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05")
+
+
+def read_npz(path: Path, options: Options) -> Clip:
+    """The clip in a `.npz`, by the names of its arrays."""
+    return _read(Archive(path, options.allow_pickle), path, options)
+
+
+def read_pickled(path: Path, options: Options) -> Clip:
+    """The clip in a `.pkl` or `.npy` of pickled arrays, which must be asked for."""
+    with path.open("rb") as file:
+        if file.read(len(NPY_MAGIC)) == NPY_MAGIC:
+            file.seek(0)
+            header = npy_header(file, path)
+            if not header.dtype.hasobject:
+                raise PoiseError(
+                    f"it holds one array of shape {header.shape} without joint names or a frame rate",
+                    path,
+                    "Save it as npz with named arrays",
+                )
+    if not options.allow_pickle:
+        raise PoiseError("this is a pickled file", path, ASK)
+    return _read(load_restricted(path), path, options)
+
+
+def _read(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+    for kind in KINDS:
+        if kind.holds(data):
+            return kind.read(data, path, options)
+    there = listed(shown(k) for k in data) if len(data) else "none at all"
+    known = "; ".join(kind.name for kind in KINDS[:-1])
+    raise PoiseError(f"its arrays are no motion that is known ({there})", path, f"Known: {known}")
+
+
+def write_npz(clip: Clip, path: Path) -> None:
+    """Writes npz: with the keys of AMASS what came from the SMPL family, else Poise's own.
+
+    `.poise.npz` and `.amass.npz` decide it; see `write_poise_npz` and `write_amass`.
+    """
+    inner = Path(path.stem).suffix.lower()
+    if inner == ".amass" or (inner != ".poise" and is_amass_clip(clip)):
+        write_amass(clip, path)
+    else:
+        write_poise_npz(clip, path)

@@ -1,0 +1,273 @@
+"""Clips of the SMPL family: AMASS npz and its relatives, AIST++, without any model file.
+
+A pose is one axis-angle vector per joint on a body that stands in a T-pose along Y, facing Z; the
+root's rotation takes that body into the world. The pelvis stands at `trans` plus its place in the
+model's frame. What a file lacks, bone lengths above all, is a stated default (`smpl_table`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.motion.info import sampled
+from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
+from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
+from poise.motion.io.raw import (
+    Options,
+    RawMotion,
+    assemble,
+    vectors_from_z_up,
+)
+from poise.motion.io.text import listed
+from poise.motion.skeleton import Channel
+from poise.spatial import forward_kinematics, quat_mul, rotvec_to_quat
+
+_POSES = ("poses", "smpl_poses", "pose_aa", "fullpose")
+_ROOT = ("root_orient", "global_orient")
+_BODY = ("pose_body", "body_pose")
+_TRANS = ("trans", "smpl_trans", "transl")
+_RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "framerate", "fps")
+_JOINTS = ("rest_joints", "J", "joints")
+_UNUSED = ("dmpls", "expression", "pose_est_dmpls")
+_AIST_FPS = 60.0
+Z_TO_Y_UP = (2**-0.5, -(2**-0.5), 0.0, 0.0)
+"""wxyz, the turn of the world from Z up to Y up: -90 degrees about X."""
+
+
+def is_smpl(keys: Mapping[str, Any] | Sequence[str]) -> bool:
+    """Whether arrays of these names are a motion of the SMPL family."""
+    return _first(keys, _POSES) is not None or (
+        _first(keys, _ROOT) is not None and _first(keys, _BODY) is not None
+    )
+
+
+def read_smpl(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+    """A clip from named arrays: `poses (T, 66|72|156|165)` rad (or its parts), `trans (T, 3)` m,
+    `betas`, `gender`, `mocap_framerate`.
+
+    22, 24, 52 or 55 joints, whatever the file turns, fingers and face included. Rest joints come
+    from the file (`rest_joints`, `J` or `joints`, `(J, 3)` m) or from the stated default body.
+
+    Raises:
+        PoiseError: arrays that are missing, of the wrong shape or not finite.
+    """
+    poses, layout = _poses(data, path)
+    scale, world_unit = _scale(data, path, options)
+    trans = numeric(data, _needed(data, _TRANS, path), (None, 3), path)
+    if len(trans) != len(poses):
+        raise PoiseError(f"it has {len(poses)} poses but {len(trans)} translations", path)
+    refuse_bad(poses, "the rotation", path, layout.names)
+    refuse_bad(trans, "the translation", path)
+    notes: list[str] = []
+    pelvis, offsets = _rest(data, path, layout, notes)
+    root_pos = trans / scale * world_unit + pelvis
+    quat = rotvec_to_quat(torch.tensor(poses))
+    up, up_note = _up(data, options, layout, root_pos, quat)
+    notes += [*up_note, *_told(data)]
+    if up == "Z":
+        quat[:, 0] = quat_mul(torch.tensor(Z_TO_Y_UP, dtype=torch.float64), quat[:, 0])
+        root_pos = vectors_from_z_up(root_pos, "Y")
+    fps = options.fps or _fps(data, path, notes)
+    raw = RawMotion(
+        format="smpl",
+        path=path,
+        names=layout.names,
+        parents=layout.parents,
+        offsets=offsets,
+        ends=layout.tips,
+        root_pos=root_pos,
+        rot=quat.numpy(),
+        fps=fps,
+        channels=(Channel(order=("axis-angle",)),) * len(layout.names),
+        unit_m=1.0,
+        up_axis="Y",
+        notes=tuple(notes),
+        extra=_extra(data, layout, pelvis, up),
+    )
+    clip = assemble(raw, Options(fps=options.fps))
+    source = {"up_axis": up, "unit_m": world_unit / scale}
+    return clip.replaced(skeleton=clip.skeleton.with_source(**source))
+
+
+def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str | None:
+    return next((n for n in names if n in keys), None)
+
+
+def _needed(data: Mapping[str, Any], names: Sequence[str], path: Path) -> str:
+    found = _first(data, names)
+    if found is None:
+        require(data, names[:1], path, "this motion of the SMPL family")
+    return str(found)
+
+
+def _poses(data: Mapping[str, Any], path: Path) -> tuple[np.ndarray, Layout]:
+    """`(T, J, 3)` axis-angle vectors in rad, and the layout with that many joints."""
+    key = _first(data, _POSES)
+    if key is not None:
+        found = np.asarray(data[key])
+        shape = (None, None, 3) if found.ndim == 3 else (None, None)
+        poses = numeric({key: found}, key, shape, path)
+        poses = _flat(poses)
+        what = f"array '{key}'"
+    else:
+        poses, what = _parts(data, path), "root_orient, pose_body and the rest together"
+    layout = layout_of_width(poses.shape[1])
+    if layout is None:
+        known = listed(f"{x.width} ({x.name})" for x in LAYOUTS)
+        raise PoiseError(
+            f"{what} has {poses.shape[1]} numbers a frame, which is no layout of SMPL", path,
+            f"Known: {known}",
+        )  # fmt: skip
+    return poses.reshape(len(poses), len(layout.names), 3), layout
+
+
+def _flat(value: np.ndarray) -> np.ndarray:
+    """One row per frame, even where there are no frames."""
+    return value.reshape(len(value), math.prod(value.shape[1:])) if value.ndim > 1 else value
+
+
+def _parts(data: Mapping[str, Any], path: Path) -> np.ndarray:
+    """`(T, D)` the poses put together from the parts that some tools keep apart."""
+
+    def part(*names: str) -> np.ndarray | None:
+        key = _first(data, names)
+        if key is None:
+            return None
+        value = np.asarray(data[key])
+        return numeric({key: _flat(value)}, key, (None, None), path)
+
+    body = [part(*_ROOT), part(*_BODY)]
+    left, right = part("left_hand_pose"), part("right_hand_pose")
+    hands = part("pose_hand", "hand_pose")
+    if hands is None and left is not None and right is not None:
+        hands = np.concatenate((left, right), 1) if len(left) == len(right) else left
+    jaw, eyes = part("pose_jaw", "jaw_pose"), part("pose_eye")
+    frames = len(body[0]) if body[0] is not None else 0
+    if jaw is not None or eyes is not None:
+        body += [jaw if jaw is not None else np.zeros((frames, 3))]
+        body += [eyes if eyes is not None else np.zeros((frames, 6))]
+        hands = hands if hands is not None else np.zeros((frames, 90))
+    found = [b for b in (*body, hands) if b is not None]
+    if any(len(b) != frames for b in found):
+        raise PoiseError(f"its poses have different lengths: {listed(len(b) for b in found)}", path)
+    return np.concatenate(found, 1)
+
+
+def _scale(data: Mapping[str, Any], path: Path, options: Options) -> tuple[float, float]:
+    """What `trans` is divided by (AIST++ `smpl_scaling`), and metres per its unit."""
+    scale = 1.0
+    if "smpl_scaling" in data:
+        scale = one_number(data, "smpl_scaling", path)
+        if not scale > 0:
+            raise PoiseError(f"smpl_scaling is {scale:g}, which must be above 0", path)
+    return scale, options.unit_m or 1.0
+
+
+def _rest(
+    data: Mapping[str, Any], path: Path, layout: Layout, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pelvis in the model's frame `(3,)` and the offsets `(J, 3)`, m, Y up."""
+    count = len(layout.names)
+    for key in _JOINTS:
+        if key not in data:
+            continue
+        joints = np.asarray(data[key])
+        joints = joints[0] if joints.ndim == 3 and len(joints) == 1 else joints
+        if joints.ndim != 2 or joints.shape[1:] != (3,) or len(joints) < count:
+            continue
+        joints = numeric({key: joints}, key, (None, 3), path)[:count]
+        refuse_bad(joints[None], f"array '{key}': the rest place", path, layout.names)
+        parents = np.maximum(layout.parents, 0)
+        notes.append(f"Bone lengths come from the file's array '{key}'")
+        return joints[0], np.where(np.arange(count)[:, None] > 0, joints - joints[parents], 0.0)
+    notes.append(
+        "The file states no bone lengths: those of Poise's default body of 1.72 m in SMPL's T-pose "
+        "were taken"
+    )
+    return np.array(PELVIS), layout.offsets
+
+
+def _up(
+    data: Mapping[str, Any],
+    options: Options,
+    layout: Layout,
+    root_pos: np.ndarray,
+    quat: torch.Tensor,
+) -> tuple[str, list[str]]:
+    """The world's vertical: stated, else Z as in AMASS (Y in AIST++) unless the body says otherwise."""
+    if options.up_axis is not None:
+        return options.up_axis.upper(), []
+    stated = text_of(data["up_axis"]).upper() if "up_axis" in data else ""
+    if stated in ("Y", "Z"):
+        return stated, []
+    if "smpl_poses" in data:
+        return "Y", ["Y up and metres after division by smpl_scaling, as AIST++ has it"]
+    if not len(root_pos):
+        return "Z", []
+    at = sampled(len(root_pos))
+    pos, _ = forward_kinematics(
+        layout.parents, torch.tensor(layout.offsets), torch.tensor(root_pos[at]), quat[at]
+    )
+    ankles = [layout.names.index(f"{side}_ankle") for side in ("left", "right")]
+    way = pos[:, layout.names.index("head")] - pos[:, ankles].mean(1)
+    lean = (way / way.norm(dim=-1, keepdim=True)).mean(0).numpy()
+    if abs(lean[1]) > 0.7 and abs(lean[2]) < 0.4:
+        head_down = "" if lean[1] > 0 else " with the head down (are these a camera's axes?)"
+        return "Y", [f"The file states no vertical: Y taken, since the body stands along it{head_down}"]
+    return "Z", ["The file states no vertical: Z taken, as AMASS has it"]
+
+
+def _fps(data: Mapping[str, Any], path: Path, notes: list[str]) -> float:
+    key = _first(data, _RATES)
+    if key is not None:
+        rate = one_number(data, key, path)
+        if not 0 < rate <= 1e5:
+            raise PoiseError(f"{key} is {rate:g}, which is no frame rate", path, "State it with --fps F")
+        return rate
+    if "smpl_poses" in data:
+        notes.append("The file states no frame rate: 60 frames per second taken, as AIST++ has it")
+        return _AIST_FPS
+    raise PoiseError(
+        f"the file states no frame rate (none of {listed(_RATES)})", path, "State it with --fps F"
+    )
+
+
+def _told(data: Mapping[str, Any]) -> list[str]:
+    """Sentences about what is in the file and changes nothing here."""
+    notes = []
+    if "betas" in data:
+        notes.append("The body shape (betas) is kept for writing back, but changes no bone length here")
+    unused = [k for k in _UNUSED if k in data]
+    if unused:
+        notes.append(f"Arrays that turn no joint were left out: {listed(unused)}")
+    return notes
+
+
+def _extra(
+    data: Mapping[str, Any], layout: Layout, pelvis: np.ndarray, up: str
+) -> tuple[tuple[str, str], ...]:
+    """What writing back needs besides the clip itself."""
+    betas = np.asarray(data["betas"]) if "betas" in data else np.zeros(16)
+    if betas.dtype.kind not in "fiu" or not betas.size or not np.isfinite(betas).all():
+        betas = np.zeros(16)
+    betas = betas.reshape(-1, betas.shape[-1] if betas.ndim else 1)[0][:400]
+    gender = text_of(data["gender"], "neutral") if "gender" in data else "neutral"
+    return (
+        ("layout", layout.name),
+        ("gender", gender[:20]),
+        ("betas", _row(betas)),
+        ("pelvis", _row(pelvis)),
+        ("up", up),
+    )
+
+
+def _row(values: np.ndarray) -> str:
+    return " ".join(repr(float(v)) for v in values)

@@ -1,0 +1,112 @@
+"""Keypoints in NumPy arrays: Poise's keypoint npz, and the results of the motion diffusion model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.motion.clip import Clip
+from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
+from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
+from poise.motion.io.raw import Options
+from poise.motion.io.text import MAX_JOINTS, shown
+
+HUMANML3D = (
+    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
+    *("right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head"),
+    *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+)
+"""The 22 joints of HumanML3D (Guo et al. 2022), in the order of its arrays."""
+_HUMANML3D_FPS = 20.0
+
+
+def is_points(data: Mapping[str, Any]) -> bool:
+    """Whether named arrays are keypoints: `positions` and `names`, and no rotations."""
+    return "positions" in data and "names" in data and not {"rot", "rotations", "quats"} & set(data)
+
+
+def read_points_arrays(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+    """Keypoint arrays as the clip of a skeleton that is fitted to them."""
+    return points_clip(array_points(data, path, options), options)
+
+
+def array_points(data: Mapping[str, Any], path: Path, options: Options | None = None) -> RawPoints:
+    """`positions (T, K, 3)` (NaN where missing), `names (K)`, `fps`; optional `confidence (T, K)`,
+    `unit_m` and `up_axis`.
+
+    Raises:
+        PoiseError: an array that lacks or has another shape; no frame rate; 2D positions.
+    """
+    require(data, ("positions", "names"), path, "a keypoint file")
+    positions = np.asarray(data["positions"])
+    if positions.ndim == 3 and positions.shape[-1] == 2:
+        raise PoiseError(f"its positions have the shape {positions.shape}: they are 2D", path, FLAT_HINT)
+    positions = numeric(data, "positions", (None, None, 3), path)
+    names = tuple(text_of(x).strip() for x in np.ravel(np.asarray(data["names"])))
+    if len(names) != positions.shape[1] or not all(names) or len(names) > MAX_JOINTS:
+        raise PoiseError(
+            f"it has {len(names)} names and {positions.shape[1]} keypoints; each needs a name", path
+        )
+    fps = None if options is None else options.fps
+    if fps is None:
+        if "fps" not in data:
+            raise PoiseError("the arrays state no frame rate", path, "Add fps, or give --fps F")
+        fps = one_number(data, "fps", path)
+        if not fps > 0:
+            raise PoiseError(f"fps must be above 0, got {fps:g}", path)
+    unit = one_number(data, "unit_m", path) if "unit_m" in data else None
+    up = text_of(data["up_axis"]).upper() if "up_axis" in data else None
+    if unit is not None and not unit > 0:
+        raise PoiseError(f"unit_m must be above 0, got {unit:g}", path)
+    if up not in (None, "Y", "Z"):
+        raise PoiseError(f"up_axis must be Y or Z, got {shown(up or '')}", path)
+    scores = numeric(data, "confidence", positions.shape[:2], path) if "confidence" in data else None
+    return RawPoints("keypoints-npz", path, names, positions, fps, unit, up, scores)
+
+
+def is_mdm(data: Mapping[str, Any]) -> bool:
+    """Whether named arrays are the results of a motion diffusion model (Tevet et al. 2023)."""
+    return "motion" in data and "lengths" in data
+
+
+def read_mdm(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+    """One motion in the results of a motion diffusion model: the first, or number `options.take`."""
+    take = options.take or "0"
+    if not take.isdecimal():
+        raise PoiseError(f"--take must be the number of a motion, got {shown(take)}", path)
+    return points_clip(mdm_points(data, path, int(take)), options)
+
+
+def mdm_points(data: Mapping[str, Any], path: Path, index: int = 0) -> RawPoints:
+    """One of the motions `motion (N, 22, 3, T)`: HumanML3D's joints, metres, Y up, 20 frames per second.
+
+    `lengths (N)` tells how many of the T frames are the motion's own.
+    """
+    motion = numeric(data, "motion", (None, len(HUMANML3D), 3, None), path)
+    lengths = numeric(data, "lengths", (len(motion),), path)
+    if not 0 <= index < len(motion):
+        raise PoiseError(f"it holds {len(motion)} motions, there is none with index {index}", path)
+    length = lengths[index]
+    if not 1 <= length <= motion.shape[-1]:
+        raise PoiseError(f"motion {index} states {length:g} of {motion.shape[-1]} frames", path)
+    notes = []
+    if len(motion) > 1:
+        notes.append(f"The file holds {len(motion)} motions: number {index} was read (--take N)")
+    if "text" in data:
+        texts = np.ravel(np.asarray(data["text"]))
+        if index < len(texts) and text_of(texts[index]):
+            notes.append(f"It was generated for {shown(text_of(texts[index]))}")
+    return RawPoints(
+        "mdm",
+        path,
+        HUMANML3D,
+        motion[index, :, :, : int(length)].transpose(2, 0, 1),
+        _HUMANML3D_FPS,
+        1.0,
+        "Y",
+        notes=tuple(notes),
+    )

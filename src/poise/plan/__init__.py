@@ -1,0 +1,22 @@
+"""Planning over an environment: experts, trajectory optimisation, sampling-based control."""
+
+from poise.plan.expert import Expert, ExpertConfig, Plan, make_plan
+from poise.plan.lqr_teacher import LqrTeacher
+from poise.plan.sampling import SamplingConfig, SamplingControl, SamplingResult
+from poise.plan.trajopt import TrajectoryOptimizer
+from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
+
+__all__ = [
+    "Expert",
+    "ExpertConfig",
+    "LqrTeacher",
+    "Plan",
+    "SamplingConfig",
+    "SamplingControl",
+    "SamplingResult",
+    "TrajOptConfig",
+    "TrajOptStats",
+    "Trajectories",
+    "TrajectoryOptimizer",
+    "make_plan",
+]

@@ -1,0 +1,231 @@
+"""A motion that a policy loses is looked for: many characters try, and those that come near it go on.
+
+Sampling-based control (SAMCON, Liu et al. 2010) with a trained policy in place of the open-loop
+trajectory: each character acts as the policy plus an offset, held for some steps; then the best of them
+are kept and stand where all begin the next try. What is found is one simulation from the first frame to
+the last, without help, and the actions that repeat it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from poise.env.env import ImitationEnv
+from poise.env.recovery.controller import LOST
+from poise.env.task import Acts
+from poise.errors import PoiseError
+from poise.metrics import mpjpe_global
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """How a motion is looked for.
+
+    characters: that try at once. brood: tries from each state that is kept, of which the first is the
+    policy's own. hold: control steps that an offset lasts. least, most: rad, between which the
+    deviations of a character's offsets are drawn, evenly in their logarithm. memory: what earlier
+    errors weigh, from one choice to the next. distance: what 1 m of mean distance costs beside the
+    imitation reward, where there is no estimate of what is to come. retries: how often it is
+    looked for anew where nobody comes through, each time from farther back by `hold * back` steps.
+    rounds: how often the whole motion is looked for, each time about what was found before, with half
+    the deviations.
+    """
+
+    characters: int = 512
+    samples_per_state: int = 4
+    hold: int = 4
+    least: float = 0.03
+    most: float = 0.3
+    memory: float = 0.7
+    distance: float = 2.0
+    rounds: int = 1
+    retries: int = 8
+    back: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.samples_per_state < 2 or self.characters < 2 * self.samples_per_state:
+            what = f"got {self.characters} characters, {self.samples_per_state} from each state"
+            raise PoiseError(what, "SamplingConfig", "Take 8 or more, 2 or more from each")
+        counts, spread = (self.hold, self.rounds, self.back), 0 < self.least <= self.most
+        if min(counts) < 1 or self.retries < 0 or not spread:
+            what = "hold, rounds, back, least and most must be positive, and least the smaller one"
+            raise PoiseError(what, "SamplingConfig")
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingResult:
+    """What a search came to.
+
+    actions: `(T, A)`, which repeat it from the first frame. reached: how many of those there were before
+    the motion was lost; all where it was not. error_mm: mean distance of the bodies up to there. tries:
+    control steps that all characters made.
+    """
+
+    actions: Tensor
+    reached: int
+    error_mm: float
+    tries: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether the motion was found to its end."""
+        return self.reached == len(self.actions)
+
+
+@dataclass(eq=False)
+class _Kept:
+    """The states that were kept before a choice of offsets: of the worlds, with what led there."""
+
+    sim: Tensor
+    obs: Tensor
+    cost: Tensor
+    error: Tensor
+
+
+@dataclass(eq=False)
+class _Choice:
+    """What led from some kept states to the next: actions, what they are more than the policy's,
+    `(k, K, A)`, and parents `(K,)`."""
+
+    actions: Tensor
+    offsets: Tensor
+    parent: Tensor
+
+
+class SamplingControl:
+    """Looks for a motion along one clip of an environment's reference.
+
+    Args:
+        env: without automatic restarts and guard, with the rewards of the task; its `num_envs` worlds
+            are the characters.
+        policy: acts on its observations. value: of observations `(N, O)` what the policy is still to
+            earn, `(N,)`; None goes by rewards and distances so far. clip: its index.
+    """
+
+    def __init__(
+        self,
+        env: ImitationEnv,
+        policy: Acts,
+        config: SamplingConfig | None = None,
+        value: Callable[[Tensor], Tensor] | None = None,
+        clip: int = 0,
+    ):
+        self.env, self.policy, self.value = env, policy, value
+        self.config = config or SamplingConfig(characters=env.num_envs)
+        self.rng = torch.Generator().manual_seed(self.config.seed)
+        self.clip, self.last = clip, int(env.reference.length[clip]) - 1
+        self.states = env.num_envs // self.config.samples_per_state
+        self.tries, self.scale = 0, 1.0
+        self.offsets = torch.zeros(self.last, env.num_actions)
+
+    def run(self, show: Callable[[int, int], None] | None = None) -> SamplingResult:
+        """Searches from the first frame to the last. show: is told of steps done and all steps."""
+        rounds, best = self.config.rounds, None
+        for k in range(rounds):
+            told = show and (lambda done, steps, k=k: show(k * steps + done, rounds * steps))
+            found = self._round(told)
+            if best is None or (found.whole and found.error_mm < best.error_mm):
+                best = found
+            if not found.whole:
+                break
+            self.scale /= 2.0
+        assert best is not None
+        return replace(best, tries=self.tries)
+
+    def _round(self, show: Callable[[int, int], None] | None) -> SamplingResult:
+        c, clip = self.config, torch.full((self.env.num_envs,), self.clip)
+        obs = self.env.reset_to(clip, torch.zeros_like(clip))
+        now = self._first(obs)
+        before: deque[_Kept] = deque(maxlen=c.retries * c.back + 1)
+        path: list[_Choice] = []
+        came: tuple[int, list[_Choice], _Kept] = (0, [], now)
+        wall, failures = 0, 0
+        while (done := sum(len(x.actions) for x in path)) < self.last:
+            if show is not None:
+                show(done, self.last)
+            before.append(now)
+            choice, after = self._extend(now, done)
+            if after is not None:
+                path.append(choice)
+                now = after
+                continue
+            # Nobody came through: from farther back each time, unless it is another place.
+            if done > wall + c.hold * c.back:
+                failures = 0
+            wall, failures = max(wall, done), failures + 1
+            came = max(came, (done, list(path), now), key=lambda x: x[0])
+            if failures > c.retries:
+                done, path, now = came
+                return self._result(path, now, done)
+            for _ in range(min(failures * c.back, len(before) - 1)):
+                before.pop()
+                path.pop()
+            now = before.pop()
+        return self._result(path, now, self.last)
+
+    def _first(self, obs: Tensor) -> _Kept:
+        nothing = torch.zeros(self.states)
+        return _Kept(
+            self.env.backend.snapshot()[: self.states], obs[: self.states].clone(), nothing, nothing
+        )
+
+    def _extend(self, now: _Kept, done: int) -> tuple[_Choice, _Kept | None]:
+        """One choice of offsets, tried by all characters; None where all lose the motion."""
+        c, env, n = self.config, self.env, self.env.num_envs
+        parent = torch.arange(n) % self.states
+        env.backend.restore(now.sim[parent])
+        if int(env.frame[0]) != done:
+            env.set_goal(env.reference, env.clip, torch.full_like(env.frame, done))
+        obs, cost, error = now.obs[parent], c.memory * now.cost[parent], now.error[parent].clone()
+        drawn, lost = self._drawn(n), torch.zeros(n, dtype=torch.bool)
+        made: list[Tensor] = []
+        given: list[Tensor] = []
+        for step in range(done, min(done + c.hold, self.last)):
+            given.append(self.offsets[step] + drawn)
+            made.append(self.policy.act(obs) + given[-1])
+            obs = env.step(made[-1]).final_obs
+            ref = env.reference.gather(env.clip, env.frame).pos
+            off = mpjpe_global(env.pose().pos, ref) / 1000.0
+            lost |= ~(off <= LOST)
+            cost, error = cost - env.imitation, error + off
+            if self.value is None:
+                cost = cost + c.distance * off
+        self.tries += n * len(made)
+        ahead = cost if self.value is None else cost - self.value(obs)
+        ahead = torch.where(lost | ~ahead.isfinite(), torch.inf, ahead)
+        best = ahead.argsort(stable=True)[: self.states]
+        alive = best[ahead[best].isfinite()]
+        if not len(alive):
+            return _Choice(torch.stack(made), torch.stack(given), parent), None
+        # Where fewer came through than are kept, they have more tries.
+        best = alive[torch.arange(self.states) % len(alive)]
+        actions, offsets = (torch.stack([a[best] for a in x]) for x in (made, given))
+        choice = _Choice(actions, offsets, parent[best])
+        kept = _Kept(env.backend.snapshot()[best], obs[best], cost[best], error[best])
+        return choice, kept
+
+    def _drawn(self, count: int) -> Tensor:
+        """`(N, A)` rad; none for the first try from each state."""
+        c = self.config
+        spread = torch.rand(count, 1, generator=self.rng)
+        size = c.least * (c.most / c.least) ** spread
+        size[: self.states] = 0.0
+        out = self.scale * size * torch.randn(count, self.env.num_actions, generator=self.rng)
+        out[:, self.env.hinges :] = 0.0
+        return out
+
+    def _result(self, path: list[_Choice], now: _Kept, reached: int) -> SamplingResult:
+        """The actions that led to the best of those that came farthest; beyond, none is known."""
+        at = int(now.error.argmin())
+        error, actions, end = float(now.error[at]), torch.zeros_like(self.offsets), reached
+        for choice in reversed(path):
+            begin = end - len(choice.actions)
+            actions[begin:end], self.offsets[begin:end] = choice.actions[:, at], choice.offsets[:, at]
+            at, end = int(choice.parent[at]), begin
+        return SamplingResult(actions, reached, 1000.0 * error / max(1, reached), self.tries)

@@ -1,7 +1,0 @@
-"""A folder of motion files as one library on one humanoid: read, cleaned, cut, retargeted."""
-
-from poise.recipes.library.clips import LibraryConfig
-from poise.recipes.library.folder import Split, library_of, split
-from poise.recipes.library.report import ClipNote, LibraryReport
-
-__all__ = ["ClipNote", "LibraryConfig", "LibraryReport", "Split", "library_of", "split"]

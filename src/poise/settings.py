@@ -1,0 +1,172 @@
+"""Settings as data: a frozen dataclass to JSON or TOML and back, every value checked.
+
+    data = to_data(config)                      # for a checkpoint's JSON
+    config = from_data(ResidualForce, data)     # or one sentence that names the setting
+    text = to_toml(config); config = from_toml(ResidualForce, path)
+
+A setting that was renamed since a run was made is found by `Migration`, so that old runs open for ever.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from poise.errors import PoiseError, did_you_mean
+
+T = TypeVar("T")
+#: How TOML, which has no null, says that a part is left out.
+NONE = "none"
+
+
+@dataclass(frozen=True)
+class Migration:
+    """What settings of earlier versions are called now.
+
+    keys: dotted names of then to dotted names of now; a value moves with its key. values: by the new
+    dotted name, what a value of then is called now. absent: what a run did that does not name a setting,
+    where that is not today's default.
+    """
+
+    keys: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[str, Mapping[Any, Any]] = field(default_factory=dict)
+    absent: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, data: Mapping[str, Any]) -> dict[str, Any]:
+        """The settings under their names of today; `data` stays as it is."""
+        out: dict[str, Any] = json.loads(json.dumps(data))
+        for old, new in self.keys.items():
+            holder, name = _holder(out, old)
+            if holder is not None and name in holder:
+                value = holder.pop(name)
+                target, name = _holder(out, new)
+                if target is not None:
+                    target[name] = value
+        for name, known in self.values.items():
+            holder, last = _holder(out, name)
+            if holder is not None and isinstance(holder.get(last), str):
+                holder[last] = known.get(holder[last], holder[last])
+        for name, value in self.absent.items():
+            holder, last = _holder(out, name)
+            if holder is not None:
+                holder.setdefault(last, value)
+        return out
+
+
+def to_data(config: Any) -> dict[str, Any]:
+    """The settings as JSON data."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_data(kind: type[T], data: Any, where: Path | str | None = None) -> T:
+    """Settings from JSON data; what is left out is as by default.
+
+    Raises:
+        PoiseError: an unknown setting, or a value of another type; `where` says in which file.
+    """
+    return _made(kind, data, "", where)
+
+
+def to_toml(config: Any) -> str:
+    """The settings as TOML text, one table a part."""
+    import tomli_w
+
+    return tomli_w.dumps(_without_null(to_data(config)))
+
+
+def from_toml(kind: type[T], path: Path, verb: str = "") -> T:
+    """Settings from a TOML file; what is left out is as by default.
+
+    Raises:
+        PoiseError: no such file, no TOML, an unknown setting, or a value of another type.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as problem:
+        raise PoiseError(f"cannot be read ({(problem.strerror or '').lower()})", path) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+        hint = f"poise {verb} --print-config shows one that is complete" if verb else ""
+        raise PoiseError(f"is no TOML ({problem})", path, hint) from None
+    return from_data(kind, data, path)
+
+
+@cache
+def _types(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:
+    if not isinstance(data, Mapping):
+        raise PoiseError(f"{name or 'the settings'} must be a table of settings, got {data!r}", where)
+    types = {f.name: _types(kind)[f.name] for f in fields(kind) if f.init}
+    unknown = [k for k in data if k not in types]
+    if unknown:
+        near = did_you_mean(str(unknown[0]), list(types)) or f"Known: {', '.join(types)}"
+        whole = f"{name}.{unknown[0]}" if name else str(unknown[0])
+        raise PoiseError(f"there is no setting '{whole}' in this version of Poise", where, near)
+    values = {k: _value(types[k], v, f"{name}.{k}" if name else k, where) for k, v in data.items()}
+    return kind(**values)
+
+
+def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
+    """`value` as the annotated type `kind`, lists as tuples."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if origin in (Union, UnionType):
+        if NoneType in args and (value is None or value == NONE):
+            return None
+        *others, last = [a for a in args if a is not NoneType]
+        for one in others:
+            with contextlib.suppress(PoiseError):
+                return _value(one, value, name, where)
+        return _value(last, value, name, where)
+    if origin is Literal:
+        if value not in args:
+            known = ", ".join(f"'{a}'" for a in args)
+            raise PoiseError(f"{name} must be one of {known}, got {value!r}", where)
+        return value
+    if is_dataclass(kind):
+        return _made(kind, value, name, where)
+    if origin is tuple and isinstance(value, list | tuple):
+        kinds = args[:1] * len(value) if len(args) == 2 and args[1] is ... else args
+        if len(kinds) != len(value):
+            raise PoiseError(f"{name} must have {len(kinds)} values, got {len(value)}", where)
+        pairs = enumerate(zip(kinds, value, strict=True))
+        return tuple(_value(k, v, f"{name}[{i}]", where) for i, (k, v) in pairs)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    plain = origin or kind
+    if not isinstance(value, plain) or (isinstance(value, bool) and plain is not bool):
+        raise PoiseError(f"{name} must be {_words(kind)}, got {value!r}", where)
+    return value
+
+
+def _words(kind: Any) -> str:
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+    if get_origin(kind) is tuple:
+        return "a list"
+    return names.get(kind, f"a {getattr(kind, '__name__', kind)}")
+
+
+def _holder(data: dict[str, Any], dotted: str) -> tuple[dict[str, Any] | None, str]:
+    """The table that holds a dotted name, None where there is none, and the last part of the name."""
+    *parts, last = dotted.split(".")
+    here: Any = data
+    for part in parts:
+        here = here.get(part) if isinstance(here, dict) else None
+    return (here if isinstance(here, dict) else None), last
+
+
+def _without_null(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: NONE if v is None else _without_null(v) for k, v in value.items()}
+    return [_without_null(v) for v in value] if isinstance(value, list) else value

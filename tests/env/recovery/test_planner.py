@@ -1,0 +1,169 @@
+"""Ways back made of a library's own clips: what they are made of, where they lead, how they move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from poise.env import Reference
+from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
+from poise.env.recovery.get_up import LIFT, GetUpPlanner
+from poise.env.recovery.planner import plan_recovery, recovery_motions
+from poise.kin import Kinematics
+from poise.motion import ClipLibrary
+from poise.recipes.perpetual import Perpetual, build
+from poise.recipes.perpetual.recovery import standing, walking_clips
+from poise.spatial import quat_angle, quat_between
+from poise.spatial.turns import facing, heading_angle, turned, yaw_quat
+from toy_human import swing
+from toy_library import rises, tiny
+
+Built = tuple[Reference, GetUpPlanner]
+
+
+@pytest.fixture(scope="module")
+def built() -> Built:
+    made = build(ClipLibrary.of([swing(1.2, speed=1.0, name="walk"), rises("rises")]), tiny())
+    reference = made.reference
+    recovery_clips = find_recovery_clips(reference, standing(reference), walking_clips(reference))
+    assert recovery_clips is not None
+    return reference, GetUpPlanner(recovery_clips, reference.humanoid.table, reference.rate_hz)
+
+
+def test_a_library_knows_a_walk_and_how_to_get_up(built: Built) -> None:
+    recovery_clips = built[1].recovery_clips
+    (walk,), (up,) = recovery_clips.walks, recovery_clips.ups
+    # One cycle along +X, closed: its last frame is its first one farther on.
+    assert walk[0, 0] == 0 and walk[-1, 0] == pytest.approx(1.2, abs=0.15)
+    assert torch.allclose(walk[-1, 7:], walk[0, 7:], atol=1e-9)
+    assert float(walk[-1, 1] - walk[0, 1]) == pytest.approx(0.0, abs=1e-9)
+    height = float(recovery_clips.ease[2])
+    assert up[0, 2] < 0.4 * height and up[-1, 2] > 0.9 * height
+
+
+def test_nobody_walks_or_nobody_gets_up() -> None:
+    for clips in (
+        [swing(1.2, speed=1.0, name="walk"), swing(1.2, name="calm")],
+        [swing(1.2, name="calm"), rises("rises")],
+    ):
+        reference = build(ClipLibrary.of(clips), tiny()).reference
+        assert find_recovery_clips(reference, standing(reference), walking_clips(reference)) is None
+
+
+@pytest.mark.parametrize("bearing", [0.3, 2.0, -2.9])
+def test_a_walk_leads_from_anywhere_to_a_place(built: Built, bearing: float) -> None:
+    reference, get_up = built
+    recovery_clips = get_up.recovery_clips
+    start, place = facing(recovery_clips.ease, bearing), facing(recovery_clips.ease, 0.5)
+    start[0], start[1] = 2.0, -1.0
+    way = plan_recovery(get_up, start, place)
+    assert (way[0, :2] - start[:2]).norm() < 0.05
+    assert turned_by(way[0], start) < 0.1
+    assert way[-1, :2].norm() < 0.1
+    assert turned_by(way[-1], place) < 0.15
+    # Nobody runs, and at the end a second is stood.
+    pace = (way[1:, :2] - way[:-1, :2]).norm(dim=-1) * reference.rate_hz
+    assert pace.max() < 1.5 and pace[-20:].max() < 1e-6
+
+
+def test_what_is_near_and_behind_is_come_to_backwards(built: Built) -> None:
+    _, get_up = built
+    recovery_clips, place = get_up.recovery_clips, facing(get_up.recovery_clips.ease, 0.0)
+    walk_faces = heading_angle(recovery_clips.walks[0][:-1, 3:7])
+    for off, backwards in ((0.8, True), (2.0, False)):
+        start = facing(recovery_clips.ease, walk_faces)
+        start[0] = off
+        way = plan_recovery(get_up, start, place)
+        assert way[-1, :2].norm() < 0.1
+        # Who turns around to walk there faces the other way in between.
+        turns = max(turned_by(q, start) for q in way)
+        assert (turns < 1.0) == backwards
+
+
+@pytest.mark.parametrize("side", [0.0, math.pi])
+def test_who_lies_gets_up_whichever_side_is_up(built: Built, side: float) -> None:
+    reference, get_up = built
+    recovery_clips = get_up.recovery_clips
+    table, place = reference.humanoid.table, facing(recovery_clips.ease, 0.0)
+    lying = turned(
+        recovery_clips.ups[0][:1], 1.0, recovery_clips.ups[0][0, :2], torch.tensor([1.0, 1.0])
+    )[0]
+    lying[3:7] = rolled(lying[3:7], side)
+    way = plan_recovery(get_up, lying, place)
+    # Turned over as a whole it floats or is in the floor, onto which the way sets it.
+    kept = [k for k in range(len(lying)) if k != 2]
+    assert torch.allclose(way[0, kept], lying[kept], atol=1e-6)
+    assert way[-1, :2].norm() < 0.1 and way[-1, 2] > 0.9 * recovery_clips.ease[2]
+    body = Kinematics(table)(way, torch.zeros(len(way), way.shape[1] - 1, dtype=way.dtype))
+    speed = (body.pos[1:] - body.pos[:-1]).norm(dim=-1) * reference.rate_hz
+    assert speed.max() < 8.0
+    # Turning over on the floor is no flight: before it gets up the root stays low.
+    up = int((way[:, 2] > 0.5 * recovery_clips.ease[2]).nonzero()[0])
+    assert up > reference.rate_hz * (0.2 if side == 0 else 0.5)
+    assert way[:up, 2].max() < float(lying[2]) + LIFT + 0.3
+
+
+def test_as_many_as_asked_for_of_both_kinds_and_by_seed(built: Built) -> None:
+    reference, get_up = built
+    recovery_clips = get_up.recovery_clips
+    falls = recovery_clips.ups[0][:3]
+    how = get_up, falls, 3.0, 6
+    first, again, other = (recovery_motions(*how, seed) for seed in (0, 0, 1))
+    assert list(first) == ["far-0", "fallen-0", "far-1", "fallen-1", "far-2", "fallen-2"]
+    assert all(np.array_equal(first[k], again[k]) for k in first)
+    assert any(first[k].shape != other[k].shape or (first[k] != other[k]).any() for k in first)
+    assert [q[0, 2] < 0.5 for q in first.values()] == [False, True] * 3
+    assert Reference(reference.humanoid, list(first.values()), 30, list(first)).length.min() > 30
+
+
+def test_turns_about_the_vertical() -> None:
+    pose = torch.tensor([1.0, 2.0, 0.9, *yaw_quat(torch.tensor(0.4)), 0.3], dtype=torch.float64)
+    assert heading_angle(pose[3:7]) == pytest.approx(0.4)
+    east = facing(pose, 0.0)
+    assert torch.allclose(east[:3], torch.tensor([0.0, 0.0, 0.9]).double())
+    assert heading_angle(east[3:7]) == pytest.approx(0.0) and east[7] == 0.3
+
+
+def turned_by(a: Tensor, b: Tensor) -> float:
+    return float(quat_angle(quat_between(a[3:7], b[3:7])))
+
+
+def rolled(quat: Tensor, angle: float) -> Tensor:
+    """Turned about the body's own long axis."""
+    from poise.spatial import quat_mul
+
+    half = 0.5 * angle
+    return quat_mul(quat, torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)], dtype=torch.float64))
+
+
+def test_who_lies_takes_the_nearest_clip_that_gets_up(built: Built) -> None:
+    _, get_up = built
+    recovery_clips = get_up.recovery_clips
+    # The same clip on the belly, as if somebody had gotten up from there.
+    prone = recovery_clips.ups[0].clone()
+    prone[:, 3:7] = torch.stack([rolled(q, math.pi) for q in prone[:, 3:7]])
+    both = GetUpPlanner(
+        RecoveryClips(recovery_clips.ease, recovery_clips.walks, (*recovery_clips.ups, prone)),
+        get_up.table,
+        get_up.rate_hz,
+    )
+    for clip in both.recovery_clips.ups:
+        up = both.up(clip[0])
+        assert turned_by(up[-1], clip[-1]) < 1e-6
+    again = RecoveryClips.of(both.recovery_clips.state())
+    assert len(again.ups) == 2 and torch.equal(again.ups[1], prone)
+    assert torch.equal(again.walks[0], recovery_clips.walks[0]) and torch.equal(
+        again.ease, recovery_clips.ease
+    )
+
+
+def test_settings_refuse_what_makes_no_sense() -> None:
+    from poise.errors import PoiseError
+
+    with pytest.raises(PoiseError, match="demonstration_share"):
+        replace(Perpetual().recovering, demonstration_share=1.0)

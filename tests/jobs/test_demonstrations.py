@@ -1,0 +1,223 @@
+"""Ways back are learned as clips are, the policy stays what it was, and a killed run goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from poise.errors import PoiseError
+from poise.jobs.perpetual.demonstrations import demonstrations, odds, practised
+from poise.jobs.perpetual.progress import Progress, Stage
+from poise.jobs.perpetual.recovery import try_recovery
+from poise.jobs.perpetual.run import Earlier, begin, going_on, reopen, resume, train
+from poise.jobs.perpetual.stage_initialisation import Owners, staged
+from poise.jobs.track import TrackConfig, track
+from poise.jobs.track.learning import learn
+from poise.jobs.track.policy import Tracker, load_tracker, policy_of_run, save_tracker
+from poise.learn import Until, load_policy
+from poise.motion import ClipLibrary
+from poise.nets import Composer
+from poise.recipes.perpetual import Perpetual, build
+from poise.recipes.perpetual.config import WIDE
+from toy_human import swing
+from toy_library import Scripted, library, rises, tiny
+
+PLAIN = {"style": None, "help_start": 0.0, "expert": False}
+RECOVERY, COMPOSER = Stage("recovery", 2), Stage("composer", 3, mixed=True)
+
+
+def lively() -> ClipLibrary:
+    """A library of somebody who walks and somebody who gets up."""
+    return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
+
+
+def test_ways_are_clips_of_the_stages_that_recover() -> None:
+    made = build(lively(), tiny(recovery=True, **PLAIN))
+    assert made.recovery_clips is not None and made.task.recovery is None
+    own, recovery_clips = len(made.library), demonstrations(made)
+    assert (
+        len(recovery_clips.names) == 4 and recovery_clips.qpos.shape[1] == made.reference.qpos.shape[1]
+    )
+    assert practised(made, Stage("primitive")) is made
+    assert practised(made, RECOVERY).reference.names == recovery_clips.names
+    both = practised(made, COMPOSER).reference
+    assert both.names == (*made.reference.names, *recovery_clips.names)
+    # Joined, every clip is what it was, also beyond its end.
+    for ref, first in ((made.reference, 0), (recovery_clips, own)):
+        clip = torch.arange(len(ref.names)).repeat_interleave(3)
+        frame = torch.tensor([0, 5, 10_000]).repeat(len(ref.names))
+        assert torch.equal(ref.gather_packed(clip, frame), both.gather_packed(clip + first, frame))
+        rows = ref.rows(clip, frame)
+        a = ref.follow(rows, clip, frame)[1]
+        assert torch.equal(a, both.follow(both.rows(clip + first, frame), clip + first, frame)[1])
+    # Of all episodes the share that the settings say are ways, however the library is drawn.
+    drawn = odds(made, COMPOSER, torch.tensor([3.0, 1, 0, 0, 0]).double(), both.length)
+    assert drawn[own:].sum() == pytest.approx(made.config.recovering.demonstration_share)
+    assert drawn[0] == pytest.approx(3 * float(drawn[1])) and not drawn[2:own].any()
+    assert {r.when for r in staged(made, COMPOSER).task.rewards} == {"always"}
+
+
+def test_a_library_without_getting_up_comes_back_to_a_point() -> None:
+    made = build(library(), tiny(recovery=True, **PLAIN))
+    assert made.recovery_clips is None and made.task.recovery is not None
+    none = replace(tiny().recovering, demonstrations=0)
+    assert build(lively(), tiny(recovery=True, recovering=none, **PLAIN)).recovery_clips is None
+    assert build(lively(), tiny(recovery=False, **PLAIN)).recovery_clips is None
+
+
+@pytest.fixture(scope="module")
+def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
+    """A single network that tracks."""
+    folder = tmp_path_factory.mktemp("first")
+    config = tiny(single=True, action="additive", **PLAIN)
+    train(begin(folder, lively(), config), folder, Until(iterations=2), None, 1, False)
+    return policy_of_run(folder)
+
+
+def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tmp_path: Path) -> None:
+    config = going_on(tracker.config, tiny(recovery=True))
+    assert not config.single and config.ppo.obs_clip == WIDE
+    assert config.ppo.policy_hidden == tracker.config.single_hidden
+    told: list[tuple[str, int]] = []
+
+    def show(p: Progress) -> None:
+        told.append((p.stage.name, p.stage.number))
+
+    whole, until = tmp_path / "whole", Until(iterations=8)
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(whole, lively(), config, earlier=went)
+    done = train(own, whole, until, show, 1, False, trained=tracker.policy)
+    assert list(dict.fromkeys(told)) == [("recovery", 2), ("composer", 3)]
+    assert done.recovery is not None and (whole / "recovery.safetensors").exists()
+    # The policy that was given is the first primitive, to the bit.
+    after, before = load_policy(whole / "policy.safetensors"), tracker.policy
+    assert isinstance(after.policy, Composer)
+    columns = after.policy.primitives
+    for a, b in zip(columns.column(0).parameters(), before.policy.mean.parameters(), strict=True):
+        assert torch.equal(a, b)
+    # Cut in every stage and gone on with: the same.
+    parts = tmp_path / "parts"
+    begin(parts, lively(), config, earlier=went)
+    for stop in (2, 5, 99):
+        again = resume(parts, config)
+        cut = lambda p, stop=stop: p.iteration < stop  # noqa: E731
+        train(again, parts, until, cut, 1, False, trained=tracker.policy)
+    other = load_policy(parts / "policy.safetensors").state()
+    assert all(torch.equal(v, other[k]) for k, v in after.state().items())
+    # On ways the last primitive is the composer's teacher.
+    env = staged(practised(own, COMPOSER), COMPOSER).env(2, threads=1)
+    owner = Owners(env, after, torch.zeros(len(own.library), dtype=torch.long)).owner
+    assert owner.tolist() == [0] * len(own.library) + [1] * 4
+    env.close()
+
+
+def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
+    assert going_on(tracker.config, Perpetual(recovery=False)).single
+    config = going_on(tracker.config, replace(tiny(recovery=True), single=True))
+    assert config.single and config.recovery and config.recovering.demonstrations == 4
+    run, told = tmp_path / "run", []
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(run, lively(), config, earlier=went)
+    show = lambda p: told.append(p.stage.name)  # noqa: E731
+    done = train(own, run, Until(iterations=2), show, 1, False, trained=tracker.policy)
+    assert set(told) == {"single with recovery"} and done.recovery is not None
+    assert {r.kind for r in done.recovery.rows} == {"fallen", "far", "fallen and far"}
+    # What it knows of coming back goes with it.
+    learned = policy_of_run(run)
+    save_tracker(learned, tmp_path / "p.safetensors")
+    kept = load_tracker(tmp_path / "p.safetensors").recovery_clips
+    assert learned.recovery_clips is not None and kept is not None
+    for name, value in learned.recovery_clips.state().items():
+        assert torch.allclose(kept.state()[name], value, atol=1e-6)
+    again = try_recovery(reopen(run), learned.policy, 2, 1)
+    assert again.rows == try_recovery(reopen(run), learned.policy, 2, 1).rows
+
+
+def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
+    tracker: Tracker, tmp_path: Path
+) -> None:
+    config = going_on(tracker.config, tiny(recovery=True, max_primitives=2), returns=True)
+    assert config.recovering.primitive == "first" and config.max_primitives == 2
+    told: list[tuple[str, int]] = []
+
+    def show(p: Progress) -> None:
+        told.append((p.stage.name, p.clips))
+
+    whole, until = tmp_path / "whole", Until(iterations=8)
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(whole, lively(), config, earlier=went)
+    done = train(own, whole, until, show, 1, False, trained=tracker.policy)
+    # What was given is evaluated, and what it fails is learned by the second primitive.
+    rows = (whole / "success.csv").read_text().splitlines()[1:]
+    first = [r.split(",") for r in rows if r.split(",")[1] == "primitive 1"]
+    failed = sum(r[4] == "0" for r in first)
+    assert len(first) == len(own.library) and failed
+    assert told[0] == ("primitive 2", failed) and told[-1] == ("composer", len(own.library))
+    assert done.primitives == 2 and done.recovery is not None
+    policy = load_policy(whole / "policy.safetensors")
+    assert isinstance(policy.policy, Composer)
+    columns = policy.policy.primitives
+    for a, b in zip(
+        columns.column(0).parameters(), tracker.policy.policy.mean.parameters(), strict=True
+    ):
+        assert torch.equal(a, b)
+    # Killed before the first checkpoint, in each stage, and gone on with: the same.
+    parts = tmp_path / "parts"
+    begin(parts, lively(), config, earlier=went)
+    for stop in (1, 5, 99):
+        cut = lambda p, stop=stop: p.iteration < stop  # noqa: E731
+        train(resume(parts, config), parts, until, cut, 1, False, trained=tracker.policy)
+    after = policy.state()
+    other = load_policy(parts / "policy.safetensors").state()
+    assert all(torch.equal(v, other[k]) for k, v in after.items())
+    # The composer's teacher on ways is the one that was given.
+    env = staged(practised(own, COMPOSER), COMPOSER).env(2, threads=1)
+    owners = Owners(env, policy, torch.ones(len(own.library), dtype=torch.long), own=False)
+    assert owners.owner.tolist() == [1] * len(own.library) + [0] * 4
+    env.close()
+    # In a library in which nobody gets up, recovery is learned by a primitive of its own.
+    assert build(library(), config).config.recovering.primitive == "own"
+
+
+def test_a_policy_that_fails_nothing_is_done(
+    tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("judge", "result"):
+        path = f"poise.recipes.perpetual.{module}.evaluate_clips"
+        monkeypatch.setattr(path, Scripted(lambda *_: True))
+    config = going_on(tracker.config, tiny(recovery=True), returns=True)
+    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
+    own = begin(tmp_path, lively(), config, earlier=went)
+    done = train(own, tmp_path, Until(iterations=8), None, 1, False, trained=tracker.policy)
+    assert done.solved and done.last is None and done.recovery is not None
+    assert policy_of_run(tmp_path).recovery_clips is not None
+
+
+def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:
+    """With a policy that hardly stands, so that it is lost; what comes out holds together."""
+    config = TrackConfig(recover=True)
+    with pytest.raises(PoiseError, match="has not learned to come back"):
+        track(tracker, swing(4.0, name="long"), config)
+    made = build(lively(), tiny(recovery=True, **PLAIN))
+    able = replace(tracker, recovery_clips=made.recovery_clips)
+    clip = swing(4.0, name="long")
+    done = track(able, clip, config)
+    again = track(able, clip, config)
+    assert (done.evaluation.recordings[0].qpos == again.evaluation.recordings[0].qpos).all()
+    assert done.losses is not None and done.failures[0] == (0, done.losses.lost[0])
+    frames = len(done.evaluation.recordings[0].qpos)
+    assert frames == int(done.imitation.reference.length[0]) == len(done.placed.qpos)
+    # Up to where it was lost everything is as without.
+    plain = track(able, clip)
+    upto = round(done.losses.lost[0] * 30)
+    a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
+    assert abs(a - b).max() < 1e-9
+    assert "lost the motion" in done.losses.sentence()
+    # Who learns the motion still knows its ways back.
+    learned = learn(able, plain.placed, tmp_path / "learned", 0.01, threads=1)
+    assert learned.tracker.recovery_clips is able.recovery_clips
+    with pytest.raises(PoiseError, match="a single character"):
+        TrackConfig(recover=True, count=2)

@@ -1,0 +1,184 @@
+"""A perpetual run that was stopped or killed anywhere ends like one that was not, bit for bit."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from poise.errors import PoiseError
+from poise.jobs.perpetual import stage_initialisation as perpetual_next
+from poise.jobs.perpetual import stage_trainer as perpetual_stages
+from poise.jobs.perpetual.progress import Progress, Stage
+from poise.jobs.perpetual.run import begin, config_of, resume, to_data, train
+from poise.jobs.perpetual.stage_trainer import StageTrainer
+from poise.jobs.runs import FINAL
+from poise.learn import LATEST, Until, load_checkpoint
+from poise.motion import ClipLibrary
+from poise.recipes.perpetual import Perpetual
+from toy_library import library, tiny
+
+ITERATIONS = 16
+#: Evaluations are at every second iteration of a stage; it ends at 0.35, 0.56 and 0.86 of all at most.
+CONFIG = tiny(recovery=True, max_primitives=2)
+STAGES = ["primitive 1", "primitive 2", "recovery", "composer"]
+
+
+class KilledError(Exception):
+    """Ends a training without any farewell."""
+
+
+def go_on(
+    folder: Path,
+    show: Callable[[Progress], bool | None] | None = None,
+    save_s: float = 0.0,
+    config: Perpetual = CONFIG,
+) -> None:
+    imitation = begin(folder, library(), config)
+    until = Until(iterations=ITERATIONS)
+    train(imitation, folder, until, show, threads=1, tensorboard=False, save_s=save_s)
+
+
+def killing(at: int) -> Callable[[Progress], None]:
+    def show(p: Progress) -> None:
+        if p.iteration == at:
+            raise KilledError
+
+    return show
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run with real evaluations."""
+    folder = tmp_path_factory.mktemp("whole")
+    stages: list[str] = []
+    go_on(folder, lambda p: stages.append(p.stage.name))
+    # The third clip is too hard for so little training, so that all stages are there.
+    assert list(dict.fromkeys(stages)) == STAGES
+    return folder
+
+
+def assert_same(a: Path, b: Path) -> None:
+    """All numbers of two run folders, but for the clocks."""
+    for name in (LATEST, FINAL):
+        one, other = (load_checkpoint(f / name)[0] for f in (a, b))
+        for tensors in (one, other):
+            if "trainer/counters" in tensors:
+                tensors["trainer/counters"][2] = 0.0
+        assert one.keys() == other.keys()
+        different = [k for k in one if not torch.equal(one[k].nan_to_num(), other[k].nan_to_num())]
+        assert not different
+    assert (a / "success.csv").read_text() == (b / "success.csv").read_text()
+    assert curve(a) == curve(b) and result(a) == result(b)
+
+
+def result(folder: Path) -> dict[str, object]:
+    said = json.loads((folder / "result.json").read_text())
+    return {k: v for k, v in said.items() if k != "seconds"}
+
+
+def curve(folder: Path) -> list[dict[str, str]]:
+    with (folder / "log.csv").open(newline="") as file:
+        return [{k: v for k, v in r.items() if not k.startswith("time/")} for r in csv.DictReader(file)]
+
+
+def test_a_run_stopped_at_each_boundary_goes_on(whole: Path, tmp_path: Path) -> None:
+    ended: list[str] = []
+
+    def stop(p: Progress) -> bool:
+        if p.following is not None:
+            ended.append(p.stage.name)
+        # In the middle of a stage, too.
+        return p.following is None and p.iteration != 11
+
+    for _ in range(5):
+        go_on(tmp_path, stop)
+    assert ended == STAGES[:-1]
+    assert_same(whole, tmp_path)
+
+
+def test_a_killed_run_goes_on_from_an_older_checkpoint(whole: Path, tmp_path: Path) -> None:
+    for moment in (3, 9, 13):
+        # Nothing but evaluations saves, so that some iterations are lost and made again.
+        with pytest.raises(KilledError):
+            go_on(tmp_path, killing(moment), save_s=1e9)
+    go_on(tmp_path, save_s=1e9)
+    assert_same(whole, tmp_path)
+
+
+@pytest.mark.parametrize("step", ["begin_stage", "make_trainer"])
+def test_a_run_killed_between_any_two_stages_ends_the_stage_again(
+    whole: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, died = getattr(perpetual_next, step), set()
+
+    def dying(*args: object, **more: object) -> object:
+        stage = next(x for x in args if isinstance(x, Stage))
+        if stage.number > 1 and stage not in died:
+            died.add(stage)
+            raise KilledError
+        return plain(*args, **more)
+
+    monkeypatch.setattr(perpetual_stages, step, dying)
+    for _ in STAGES[1:]:
+        with pytest.raises(KilledError):
+            go_on(tmp_path)
+    go_on(tmp_path)
+    assert [s.name for s in sorted(died, key=lambda s: s.number)] == STAGES[1:]
+    assert_same(whole, tmp_path)
+
+
+def test_a_run_killed_while_it_clones_begins_again(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = StageTrainer.save
+    monkeypatch.setattr(StageTrainer, "save", lambda self: (_ for _ in ()).throw(KilledError()))
+    with pytest.raises(KilledError):
+        go_on(tmp_path)
+    assert not (tmp_path / LATEST).exists()
+    monkeypatch.setattr(StageTrainer, "save", plain)
+    go_on(tmp_path)
+    assert_same(whole, tmp_path)
+
+
+def test_a_finished_run_goes_on_with_more_time(tmp_path: Path) -> None:
+    imitation = begin(tmp_path, library(), tiny(single=True, expert=False))
+    for iterations, trains in ((2, True), (2, False), (4, True)):
+        until = Until(iterations=iterations)
+        result = train(imitation, tmp_path, until, threads=1, tensorboard=False)
+        assert (result.last is not None) == trains and result.results is not None
+        assert (tmp_path / FINAL).exists() and len(curve(tmp_path)) == iterations
+
+
+def test_settings_for_additive_actions() -> None:
+    config = Perpetual.additive(single=True, num_envs=8)
+    assert (config.action, config.style, config.single, config.num_envs) == ("additive", None, True, 8)
+    assert config.ppo.std == 0.055 and config_of(to_data(config)) == config
+
+
+def test_settings_survive_json() -> None:
+    for config in (tiny(), tiny(style=None, lateral=True, start="random"), Perpetual()):
+        assert config_of(to_data(config)) == config
+    with pytest.raises(PoiseError, match="another version"):
+        config_of(to_data(Perpetual()) | {"colour": 3})
+
+
+def test_another_run_in_the_folder_is_refused(tmp_path: Path) -> None:
+    begin(tmp_path, library(), CONFIG, "here")
+    with pytest.raises(PoiseError, match=r"other settings \(max_primitives, recovery, seed\)"):
+        begin(tmp_path, library(), tiny(seed=2), "here")
+    with pytest.raises(PoiseError, match=r"other clips \(3, here 2\)"):
+        begin(tmp_path, ClipLibrary(library().clips[:2]), CONFIG, "here")
+    with pytest.raises(PoiseError, match="on the library here"):
+        resume(tmp_path, CONFIG, "there")
+    assert resume(tmp_path, CONFIG, "here").config == CONFIG
+
+
+def test_a_single_clip_is_no_library(tmp_path: Path) -> None:
+    with pytest.raises(PoiseError, match=r"at least 2 clips.*'calm'.*poise imitate"):
+        begin(tmp_path / "run", ClipLibrary(library().clips[:1]), CONFIG)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,69 @@
+"""The policy that comes with Poise: small, honest about its data, and it walks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from poise.env import Reference
+from poise.eval.recovery import KINDS
+from poise.jobs.library.files import subject_of
+from poise.jobs.perpetual.recovery import try_recovery
+from poise.jobs.track import TrackConfig, imitation_of, track
+from poise.jobs.track.placement import place
+from poise.jobs.track.policy import SHIPPED, Tracker, open_tracker
+from poise.motion import read_clip
+from toy_policy import WALK
+
+
+@pytest.fixture(scope="module")
+def tracker() -> Tracker:
+    return open_tracker()
+
+
+def test_it_is_small_and_says_what_it_learned(tracker: Tracker) -> None:
+    assert SHIPPED.stat().st_size < 5_000_000
+    about = tracker.about
+    assert about["help_n"] == 0.0 and about["samples"] > 50_000_000 and about["finished"]
+    learned = {subject_of(name) for name in about["clips"]}
+    assert "cmu 02" in learned and not learned & {"cmu 05", "cmu 11", "cmu 14"}
+    # Clips that may not be learned from by what ships.
+    assert not any(
+        x in name.lower() for name in about["clips"] for x in ("bandai", "lafan", "sie", "ase")
+    )
+
+
+def test_the_embedded_walk_is_done_without_help(tracker: Tracker) -> None:
+    tracked = track(tracker, read_clip(WALK))
+    card = tracked.evaluation.card
+    assert not tracked.failures and card.succ == 1.0 and card.help.limit_n == 0.0
+    assert card.mpjpe_mm < 60
+
+
+def test_it_gets_up_and_comes_back(tracker: Tracker) -> None:
+    assert tracker.recovery_clips is not None
+    still = tracker.recovery_clips.ease.expand(30, -1).numpy()
+    walk = imitation_of(tracker, [place(read_clip(WALK), tracker)])
+    stands = replace(walk, reference=Reference(tracker.humanoid, [still], 30.0, ["stands"]))
+    card = try_recovery(stands, tracker.policy, 8, threads=1)
+    assert {r.kind: r.within[1] >= 0.5 for r in card.rows} == dict.fromkeys(KINDS, True)
+
+
+def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
+    """A jump aside of 2 m in one frame, which nobody can do."""
+    clip = read_clip(WALK)
+    pos = clip.root_pos.copy()
+    pos[clip.frames // 2 :, 1] += 2.0
+    tracked = track(tracker, clip.replaced(root_pos=pos), TrackConfig(recover=True))
+    losses = tracked.losses
+    assert losses is not None and len(losses.back) == len(losses.lost)
+    assert "came back" in losses.sentence()
+    rows = tracked.evaluation.recordings[0].qpos
+    assert abs(rows[-1, :2] - tracked.placed.qpos[-1, :2]).max() < 0.5
+
+
+def test_a_held_out_take_is_followed_for_a_while(tracker: Tracker, data_dir: Path) -> None:
+    tracked = track(tracker, read_clip(data_dir / "cmu_bvh/ad/14_14.bvh"))
+    assert not tracked.failures or tracked.failures[0][1] > 1.0

@@ -1,0 +1,127 @@
+"""Which stage follows which, when each ends at the latest, and how much help it may have."""
+
+from __future__ import annotations
+
+import pytest
+
+from poise.errors import PoiseError
+from poise.jobs.perpetual.cloning import MOST, clone_for
+from poise.jobs.perpetual.progress import Stage
+from poise.jobs.perpetual.stage_order import (
+    ends,
+    first_stage,
+    following,
+    is_over,
+    lasts,
+    most_help,
+    primitives,
+)
+from poise.learn import CloneConfig
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual.config import RecoveryPlan
+from toy_library import tiny
+
+
+def path(config: Perpetual, fails: bool = True) -> list[str]:
+    """The names of all stages where clips always fail, or never."""
+    stage: Stage | None = first_stage(config)
+    names = []
+    while stage is not None:
+        names.append(stage.name)
+        assert lasts(config, stage) == (following(config, stage, True) is None)
+        stage = following(config, stage, fails)
+    return names
+
+
+def test_each_switch_has_its_stages() -> None:
+    three = ["primitive 1", "primitive 2", "primitive 3"]
+    assert path(Perpetual()) == [*three, "recovery", "composer"]
+    assert path(Perpetual(), fails=False) == ["primitive 1", "recovery", "composer"]
+    assert path(Perpetual(recovery=False)) == [*three, "composer"]
+    assert path(Perpetual(recovery=False), fails=False) == ["primitive 1"]
+    assert path(Perpetual(max_primitives=1)) == ["primitive 1", "recovery", "composer"]
+    assert path(Perpetual(max_primitives=1, recovery=False)) == ["primitive 1"]
+    for switch, name in (("single", "single"), ("multiplicative", "single"), ("progressive", "joint")):
+        one = {switch: switch == "single"}
+        assert path(Perpetual(**one)) == [name, f"{name} with recovery"]
+        assert path(Perpetual(**one, recovery=False)) == [name]
+
+
+def test_where_the_first_primitive_recovers_none_of_its_own_does() -> None:
+    plan = RecoveryPlan(primitive="first", share=0.2)
+    known = Perpetual(recovering=plan, shares=(0.5, 0.8))
+    assert path(known) == ["primitive 1", "primitive 2", "primitive 3", "composer"]
+    assert path(known, fails=False) == ["primitive 1"]
+    last = Stage("composer", 4, mixed=True)
+    assert last.recovers == "composer" and primitives(known, last) == 3
+    assert primitives(Perpetual(), Stage("composer", 5, mixed=True)) == 3
+    assert primitives(known, Stage("primitive", 2)) == 2
+    assert [ends(known, Stage("primitive", k), 0.0) for k in (2, 3)] == pytest.approx([0.65, 0.8])
+    with pytest.raises(PoiseError, match="there must be another"):
+        Perpetual(recovering=plan, max_primitives=1)
+
+
+def test_what_recovers_is_told_by_the_stage() -> None:
+    known = {s.name: s.recovers for s in (Stage("primitive", 2), Stage("recovery", 4), Stage("single"))}
+    assert known == {"primitive 2": None, "recovery": "primitive", "single": None}
+    assert Stage("composer", 5, mixed=True).recovers == "composer"
+    assert Stage("composer", 4).recovers is None
+
+
+def test_stages_end_by_shares_of_the_whole() -> None:
+    plain = Perpetual(recovery=False, shares=(0.5, 0.8))
+    assert [ends(plain, Stage("primitive", k), 0.0) for k in (1, 2, 3)] == pytest.approx(
+        [0.5, 0.65, 0.8]
+    )
+    plan = RecoveryPlan(share=0.2)
+    config = Perpetual(shares=(0.5, 0.8), recovering=plan)
+    got = [ends(config, Stage("primitive", k), 0.0) for k in (1, 2, 3)]
+    assert got == pytest.approx([0.4, 0.52, 0.64])
+    recovery = Stage("recovery", 4)
+    # After primitives that needed all their time, its share of the whole; else more in proportion.
+    assert ends(config, recovery, 0.64) == pytest.approx(0.84)
+    assert ends(config, recovery, 0.28) == pytest.approx(0.28 + 0.72 * 20 / 36)
+    assert ends(config, Stage("composer", 5, mixed=True), 0.84) == 1.0
+    alone = Perpetual(single=True, shares=(0.5, 0.8), recovering=plan)
+    assert ends(alone, Stage("single"), 0.0) == pytest.approx(0.64)
+    assert ends(alone, Stage("single", 2, mixed=True), 0.64) == 1.0
+
+
+def test_a_stage_is_over_by_its_decision() -> None:
+    config, last = Perpetual(), Stage("composer", 5, mixed=True)
+    one = Stage("primitive")
+    assert [is_over(config, one, d, 0.3) for d in ("go on", "next", "solved")] == [False, True, True]
+    # Nothing begins where no time is left, and what is last is over when it is solved.
+    assert not is_over(config, one, "next", 1.0) and not is_over(config, one, "solved", 1.0)
+    assert is_over(config, last, "solved", 1.0) and not is_over(config, last, "next", 0.9)
+    assert is_over(Perpetual(recovery=False), one, "solved", 1.0)
+
+
+def test_help_ends_within_the_stage() -> None:
+    config = Perpetual(recovery=False, shares=(0.5, 0.8), help_share=0.8)
+    shares = [most_help(config, Stage("primitive"), 0.1, s) for s in (0.1, 0.26, 0.42, 0.5)]
+    assert shares == pytest.approx([1.0, 0.5, 0.0, 0.0])
+
+
+def test_the_clone_grows_with_the_library() -> None:
+    assert clone_for(300, 512) == CloneConfig()
+    big = clone_for(31_000, 512)
+    assert (big.rounds + 1) * big.steps * 512 == pytest.approx(16 * 31_000, rel=0.01)
+    assert big.rounds == 5
+    whole = [clone_for(n, 512) for n in (60_000, 10**6)]
+    assert all((c.rounds + 1) * c.steps * 512 <= MOST + 6 * 512 for c in whole)
+    assert tiny(clone=None).clone is None
+
+
+def test_switches_that_exclude_each_other_are_told() -> None:
+    for bad, word in (
+        ({"single": True, "progressive": False}, "got single and no progressive"),
+        ({"multiplicative": False, "progressive": False}, "no multiplicative and no progressive"),
+        ({"progressive": False, "combine": "means"}, "combined as a product"),
+        ({"progressive": False, "max_primitives": 1}, "at least 2 primitives"),
+        ({"shares": (0.5, 1.0)}, "something must follow"),
+    ):
+        with pytest.raises(PoiseError, match=word):
+            Perpetual(**bad)
+    with pytest.raises(PoiseError, match="share must lie in"):
+        RecoveryPlan(share=1.0)

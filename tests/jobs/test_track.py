@@ -1,0 +1,253 @@
+"""Motions of any skeleton and keypoints, tracked by a toy policy without help."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from poise.env import ImitationEnv
+from poise.errors import PoiseError
+from poise.eval import Recording, run_episodes, score_rollouts
+from poise.jobs.runs import Evaluation
+from poise.jobs.track import Keeper, TrackConfig, check_fits, imitation_of, track, write
+from poise.jobs.track.placement import home, place
+from poise.jobs.track.points import points_of
+from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.kin.hinges import within_turns
+from poise.motion import Clip, Skeleton, read_clip
+from poise.motion.io.raw import Options
+from poise.motion.keypoints import Keypoints
+from poise.motion.noise import Jitter
+from poise.motion.points.fit import JOINT_PLACES
+from poise.spatial import quat_mul
+from toy_human import swing
+from toy_policy import toy_run, walk
+
+
+@pytest.fixture(scope="module")
+def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
+    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+
+
+@pytest.fixture(scope="module")
+def pointed(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
+    return policy_of_run(toy_run(tmp_path_factory.mktemp("points"), "keypoints"))
+
+
+def points(clip: Clip) -> Keypoints:
+    """What a pose estimator would call the joints of a clip of the toy human."""
+    names = {"UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle", "Toe": "BigToe", "Arm": "Shoulder"}
+    names |= {"ForeArm": "Elbow", "Hand": "Wrist"}
+    found = {"Neck": "Neck", "Head": "Nose"}
+    for side in ("Left", "Right"):
+        found |= {f"{side}{joint}": f"{side[0]}{name}" for joint, name in names.items()}
+    at = [clip.skeleton.index(j) for j in found]
+    return Keypoints(tuple(found.values()), clip.positions()[:, at], clip.fps, "points")
+
+
+def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> None:
+    clip = walk(0, 40)
+    tracked = track(tracker, clip)
+    card = tracked.evaluation.card
+    assert tracked.placed.moved is None and card.help.limit_n == 0.0 and card.method
+    assert card.episodes == 1 and card.succ == 0.0
+    (failed,) = tracked.failed_s
+    r = tracked.evaluation.rollouts
+    far = (r.pos[0] - r.ref_pos[0]).norm(dim=-1).mean(-1)
+    first = int((far > 0.5).nonzero()[0])
+    assert failed == pytest.approx(first / 30.0)
+    motion = tracked.motion()
+    assert (motion.frames, motion.fps, motion.skeleton) == (40, 30.0, clip.skeleton)
+    done = write(tracked, tmp_path / "out", tmp_path / "out.bvh")
+    assert set(done.paths) == {"simulated", "score", "report"} and done.paths["simulated"].exists()
+    assert json.loads((tmp_path / "out/score.json").read_text())["help"]["limit_n"] == 0.0
+    back = read_clip(tmp_path / "out.bvh")
+    assert back.skeleton.names == clip.skeleton.names and back.frames == 40
+    # The same again gives the same.
+    again = track(tracker, clip)
+    np.testing.assert_array_equal(
+        again.evaluation.recordings[0].qpos, tracked.evaluation.recordings[0].qpos
+    )
+
+
+def test_the_reference_on_the_body_comes_home_as_it_was(tracker: Tracker, tmp_path: Path) -> None:
+    """Another skeleton at another size and rate: what goes onto the body comes back."""
+    source = swing(1.0, 60.0, speed=1.0, scale=0.9)
+    placed = place(source, tracker)
+    assert placed.moved is not None and placed.moved.scale != 1.0
+    assert placed.clip.skeleton == tracker.humanoid.skeleton
+    imitation = imitation_of(tracker, [placed])
+    recording = Recording(0, 0, placed.qpos, 0)
+    from poise.jobs.deliver import simulated_clip
+
+    made = simulated_clip(imitation, Evaluation(None, None, [recording]))  # type: ignore[arg-type]
+    back = home(made, placed, tracker)
+    assert (back.frames, back.fps, back.name) == (source.frames, source.fps, "swing")
+    assert back.skeleton.names == source.skeleton.names
+    off = np.linalg.norm(back.positions() - source.positions(), axis=-1)
+    assert off.mean() < 0.05
+    # A joint that the body lacks moves as in the source.
+    assert np.ptp(back.root_pos[:, 0]) == pytest.approx(np.ptp(source.root_pos[:, 0]), rel=0.05)
+
+
+def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) -> None:
+    source = swing(0.5, 60.0, scale=1.1)
+    tracked = track(tracker, source)
+    done = write(tracked, tmp_path, tmp_path / "out.npz", hold=False)
+    assert set(done.paths) == {"simulated", "body", "score", "report"}
+    back, body = read_clip(done.paths["simulated"]), read_clip(done.paths["body"])
+    assert back.skeleton.names == source.skeleton.names and back.frames == source.frames
+    np.testing.assert_allclose(back.skeleton.offsets[1:], source.skeleton.offsets[1:], atol=1e-5)
+    assert set(body.skeleton.names) == set(tracker.humanoid.skeleton.names)
+    assert any("on another skeleton" in note for note in tracked.notes)
+
+
+def test_resets_change_nothing_before_the_first_failure(tracker: Tracker) -> None:
+    plain = track(tracker, walk())
+    again = track(tracker, walk(), TrackConfig(reset_on_fail=True))
+    assert len(again.failed_s) > 1 and again.failed_s[0] == plain.failed_s[0]
+    # The score is that of the character that nobody put back.
+    assert again.evaluation.card.mpjpe_mm == plain.evaluation.card.mpjpe_mm
+    assert again.evaluation.card.succ == 0.0
+    r, ref = again.evaluation.rollouts, again.imitation.reference
+    for second in again.failed_s[:-1]:
+        t = round(second * 30)
+        far = (r.pos[0] - r.ref_pos[0]).norm(dim=-1).mean(-1)
+        # It is recorded where it fell, and one step from the reference afterwards.
+        assert far[t] > 0.5 and far[t + 1] < 0.2
+    assert ref.length.tolist() == [86]
+
+
+def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
+    placed = [place(walk(0, 40), tracker), place(walk(20, 60), tracker)]
+    imitation = imitation_of(tracker, placed)
+    env = imitation.env(2, auto_reset=False, threads=1, help_scale=0.0)
+    keeper = Keeper(tracker.policy, True)
+    keeper.env = env
+    try:
+        obs = env.reset_to(torch.tensor([0, 1]), torch.zeros(2, dtype=torch.long))
+        for _ in range(3):
+            obs = env.step(tracker.policy.act(obs)).final_obs
+        qpos, qvel = env.backend.state.qpos.clone(), env.backend.state.qvel.clone()
+        moved = qpos.clone()
+        moved[0, 0] += 2.0
+        env.backend.write(None, moved, qvel)
+        keeper.act(obs)
+        assert keeper.fallen == [(0, 3)]
+        assert torch.equal(env.backend.state.qpos[1], moved[1])
+        want = imitation.reference.coordinates(torch.tensor([0]), torch.tensor([3]))[0]
+        assert torch.equal(env.backend.state.qpos[:1], want)
+    finally:
+        env.close()
+
+
+def test_keypoints_are_streamed_to_a_policy_of_keypoints(pointed: Tracker) -> None:
+    given = points(swing(1.0, 60.0, speed=0.5))
+    tracked = track(pointed, given)
+    assert any("Each goal comes from the keypoints" in note for note in tracked.notes)
+    fit = imitation_of(pointed, [tracked.placed]).reference.pose
+    pose = tracked.imitation.reference.pose
+    off = (pose.pos - fit.pos).norm(dim=-1)
+    # The stream differs from the offline fit, and follows the same motion.
+    assert 1e-4 < float(off.mean()) < 0.05
+    speed = (pose.pos[2:] - pose.pos[:-2]) * 15.0
+    assert torch.allclose(pose.linvel[1:-1], speed, atol=0.02)
+    # With gaps and noise it goes on.
+    noisy = track(pointed, given, TrackConfig(noise=(Jitter(strength=0.2),), seed=1))
+    assert any("without noise" in note for note in noisy.notes)
+
+
+def test_keypoints_are_fitted_for_a_policy_of_rotations(tracker: Tracker, pointed: Tracker) -> None:
+    given = points(swing(0.5, 60.0))
+    tracked = track(tracker, given)
+    assert any("fitted to the keypoints" in note for note in tracked.notes)
+    assert set(tracked.placed.source.skeleton.names) >= set(JOINT_PLACES) - {"Neck", "Head"}
+    lost = given.positions.copy()
+    lost[:, given.names.index("Nose")] = np.nan
+    lost[5:8, given.names.index("LWrist")] = np.nan
+    holes = given.replaced(positions=lost)
+    assert any("longest gap" in note for note in track(pointed, holes).notes)
+
+
+def test_files_of_keypoints_are_known(data_dir: Path) -> None:
+    folder = data_dir / "noisy/pose2sim/single"
+    path = next(iter(sorted(folder.glob("*.trc"))))
+    clip = read_clip(path)
+    found = points_of(clip, Options())
+    assert found is not None and found.frames >= clip.frames
+    assert points_of(walk(), Options()) is None
+
+
+def test_noise_moves_the_input_and_says_so(tracker: Tracker) -> None:
+    config = TrackConfig(noise=(Jitter(),), seed=4)
+    tracked = track(tracker, walk(0, 30), config)
+    (note,) = [n for n in tracked.notes if "without noise" in n]
+    assert "input with noise" in note
+    assert track(tracker, walk(0, 30), config).notes == tracked.notes
+    other = track(tracker, walk(0, 30), replace(config, seed=5))
+    assert not np.array_equal(other.placed.qpos, tracked.placed.qpos)
+
+
+def test_angles_come_within_a_turn_of_their_ranges(tracker: Tracker) -> None:
+    qpos = place(walk(0, 20), tracker).qpos
+    turned = qpos.copy()
+    turned[:, 9] += 4 * np.pi
+    turned[:, 11] -= 2 * np.pi
+    np.testing.assert_allclose(within_turns(turned, tracker.humanoid), qpos, atol=1e-9)
+
+
+def test_it_agrees_with_an_evaluation_of_the_run(tracker: Tracker) -> None:
+    """A clip on the body's skeleton is scored as the run's own evaluation would score it."""
+    tracked = track(tracker, walk(0, 30))
+
+    def make(worlds: int) -> ImitationEnv:
+        return tracked.imitation.env(worlds, auto_reset=False, threads=1, help_scale=0.0)
+
+    zero = torch.zeros(1, dtype=torch.long)
+    rollouts, _ = run_episodes(make, tracker.policy, zero, zero, cycles=1)
+    assert score_rollouts(rollouts).mpjpe_mm == tracked.evaluation.card.mpjpe_mm
+
+
+def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:
+    with pytest.raises(PoiseError, match="needs at least 3"):
+        track(tracker, walk(0, 2))
+    chain = Skeleton(("a", "b", "c"), (-1, 0, 1), np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 1.0]]))
+    rot = np.tile([1.0, 0, 0, 0], (10, 3, 1))
+    with pytest.raises(PoiseError):
+        track(tracker, Clip(chain, np.zeros((10, 3)), rot, 30.0, "chain"))
+    mixed = replace(tracker, policy=pointed.policy)
+    with pytest.raises(PoiseError, match=r"observations .* another body"):
+        track(mixed, walk(0, 20))
+    env = imitation_of(tracker, [place(walk(0, 20), tracker)]).env(1, threads=1)
+    check_fits(tracker, env)
+    env.close()
+
+
+def test_a_joint_beyond_its_range_is_no_blow(tracker: Tracker) -> None:
+    """Who is put down outside a joint's range must not be thrown back into it."""
+    clip = walk(0, 40)
+    knee = clip.skeleton.index("LeftLeg")
+    turned = quat_mul(
+        torch.tensor(clip.rot[:, knee]), torch.tensor([math.cos(0.8), 0.0, -math.sin(0.8), 0.0])
+    )
+    rot = np.array(clip.rot)
+    rot[:, knee] = turned.numpy()
+    bent = clip.replaced(rot=rot)
+    # Absolute targets are shares of the ranges, which must stay as they were trained.
+    assert tracker.config.action == "absolute"
+    placed = place(bent, tracker)
+    assert imitation_of(tracker, [placed]).humanoid is tracker.humanoid
+    assert any("beyond the range" in n and "widened" not in n for n in placed.notes)
+    tracker = replace(tracker, config=replace(tracker.config, action="additive"))
+    placed = place(bent, tracker)
+    body = imitation_of(tracker, [placed]).humanoid
+    ranges = body.model.jnt_range[1:]
+    assert (placed.qpos[:, 7:] >= ranges[:, 0]).all() and (placed.qpos[:, 7:] <= ranges[:, 1]).all()
+    assert any("which is widened" in n for n in placed.notes)
+    assert imitation_of(tracker, [place(clip, tracker)]).humanoid is tracker.humanoid

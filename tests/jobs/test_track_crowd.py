@@ -1,0 +1,112 @@
+"""Several characters in one world move as each would alone, until they meet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from poise.errors import PoiseError
+from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track, write
+from poise.jobs.track.crowd import APART_M, Crowd, crowd_model, places
+from poise.jobs.track.placement import place
+from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.motion import read_clip
+from poise.sim import CpuBackend
+from toy_human import swing
+from toy_policy import toy_run, walk
+
+
+@pytest.fixture(scope="module")
+def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
+    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+
+
+def test_places() -> None:
+    assert places(1).tolist() == [[0.0, 0.0]]
+    assert places(3).tolist() == [[0.0, 0.0], [0.0, APART_M], [APART_M, 0.0]]
+    many = places(16)
+    apart = np.linalg.norm(many[:, None] - many[None], axis=-1) + 9 * np.eye(16)
+    assert apart.min() == pytest.approx(APART_M)
+
+
+def test_a_model_of_copies(tracker: Tracker) -> None:
+    single, sim = tracker.humanoid.model, tracker.config.sim
+    model = crowd_model(tracker.humanoid, sim, 3)
+    assert model.nq == 3 * single.nq and model.nexclude == 3 * single.nexclude
+    assert model.opt.timestep == sim.timestep and model.opt.integrator == single.opt.integrator
+    assert model.body_mass.sum() == pytest.approx(3 * single.body_mass.sum())
+    for name in ("jnt_range", "dof_damping", "dof_armature", "actuator_gainprm"):
+        np.testing.assert_array_equal(getattr(model, name), np.concatenate([getattr(single, name)] * 3))
+    assert model.body(single.nbody).name == f"2@{tracker.humanoid.bodies[0]}"
+
+
+def test_its_state_looks_like_that_of_worlds(tracker: Tracker) -> None:
+    """The same coordinates and targets in one world and in worlds of their own."""
+    placed = place(walk(0, 30), tracker)
+    imitation = side_by_side(imitation_of(tracker, [placed]), 3)
+    n = torch.arange(3)
+    qpos, qvel = imitation.reference.coordinates(n, 4 * n)
+    crowd = Crowd(tracker.humanoid, tracker.config.sim, 3)
+    alone = CpuBackend(tracker.humanoid.model, 3, threads=1)
+    try:
+        for backend in (crowd, alone):
+            backend.state.bind(("qfrc_damper",))
+            backend.write(None, qpos, qvel)
+            backend.drive.clear()
+            backend.drive.ctrl.add_(qpos[:, 7:] + 0.1)
+            backend.step(4)
+        for name in ("qpos", "qvel", "qfrc_damper"):
+            assert torch.allclose(crowd.state[name], alone.state[name], atol=1e-7), name
+        for name in ("xpos", "xquat", "xipos", "subtree_com", "cvel"):
+            a, b = crowd.state[name][:, 1:], alone.state[name][:, 1:]
+            assert torch.allclose(a, b, atol=1e-7), name
+        before = crowd.snapshot()
+        crowd.write(torch.tensor([1]), qpos[1:2], qvel[1:2])
+        assert torch.equal(crowd.state.qpos[1], qpos[1])
+        assert torch.equal(crowd.state.qpos[[0, 2]], before[[0, 2], : qpos.shape[1]])
+        crowd.restore(before)
+        assert torch.equal(crowd.snapshot(), before)
+        with pytest.raises(PoiseError, match="not known per character"):
+            crowd.state.bind(("contact",))
+    finally:
+        crowd.close()
+        alone.close()
+
+
+def test_each_tracks_as_if_alone(tracker: Tracker) -> None:
+    alone = track(tracker, walk(0, 25))
+    many = track(tracker, walk(0, 25), TrackConfig(count=3))
+    want = alone.evaluation.recordings[0].qpos
+    for k, recording in enumerate(many.evaluation.recordings):
+        got = recording.qpos.copy()
+        got[:, :2] -= places(3)[k]
+        np.testing.assert_allclose(got, want, atol=1e-4)
+    assert many.evaluation.card.episodes == 3
+    assert many.imitation.library.names == ("walk-1", "walk-2", "walk-3")
+    assert [t for _, t in many.failures] == [t for _, t in alone.failures] * 3
+
+
+def test_a_crowd_of_another_skeleton_is_delivered(tracker: Tracker, tmp_path: Path) -> None:
+    source = swing(0.7, 30.0)
+    tracked = track(tracker, source, TrackConfig(count=2, reset_on_fail=True))
+    done = write(tracked, tmp_path, hold=False)
+    assert set(done.paths) == {
+        "simulated_swing-1", "simulated_swing-2", "body_swing-1", "body_swing-2", "score", "report",
+    }  # fmt: skip
+    assert all(path.exists() for path in done.paths.values())
+    one, two = (read_clip(done.paths[f"simulated_swing-{k}"]) for k in (1, 2))
+    assert set(one.skeleton.names) == set(source.skeleton.names)
+    assert tracked.motion(1).frames == source.frames
+    # They begin side by side.
+    assert (two.root_pos - one.root_pos)[0] == pytest.approx([0.0, APART_M, 0.0], abs=0.05)
+    with pytest.raises(PoiseError, match="2 characters make 2 files"):
+        write(tracked, tmp_path, tmp_path / "one.bvh")
+
+
+def test_counts_that_make_no_sense() -> None:
+    for count in (0, -1, 65):
+        with pytest.raises(PoiseError, match="1 to 64"):
+            TrackConfig(count=count)

@@ -1,0 +1,76 @@
+"""Noise by name, and the robustness curve."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from poise.errors import PoiseError
+from poise.jobs.track import TrackConfig, track
+from poise.jobs.track.noise import KINDS, Robustness, Rung, noise_of, robustness, write_robustness
+from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.motion.noise import VIDEO, Drift, FrameLoss, Jitter, Level, robustness_levels
+from toy_policy import toy_run, walk
+
+
+@pytest.fixture(scope="module")
+def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
+    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+
+
+def test_noise_by_name() -> None:
+    assert noise_of(()) == ()
+    assert noise_of(("jitter:0.5", "drift")) == (Jitter(strength=0.5), Drift())
+    assert noise_of(("video:1",)) == VIDEO
+    assert noise_of(("lost-frames : 2",)) == (FrameLoss(strength=2.0),)
+    assert all(noise_of((f"{kind}:1",)) == chain for kind, chain in KINDS.items())
+    for text in ("jitter:", "jitter:-1", "jitter:nan", "jitter:inf", "jitter:a"):
+        with pytest.raises(PoiseError, match="number of at least 0"):
+            noise_of((text,))
+    with pytest.raises(PoiseError, match=r"no noise 'jiter'. Did you mean 'jitter'\?"):
+        noise_of(("jiter:1",))
+
+
+def test_the_curve_is_that_of_tracking(tracker: Tracker, tmp_path: Path) -> None:
+    motions = [walk(0, 20), walk(20, 45, "later")]
+    levels = robustness_levels((Jitter(sigma_m=0.01),), (0.0, 1.0))
+    told: list[str] = []
+    found = robustness(tracker, motions, levels, seed=3, tell=told.append)
+    assert found == robustness(tracker, motions, levels, seed=3)
+    assert [r.name for r in found.rungs] == ["clean", "all x1"] and len(told) == 2
+    clean, noisy = found.rungs
+    assert clean.succ == clean.succ_clean and clean.noise_mm == 0.0
+    # Without noise the input is the motion itself.
+    assert clean.mpjpe_mm == pytest.approx(clean.off_mm, rel=1e-5)
+    assert 5.0 < noisy.noise_mm < 100.0 and noisy.motions == 2
+    cards = [track(tracker, m, TrackConfig(levels[1].noise, 3)).evaluation.card for m in motions]
+    assert noisy.mpjpe_mm == pytest.approx(sum(c.mpjpe_global_mm for c in cards) / 2)
+    paths = write_robustness(found, tmp_path)
+    said = json.loads(paths["json"].read_text())
+    assert said["rungs"][1]["noise_mm"] == noisy.noise_mm and said["refused"] == []
+    assert "<svg" in paths["plot"].read_text()
+
+
+def test_ladders_of_kinds_begin_without_noise(tmp_path: Path) -> None:
+    def rung(name: str, strength: float, succ: float) -> Rung:
+        return Rung(name, strength, 4, succ, succ, 30.0, 30.0, math.nan, 1.0)
+
+    rungs = (rung("clean", 0, 1.0), rung("all x1", 1, 0.5), rung("Jitter x1", 1, 0.75))
+    paths = write_robustness(Robustness(rungs, (("all x1", "a", "why"),)), tmp_path)
+    text = paths["plot"].read_text()
+    assert "Jitter" in text and "all" in text
+    said = json.loads(paths["json"].read_text())
+    assert said["rungs"][0]["noise_mm"] is None and said["refused"][0]["motion"] == "a"
+
+
+def test_what_cannot_be_measured(tracker: Tracker) -> None:
+    with pytest.raises(PoiseError, match="at least one motion"):
+        robustness(tracker, [])
+    with pytest.raises(PoiseError, match="at least 3"):
+        robustness(tracker, [walk(0, 2)], [Level("clean", 0.0, ())])
+    # A motion that noise makes unusable counts as failed.
+    (rung,) = (found := robustness(tracker, [walk(0, 2)], [Level("x1", 1.0, (Jitter(),))])).rungs
+    assert rung.succ == 0.0 and math.isnan(rung.mpjpe_mm) and found.refused[0][1] == "walk"

@@ -1,0 +1,146 @@
+"""A policy as one file: the same body, the same actions; what is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from poise.errors import PoiseError
+from poise.jobs import runs
+from poise.jobs.track import policy as track_policy
+from poise.jobs.track.policy import (
+    KIND,
+    Tracker,
+    export_policy,
+    load_tracker,
+    open_tracker,
+    policy_of_run,
+)
+from poise.learn import load_checkpoint, save_checkpoint
+from poise.recipes import ResidualForce
+from toy_policy import toy_run, walk
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return toy_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def tracker(run: Path) -> Tracker:
+    return policy_of_run(run)
+
+
+@pytest.fixture(scope="module")
+def file(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("file") / "policy.safetensors"
+    export_policy(run, path)
+    return path
+
+
+def test_the_body_comes_back_exactly_and_actions_to_half_precision(tracker: Tracker, file: Path) -> None:
+    back = open_tracker(file)
+    assert back.humanoid.table == tracker.humanoid.table
+    assert back.humanoid.identity == tracker.humanoid.identity and back.config == tracker.config
+    assert back.about == json.loads(json.dumps(dict(tracker.about)))
+    assert back.about["clips"] == ["first", "second"] and back.about["samples"] > 0
+    assert back.humanoid.model.opt.timestep == tracker.config.sim.timestep
+    assert back.example.skeleton == tracker.example.skeleton
+    obs = torch.randn(64, back.policy.num_obs, generator=torch.Generator().manual_seed(0))
+    want, got = tracker.policy.act(obs), back.policy.act(obs)
+    # Half precision has 11 bits.
+    assert float((want - got).abs().max()) < 4e-3 * float(want.abs().max())
+
+
+def test_matrices_are_halved_and_statistics_are_not(tracker: Tracker, file: Path) -> None:
+    tensors, meta = load_checkpoint(file)
+    assert meta["kind"] == KIND and meta["recipe"] == "perpetual"
+    state = tracker.policy.state()
+    for name, value in state.items():
+        matrix = name.startswith("policy/") and value.ndim > 1
+        assert tensors[name].dtype == (torch.float16 if matrix else value.dtype)
+    big = torch.full((2, 2), 1e5)
+    assert track_policy._halved("policy/w", big).dtype == torch.float32
+
+
+def test_the_policy_that_comes_with_poise_is_sought_among_its_data() -> None:
+    import poise
+
+    assert track_policy.SHIPPED.parent == Path(poise.__file__).parent / "data"
+    assert (track_policy.SHIPPED.parent / "walk.bvh").exists()
+
+
+def test_files_of_another_kind(run: Path, file: Path, tmp_path: Path) -> None:
+    for path, words in (
+        (tmp_path / "absent", "there is no such policy"),
+        (tmp_path, "is no run folder"),
+        (run / "policy.safetensors", "weights without the body .* Give the folder"),
+        (run / "run.safetensors", "a run's clips and settings"),
+    ):
+        with pytest.raises(PoiseError, match=words):
+            open_tracker(path)
+    data = bytearray(file.read_bytes())
+    data[-3] ^= 1
+    (tmp_path / "damaged").write_bytes(data)
+    (tmp_path / "cut").write_bytes(file.read_bytes()[:5000])
+    (tmp_path / "text").write_text("no policy")
+    for name in ("damaged", "cut", "text"):
+        with pytest.raises(PoiseError, match="damaged or no checkpoint"):
+            load_tracker(tmp_path / name)
+
+
+def test_other_versions_and_other_bodies(file: Path, tmp_path: Path) -> None:
+    tensors, meta = load_checkpoint(file)
+    path = tmp_path / "other.safetensors"
+    config = meta["config"]
+    for change in (
+        {"tracker": 99},
+        {"config": {**config, "unheard_of": 1}},
+        {"policy": {**meta["policy"], "kind": "unheard of"}},
+        {"num_obs": 7},
+        {"table": {**meta["table"], "unheard_of": 1}},
+    ):
+        save_checkpoint(path, tensors, {**meta, **change})
+        with pytest.raises(PoiseError, match="does not fit this version") as problem:
+            load_tracker(path)
+        assert "\n" not in str(problem.value)
+    save_checkpoint(path, tensors, {**meta, "character": "0123"})
+    with pytest.raises(PoiseError, match="trained for the character '0123'"):
+        load_tracker(path)
+
+
+def test_a_run_that_knows_one_clip_only(tmp_path: Path) -> None:
+    from poise.motion import ClipLibrary
+
+    runs.begin(tmp_path / "run", ClipLibrary.of([walk(0, 20)]), ResidualForce(num_envs=2))
+    # The folder of a result leads to its run.
+    for folder in (tmp_path, tmp_path / "run"):
+        with pytest.raises(PoiseError, match="only the clips that it was trained on"):
+            open_tracker(folder)
+
+
+def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
+    from poise.jobs.perpetual import run as perpetual_run
+    from poise.motion import ClipLibrary
+
+    config = replace(tracker.config, seed=3)
+    perpetual_run.begin(tmp_path, ClipLibrary.of([walk(0, 20), walk(20, 40, "b")]), config)
+    with pytest.raises(PoiseError, match="nothing has been trained"):
+        open_tracker(tmp_path)
+
+
+def test_a_program_that_only_tracks_starts_without_heavy_packages(file: Path) -> None:
+    """They would take longer to import than the policy takes to open."""
+    code = (
+        "import sys; from pathlib import Path; import poise.jobs.track; "
+        "from poise.jobs.track.policy import open_tracker; open_tracker(Path(sys.argv[1])); "
+        "print([m for m in ('sympy', 'scipy.optimize', 'scipy.spatial') if m in sys.modules])"
+    )
+    command = [sys.executable, "-c", code, str(file)]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"
