@@ -21,6 +21,7 @@ from poise.kin.ik.config import CORRECTIONS, IkConfig
 from poise.kin.ik.paper import paper_humanoid
 from poise.kin.ik.polish import PolishConfig, Polished, polish
 from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
+from poise.kin.place import OnBody, place_on_body
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
@@ -42,6 +43,7 @@ __all__ = [
     "Kinematics",
     "Levelled",
     "Limb",
+    "OnBody",
     "PolishConfig",
     "Polished",
     "RetargetConfig",
@@ -74,6 +76,7 @@ __all__ = [
     "lowest_height",
     "match_positions",
     "paper_humanoid",
+    "place_on_body",
     "polish",
     "qpos_to_clip",
     "qpos_velocity",
