@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +25,7 @@ from poise.metrics import floating, foot_slide, jerk, penetration
 from poise.motion import Clip
 
 #: How often feet are locked: a leg that is led back changes what its sole does.
-ROUNDS = 3
+SLIDE_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -111,8 +110,7 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
 
 def _locked(clip: Clip, anatomy: Anatomy) -> Clip:
     """The clip without sliding feet."""
-    steps: list[Callable[[Clip, Support, list[Fault]], Clip]] = [mend_path] + [mend_slides] * ROUNDS
-    for step in steps:
+    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:

@@ -44,7 +44,7 @@ BEARS_M, CLEAR_M = 0.015, 0.03
 #: or has fallen.
 DRAG_M, DRAG_SPEED = 0.15, 0.3
 #: Time (s) for which a sole that bears before and after may stop doing so.
-GAP_S = 0.07
+REST_GAP_S = 0.07
 
 
 class Sole(NamedTuple):
@@ -194,7 +194,7 @@ def bearing(ends: list[Tensor], fps: float, ground: float = 0.0) -> list[Tensor]
     slow = (1.0 - (step[..., :2].norm(dim=-1) / SWING_SPEED).clamp(max=1.0).square()).square()
     bears = near * slow * (step[..., 2].abs() <= CONTACT_RISE)
     # A sole that rocks or bounces for a moment has not left.
-    reach = max(1, round(GAP_S * fps / 2))
+    reach = max(1, round(REST_GAP_S * fps / 2))
     wide = functional.max_pool1d(bears.T[None], 2 * reach + 1, 1, reach)
     closed = -functional.max_pool1d(-wide, 2 * reach + 1, 1, reach)[0].T
     return [*torch.maximum(bears, closed * slow * near).split(2, -1)]

@@ -26,7 +26,7 @@ from poise.motion import Clip, Skeleton
 from poise.spatial import forward_kinematics
 
 #: How often it is done: a leg that is led back moves its foot a little.
-ROUNDS = 2
+HOLD_ROUNDS = 2
 #: How much a foot bears that stands for certain, see `Standing`.
 FIRM = 100.0
 #: Half the time (s) over which a lift out of the floor is spread.
@@ -55,7 +55,7 @@ def hold(
     standing: Callable[[Tensor, Tensor], Mapping[int, Standing]],
     fixed: Tensor | None = None,
     vertical: bool = False,
-    rounds: int = ROUNDS,
+    rounds: int = HOLD_ROUNDS,
 ) -> Tensor:
     """Rotations `(T, J, 4)` wxyz with the feet held where they stand; all but the legs stays as it is.
 
