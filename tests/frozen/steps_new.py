@@ -198,8 +198,8 @@ def step(env: ImitationEnv, action: Tensor) -> dict[str, Any]:
 
 def state(env: ImitationEnv) -> dict[str, Any]:
     out: dict[str, Any] = {"help": env.help.now, "weights": env.weights}
-    if env.hardness is not None:
-        out["hardness"] = env.hardness.state()
+    if env.failure_rates is not None:
+        out["hardness"] = env.failure_rates.state()
     if env.recoveries is not None:
         out["kind"] = env.recoveries.kind
     return out

@@ -185,4 +185,4 @@ def test_a_stopped_perpetual_run_goes_on_to_its_end(tmp_path: Path) -> None:
 
 def reopen_config(folder: Path) -> Any:
     """The settings of a run as this version reads them."""
-    return perpetual_run.from_json(load_checkpoint(folder / "run.safetensors")[1]["config"])
+    return perpetual_run.config_of(load_checkpoint(folder / "run.safetensors")[1]["config"])
