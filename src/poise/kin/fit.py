@@ -36,7 +36,7 @@ class FitReport:
     ends of cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance
     per clip between its joints and the humanoid's after conversion (turns that a chain cannot make),
     before a cycle was closed. widened: hinges whose range had to grow, with the growth in degrees.
-    excluded: body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
+    excluded: body pairs that overlap in the reference.
     """
 
     names: tuple[str, ...]
@@ -48,7 +48,6 @@ class FitReport:
     joint_error_mm: tuple[float, ...]
     widened: tuple[tuple[str, float], ...]
     excluded: tuple[tuple[str, str], ...]
-    fastest: tuple[str, float]
 
     @property
     def cyclic(self) -> tuple[bool, ...]:
@@ -144,7 +143,6 @@ def fit_humanoid(
         tuple(p.joint_error_mm for p in placed),
         widened,
         overlaps,
-        fastest(humanoid, motions, rate_hz),
     )
     return humanoid, motions, report
 
@@ -213,10 +211,3 @@ def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str,
                 if a and b:
                     found.add((humanoid.bodies[a - 1], humanoid.bodies[b - 1]))
     return tuple(sorted(found))
-
-
-def fastest(humanoid: Humanoid, motions: list[np.ndarray], rate_hz: float) -> tuple[str, float]:
-    """The hinge with the largest speed between frames, and that speed in rad/s."""
-    speeds = np.max([np.abs(np.diff(q[:, 7:], axis=0)).max(0) for q in motions], 0) * rate_hz
-    k = int(speeds.argmax())
-    return humanoid.hinges[k], float(speeds[k])

@@ -11,7 +11,6 @@ import numpy as np
 from poise.body import Humanoid
 from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
 from poise.kin.feet.level import Levelled
-from poise.kin.fit import fastest
 from poise.kin.ground import clip_flights
 from poise.motion import Clip
 
@@ -50,10 +49,9 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     humanoid, rate = tracker.humanoid, tracker.config.sim.control_hz
     clip = clip.replaced(cyclic=False)
     on = place_on_body(clip, humanoid.table, tracker.example, rate, near=humanoid)
-    speed = fastest(humanoid, [on.qpos], rate)
     flights = clip_flights(on.moved, humanoid.table)
     one = ((clip.name,), (clip.fps,), (flights,), (on.cleaned,), (None,), (on.ground,))
-    report = FitReport(*one, (on.joint_error_mm,), (), (), speed)
+    report = FitReport(*one, (on.joint_error_mm,), (), ())
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
     return Placed(clip, on.moved, on.qpos, report, on.retargeting, on.level, notes)
 
