@@ -36,7 +36,7 @@ from poise.control import (
 from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
 from poise.env.terms import done, obs, reward
 from poise.kin import fit_humanoid
-from poise.kin.own_body import on_own_body
+from poise.kin.place import on_own_body
 from poise.learn import PPOConfig
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
@@ -174,8 +174,8 @@ def build(clips: Clip | ClipLibrary, config: ResidualForce | None = None) -> Imi
     """Body, reference and task for a clip or a library; train with `.trainer()`."""
     config = config or ResidualForce()
     library = ClipLibrary.of(clips) if isinstance(clips, Clip) else clips
-    library, _ = on_own_body(library, config.body)
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
+    library, own = on_own_body(library, config.body)
+    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, own)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))

@@ -35,7 +35,7 @@ from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskCo
 from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_recovery import recovery_terms
 from poise.kin import fit_humanoid
-from poise.kin.own_body import on_own_body
+from poise.kin.place import on_own_body
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual, Recovers, RecoveryPlan
@@ -132,8 +132,9 @@ def build(
     """
     config = config or Perpetual()
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
-    library, _ = on_own_body(library, config.body)
+    library, own = on_own_body(library, config.body)
     widens = table is None or config.widens
+    table = table or own
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
