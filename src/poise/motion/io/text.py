@@ -15,8 +15,6 @@ from poise.errors import PoiseError
 
 MAX_FILE_BYTES = 512 << 20
 """Larger files are refused before they are read (22 joints at 30 Hz: about seven hours)."""
-MAX_JSON_BYTES = 128 << 20
-"""The same for JSON, which needs far more memory than its text."""
 MAX_SKELETON_BYTES = 16 << 20
 """The same for ASF skeletons, which hold no motion."""
 MAX_LINES = 10_000_000
@@ -135,9 +133,9 @@ def decode(line: bytes, path: Path, number: int) -> str:
         ) from None
 
 
-def shown(token: bytes | str) -> str:
+def shown(token: object) -> str:
     """A token for an error message: printable and short."""
-    text = token.decode("utf-8", "replace") if isinstance(token, bytes) else token
+    text = token.decode("utf-8", "replace") if isinstance(token, bytes) else str(token)
     text = "".join(c if c.isprintable() else "?" for c in text)
     return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
 

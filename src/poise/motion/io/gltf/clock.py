@@ -32,6 +32,8 @@ def clock(
     The rate is the stated one, that which Poise wrote beside the keys, or the most common spacing
     of the keys. Times that are a key up to float32 noise become that key exactly.
     """
+    if not tracks:
+        raise PoiseError("the animation moves no joint of the figure", file.path)
     inputs = {id(t.times): t.times for t in tracks}.values()
     start, end = min(t[0] for t in inputs), max(t[-1] for t in inputs)
     if end <= start:

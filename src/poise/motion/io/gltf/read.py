@@ -141,7 +141,7 @@ def _ends(file: GltfFile, joints: list[int]) -> tuple[tuple[int, tuple[float, fl
     """Bone tips that Poise wrote beside the nodes, in file units."""
     out: list[tuple[int, tuple[float, float, float]]] = []
     for j, node in enumerate(joints):
-        extras = file.doc.nodes[node].extras
+        extras = file.doc["nodes"][node].get("extras")
         tips = extras.get("poise_ends") if isinstance(extras, dict) else None
         for tip in tips if isinstance(tips, list) else []:
             if isinstance(tip, list) and len(tip) == 3 and all(type(x) in (int, float) for x in tip):

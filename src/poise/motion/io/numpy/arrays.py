@@ -52,7 +52,7 @@ def npy_header(file: IO[bytes], where: str | Path) -> Header:
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(file, _HEADER_BYTES)
     except _BAD_HEADER as error:
-        raise PoiseError(f"its NumPy header is damaged ({shown(str(error))})", where, CUT_OFF) from None
+        raise PoiseError(f"its NumPy header is damaged ({shown(error)})", where, CUT_OFF) from None
     if min(shape, default=0) < 0:
         raise PoiseError(f"its NumPy header states the shape {shape}", where, CUT_OFF)
     return Header(shape, dtype, fortran)
@@ -68,7 +68,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
                 raise PoiseError(f"the archive holds more than {MAX_KEYS} arrays", path)
             yield archive
     except _DAMAGE as error:
-        raise PoiseError(f"the NumPy archive is damaged ({shown(str(error))})", path, CUT_OFF) from None
+        raise PoiseError(f"the NumPy archive is damaged ({shown(error)})", path, CUT_OFF) from None
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror or error})", path) from None
 

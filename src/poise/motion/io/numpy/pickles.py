@@ -109,7 +109,7 @@ def loads_restricted(data: bytes, path: str | Path) -> Any:
     except PoiseError:
         raise
     except (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError) as error:
-        raise PoiseError(f"the pickle is damaged ({shown(str(error))})", path, CUT_OFF) from None
+        raise PoiseError(f"the pickle is damaged ({shown(error)})", path, CUT_OFF) from None
     except RecursionError:
         raise PoiseError("the pickle is nested too deeply", path) from None
     raise PoiseError("the pickle does not end", path, CUT_OFF)

@@ -151,9 +151,7 @@ def _skeleton(header: dict[str, str], path: Path) -> Skeleton:
         offsets = np.array(record["offsets"], dtype=np.float64).reshape(-1, 3)
         ends = np.array(record["ends"], dtype=np.float64).reshape(-1, 4)
     except (TypeError, ValueError, OverflowError) as error:
-        raise PoiseError(
-            f"the skeleton record is damaged ({shown(str(error))})", path, CUT_OFF
-        ) from None
+        raise PoiseError(f"the skeleton record is damaged ({shown(error)})", path, CUT_OFF) from None
     source = source_from_json(header["source"], path)
     if not np.isfinite(ends).all():
         raise PoiseError("the skeleton record holds an end that is not finite", path)

@@ -35,7 +35,7 @@ def source_from_json(text: str, path: Path) -> Source:
         return _fit(loads(text, path, "source"), Source)
     except (KeyError, TypeError, ValueError) as error:
         raise PoiseError(
-            f"the record of the clip's source is damaged ({shown(str(error))})", path, CUT_OFF
+            f"the record of the clip's source is damaged ({shown(error)})", path, CUT_OFF
         ) from None
 
 
@@ -66,7 +66,7 @@ def loads(text: str, path: Path, what: str) -> dict[str, Any]:
         if not isinstance(record, dict):
             raise ValueError("it is no JSON object")
     except (ValueError, RecursionError) as error:
-        raise PoiseError(f"the {what} record is damaged ({shown(str(error))})", path, CUT_OFF) from None
+        raise PoiseError(f"the {what} record is damaged ({shown(error)})", path, CUT_OFF) from None
     return record
 
 
