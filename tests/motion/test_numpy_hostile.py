@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 import random
 import time
 import zipfile
@@ -146,6 +147,15 @@ def test_sizes_that_are_stated_are_not_believed(tmp_path: Path) -> None:
     assert ": its NumPy header" in refusal(path)
     forged(path, "poses", header_of((2, 66), "|V500000000000"), b"")
     assert "array 'poses'" in refusal(path)
+
+
+def test_characters_that_do_not_exist_are_refused(tmp_path: Path) -> None:
+    path = forged(tmp_path / "a.npz", "gender", header_of((), "<U1"), (0x110000).to_bytes(4, "little"))
+    assert refusal(path) == (
+        ", array 'gender': it holds characters that do not exist. The file seems cut off"
+    )
+    data = pickle.dumps({"poses": np.array(["x"])}).replace(b"x\0\0\0", b"\0\0\x11\0")
+    assert "characters that do not e" in refusal(put(tmp_path, "a.pkl", data), allow_pickle=True)
 
 
 def test_a_zip_bomb_is_left_unpacked(tmp_path: Path) -> None:

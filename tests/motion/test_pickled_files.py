@@ -91,6 +91,11 @@ REFUSED = {
     "empty stack": (b"\x80\x02.", "the pickle is damaged"),
     "no mark": (b"\x80\x02]e.", "the pickle is damaged"),
     "huge bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b"ab.", "the pickle is damaged"),
+    "huge bytearray": (b"\x80\x05\x96" + struct.pack("<Q", 1 << 40) + b"ab.", "the pickle is damaged"),
+    "a set": (pickle.dumps({"a": {1}}), "uses EMPTY_SET"),
+    "no instruction": (b"\x80\x02\xff.", "uses an unknown instruction"),
+    "a state of a list": (b"\x80\x02]}b.", "the pickle is damaged"),
+    "a call of a list": (b"\x80\x02])R.", "the pickle is damaged"),
     "huge array": (
         b"\x80\x02cnumpy\nndarray\n0cnumpy.core.multiarray\n_reconstruct\n)R(K\x01\x8a\x06"
         + (1 << 44).to_bytes(6, "little")

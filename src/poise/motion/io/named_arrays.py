@@ -18,8 +18,8 @@ from poise.motion.io.numpy import (
     read_smpl,
     write_amass,
 )
-from poise.motion.io.numpy.arrays import NPY_MAGIC, Archive, first_member, npy_header
-from poise.motion.io.numpy.pickles import ASK, load_restricted
+from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header
+from poise.motion.io.numpy.pickles import load_restricted, loads_restricted
 from poise.motion.io.own import read_poise_npz, write_poise_npz
 from poise.motion.io.own.npz import MARK
 from poise.motion.io.points import is_mdm, is_points, read_mdm, read_points_arrays
@@ -72,7 +72,7 @@ def looks_like_pickle(head: bytes) -> bool:
 
 def read_npz(path: Path, options: Options) -> Clip:
     """The clip in a `.npz`, by the names of its arrays."""
-    return _read(Archive(path, options.allow_pickle), path, options)
+    return _read(Archive(path, loads_restricted if options.allow_pickle else None), path, options)
 
 
 def read_pickled(path: Path, options: Options) -> Clip:
