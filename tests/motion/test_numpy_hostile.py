@@ -86,7 +86,7 @@ AMASS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "bad rate": (
         {**amass(), "mocap_framerate": np.array(0)},
-        ": mocap_framerate is 0, which is no frame rate. State it with --fps F",
+        ": the frame rate must be from 0.1 to 2000 per second, got 0. State the right one with --fps F",
     ),
     "nan rate": (
         {**amass(), "mocap_framerate": np.array(np.nan)},

@@ -226,7 +226,9 @@ def test_poselib_refusals(tmp_path: Path) -> None:
         ": the rotation of joint 'torso' at frame 3 is nan, not a usable number"
     )
     assert refusal(root_translation=None).startswith(": this poselib motion lacks root_translation.")
-    assert refusal(fps=0) == ": fps is 0, which is no frame rate. State it with --fps F"
+    assert refusal(fps=0) == (
+        ": the frame rate must be from 0.1 to 2000 per second, got 0. State the right one with --fps F"
+    )
     tree = dict(poselib()["skeleton_tree"])
     tree["parent_indices"] = np.array([-1, 2, 0, 0, 1])
     assert refusal(skeleton_tree=tree) == ": its parent_indices do not put parents before children"

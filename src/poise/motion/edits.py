@@ -7,6 +7,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
+from poise.motion.limits import check_rate
 from poise.spatial import slerp
 
 
@@ -16,8 +17,7 @@ def resample(clip: Clip, fps: float) -> Clip:
     The last sample falls on or before the clip's last frame (within a hundredth of a frame, since
     files round their frame times).
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise PoiseError(f"the frame rate must be above 0, got {fps}", clip.name)
+    check_rate(fps, clip.name)
     count = int(np.floor(clip.seconds * fps + 1e-2)) + 1
     if count < 2:
         raise PoiseError(

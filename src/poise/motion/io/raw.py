@@ -20,6 +20,7 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS, listed
+from poise.motion.limits import check_poses, check_rate
 from poise.motion.skeleton import Channel, Skeleton, Source
 from poise.spatial import forward_kinematics, normalize, unwrap_quats
 
@@ -94,7 +95,9 @@ def quats_from_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
 
 def check_options(options: Options) -> None:
     """Refuses overrides that make no sense."""
-    stated = (("unit", options.unit_m), ("fps", options.fps), ("smooth", options.smooth_hz))
+    stated = (("unit", options.unit_m), ("smooth", options.smooth_hz))
+    if options.fps is not None:
+        check_rate(options.fps, "--fps")
     for name, value in stated:
         if value is not None and not (np.isfinite(value) and value > 0):
             raise PoiseError(f"--{name} must be above 0, got {value}")
@@ -105,6 +108,8 @@ def check_options(options: Options) -> None:
 def assemble(raw: RawMotion, options: Options) -> Clip:
     """The clip in metres, Z up, with every guess and repair in its source's notes."""
     _check(raw)
+    check_rate(float(options.fps or raw.fps), raw.path)
+    check_poses(len(raw.rot), len(raw.names), raw.path)
     notes = list(raw.notes)
     whole = len(raw.rot)
     raw = _drop_rest_frames(raw, notes)

@@ -25,6 +25,8 @@ MAX_HEADER_WORDS = 1_000_000
 """More words than this before the motion starts are refused."""
 MAX_JOINTS = 2000
 """Skeletons with more joints are refused."""
+MAX_NAME = 200
+"""Joints and keypoints with longer names are refused."""
 MAX_VALUE = 1e8
 """Numbers larger than this, in any unit, are taken for damage."""
 CUT_OFF = "The file seems cut off"

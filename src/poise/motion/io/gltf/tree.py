@@ -12,7 +12,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.io.gltf.accessor import index_of
 from poise.motion.io.gltf.file import GltfFile
-from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, shown
+from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.spatial import matrix_to_quat
 
 MAX_DEPTH = 1000
@@ -73,7 +73,7 @@ def read_tree(file: GltfFile) -> Tree:
 def _name(value: object, index: int, file: GltfFile) -> str:
     if value is None or value == "":
         return f"node_{index}"
-    if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
+    if not isinstance(value, str) or len(value) > MAX_NAME or not value.isprintable():
         raise PoiseError(f"node {index} has the unusable name {shown(value)}", file.path)
     return value
 

@@ -60,8 +60,6 @@ def read_poselib(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
     refuse_bad(root_pos, "the root position", path)
     rot = _local(xyzw, parents, bool(data["is_local"]), names, path)
     fps = one_number(data, "fps", path)
-    if not 0 < fps <= 1e5:
-        raise PoiseError(f"fps is {fps:g}, which is no frame rate", path, "State it with --fps F")
     props = [n for n in names if n.lower() in _PROPS]
     note = f"Held things are kept as joints: {listed(props)}"
     raw = RawMotion(

@@ -31,6 +31,7 @@ from poise.motion.io.text import (
     shown,
     write_whole,
 )
+from poise.motion.limits import check_rate
 from poise.motion.skeleton import Skeleton
 
 VERSION = 1
@@ -97,8 +98,7 @@ def read_csv(path: Path, options: Options) -> Clip:
     skeleton = _skeleton(header, path)
     order = _order(lines, first, skeleton, path)
     rate = number(header["fps"], _place(path, "fps"))
-    if not rate > 0:
-        raise PoiseError(f"the frame rate must be above 0, got {rate:g}", _place(path, "fps"))
+    check_rate(rate, path)
     table = _table(lines, first, order, path)
     _check_times(table[:, 0], rate, path)
     root_pos = table[:, 1:4]

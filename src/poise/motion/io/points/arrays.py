@@ -14,6 +14,7 @@ from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
 from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
 from poise.motion.io.raw import Options
 from poise.motion.io.text import MAX_JOINTS, shown
+from poise.motion.limits import check_rate
 
 HUMANML3D = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
@@ -56,8 +57,7 @@ def array_points(data: Mapping[str, Any], path: Path, options: Options | None = 
         if "fps" not in data:
             raise PoiseError("the arrays state no frame rate", path, "Add fps, or give --fps F")
         fps = one_number(data, "fps", path)
-        if not fps > 0:
-            raise PoiseError(f"fps must be above 0, got {fps:g}", path)
+        check_rate(fps, path)
     unit = one_number(data, "unit_m", path) if "unit_m" in data else None
     up = text_of(data["up_axis"]).upper() if "up_axis" in data else None
     if unit is not None and not unit > 0:

@@ -70,7 +70,7 @@ def csv_points(path: Path, options: Options | None = None) -> RawPoints:
     stated: dict[str, str] = {}
     at = 0
     while at < len(lines) and (not lines[at].strip() or lines[at].lstrip()[0] == "#"):
-        stated.update(re.findall(r"(\w+)\s*[=:]\s*([^\s,;]+)", lines[at].lower()))
+        stated.update(re.findall(r"\b(\w{1,30})\s*[=:]\s*([^\s,;]+)", lines[at].lower()))
         at += 1
     if at == len(lines):
         raise PoiseError("the table has no header", path, CUT_OFF)
@@ -163,10 +163,7 @@ def _rate(
     if options is not None and options.fps is not None:
         return options.fps
     if "fps" in stated:
-        rate = number(stated["fps"], path.name)
-        if not rate > 0:
-            raise PoiseError(f"fps must be above 0, got {rate:g}", path)
-        return rate
+        return number(stated["fps"], path.name)
     if layout.time is None:
         raise PoiseError(
             "the table has neither times nor a frame rate", path, "State it with --fps FRAMES_PER_SECOND"

@@ -12,8 +12,9 @@ from poise.motion.clip import Clip
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
 from poise.motion.io.raw import Options, vectors_to_z_up
-from poise.motion.io.text import MAX_JOINTS, MAX_VALUE
+from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
+from poise.motion.limits import check_poses, check_rate
 from poise.motion.points import FitConfig, fit_clip
 from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
@@ -58,6 +59,7 @@ def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
         PoiseError: too few frames, flat (2D) points, a person of no human size.
     """
     _check(raw)
+    check_rate(float(options.fps or raw.fps), raw.path)
     probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, _of(raw))
     bones = _body(probe)
     notes = list(raw.notes)
@@ -97,10 +99,16 @@ def _check(raw: RawPoints) -> None:
         raise PoiseError(
             f"it has {len(raw.names)} keypoints, more than the {MAX_JOINTS} allowed", raw.path
         )
+    longest = max(raw.names, key=len, default="")
+    if len(longest) > MAX_NAME:
+        raise PoiseError(
+            f"the keypoint {shown(longest)} has a name of {len(longest)} characters", raw.path
+        )
     if frames < 2:
         raise PoiseError(
             f"it has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2", raw.path
         )
+    check_poses(frames, len(raw.names), raw.path)
     known = raw.positions[~np.isnan(raw.positions).any(-1)]
     if not len(known):
         raise PoiseError("every keypoint is missing in every frame", raw.path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def _header(lines: list[str], path: Path) -> _Header:
             "the labels of the points were expected: Frame#, Time, then one per point",
             at_line(path, _LABEL_LINE + 1),
         )
-    twice = next((n for i, n in enumerate(labels) if n in labels[:i]), None)
+    twice = next((name for name, count in Counter(labels).items() if count > 1), None)
     if twice is not None:
         raise PoiseError(f"keypoint {shown(twice)} appears twice", at_line(path, _LABEL_LINE + 1))
     stated = fields.get("nummarkers", "")

@@ -15,10 +15,8 @@ from poise.motion.clip import Clip
 from poise.motion.io.nodes import base_of, checked_unit, rigid_bones, unique_names
 from poise.motion.io.raw import Options, RawMotion, assemble
 from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, check_file, listed, shown
+from poise.motion.limits import check_poses
 from poise.spatial import matrix_to_quat
-
-MAX_FRAMES = 2_000_000
-"""Motions that would need more frames are refused."""
 
 _EVEN_TIME = 0.01
 _SHEAR = 1e-3
@@ -101,7 +99,7 @@ def _raw_motion(
     stated = [str(n) for n in rig.GetJointNamesAttr().Get() or []]
     given = stated if len(stated) == len(order) else [o.rsplit("/", 1)[-1] for o in order]
     names = unique_names(given, notes)
-    codes, fps = _codes(stage, query, options, path, notes)
+    codes, fps = _codes(stage, query, len(order), options, path, notes)
     local = np.stack([np.array(query.ComputeJointLocalTransforms(c)) for c in codes])
     above = np.array(pxr.UsdGeom.Xformable(rig).ComputeLocalToWorldTransform(codes[0]))
     top = [x[0] for x in _parts(above[None], f"{path}, the skeleton's own transform", codes)]
@@ -137,7 +135,7 @@ def _raw_motion(
 
 
 def _codes(
-    stage: Any, query: Any, options: Options, path: Path, notes: list[str]
+    stage: Any, query: Any, joints: int, options: Options, path: Path, notes: list[str]
 ) -> tuple[np.ndarray, float]:
     """The time codes `(T,)` at which the pose is read, and frames per second.
 
@@ -157,10 +155,10 @@ def _codes(
             f"The keys are not evenly spaced; they were read at {per_second / step:.6g} per second"
         )
     else:
+        check_poses(len(samples), joints, path)
         return samples, per_second / step
     count = int(np.floor((samples[-1] - samples[0]) / step + 1e-6)) + 1
-    if count > MAX_FRAMES:
-        raise PoiseError(f"the motion would need {count} frames, too many to read", path)
+    check_poses(count, joints, path)
     return samples[0] + step * np.arange(count), per_second / step
 
 
