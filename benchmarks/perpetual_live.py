@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.eval.field_table import field_table
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
-from poise.motion.io.raw import Options as Stated
+from poise.motion.io.raw import ReadOptions as Stated
 from poise.motion.noise import robustness_levels
 from poise.recipes.library.files import motion_files_of
 from poise.recipes.track import TrackConfig, side_by_side, track

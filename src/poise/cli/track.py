@@ -216,7 +216,7 @@ def outcome(tracked: Tracked, reset: bool) -> str:
 
 def read(path: Path, reading: Reading) -> Clip | Keypoints:
     """The motion in a file; keypoints stay keypoints."""
-    from poise.motion.io.raw import Options as Stated
+    from poise.motion.io.raw import ReadOptions as Stated
     from poise.recipes.track.points import points_of
 
     clip = reading.read(path)

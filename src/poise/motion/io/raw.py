@@ -26,7 +26,7 @@ from poise.spatial import forward_kinematics, normalize, unwrap_quats
 
 
 @dataclass(frozen=True)
-class Options:
+class ReadOptions:
     """What the caller states instead of leaving it to a guess; None where it is not stated."""
 
     skeleton: Path | None = None
@@ -93,7 +93,7 @@ def quats_from_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
     return np.concatenate((q[..., :1], vectors_from_z_up(q[..., 1:], up_axis)), -1)
 
 
-def check_options(options: Options) -> None:
+def check_options(options: ReadOptions) -> None:
     """Refuses overrides that make no sense."""
     stated = (("unit", options.unit_m), ("smooth", options.smooth_hz))
     if options.fps is not None:
@@ -105,7 +105,7 @@ def check_options(options: Options) -> None:
         raise PoiseError(f"--up must be Y or Z, got '{options.up_axis}'")
 
 
-def assemble(raw: RawMotion, options: Options) -> Clip:
+def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
     """The clip in metres, Z up, with every guess and repair in its source's notes."""
     _check(raw)
     check_rate(float(options.fps or raw.fps), raw.path)
@@ -151,7 +151,9 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
     return Clip(skeleton, root_pos, quats_to_z_up(rot, axis), fps, raw.path.stem, raw.cyclic)
 
 
-def _evidence(raw: RawMotion, options: Options, up: Guess, unit: Guess) -> tuple[tuple[str, str], ...]:
+def _evidence(
+    raw: RawMotion, options: ReadOptions, up: Guess, unit: Guess
+) -> tuple[tuple[str, str], ...]:
     """Why the vertical, the unit and the frame rate are what they are, one sentence each."""
     by_format = "The format itself states it"
     if options.fps is not None:
@@ -194,7 +196,7 @@ def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
     return replace(raw, root_pos=raw.root_pos[count:], rot=raw.rot[count:])
 
 
-def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: Options) -> tuple[Guess, Guess]:
+def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple[Guess, Guess]:
     """The vertical and the metres per unit, stated or guessed, each with its evidence."""
     at = sampled(len(rot))
     offsets = torch.tensor(raw.offsets)

@@ -74,6 +74,15 @@ def read_head(path: Path, size: int = 4096) -> bytes:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
 
 
+def read_binary(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """All bytes of a file of any kind, after `check_file`."""
+    check_file(path, limit)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+
+
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """All bytes of a text file; binary data, other encodings and endless lines are refused.
 

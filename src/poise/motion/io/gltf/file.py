@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 from poise.errors import PoiseError
 from poise.motion.io.json import json_object
-from poise.motion.io.text import CUT_OFF, MAX_FILE_BYTES, check_file, shown
+from poise.motion.io.text import CUT_OFF, MAX_FILE_BYTES, read_binary, shown
 
 MAGIC = b"glTF"
 JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
@@ -71,7 +71,7 @@ class GltfFile:
         elif uri.startswith(_DATA_URI):
             data = _embedded(uri, index, self.path)
         else:
-            data = _beside(uri, index, self.path).read_bytes()
+            data = read_binary(_beside(uri, index, self.path))
         if len(data) < length:
             raise PoiseError(
                 f"buffer {index} has {len(data)} bytes, but the document states {length}",
@@ -87,11 +87,7 @@ def load_gltf(path: Path) -> GltfFile:
     Raises:
         PoiseError: bad container, broken JSON, an unknown version, too many objects.
     """
-    check_file(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+    data = read_binary(path)
     text, blob = _chunks(data, path) if data[:4] == MAGIC else (data, None)
     if text.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
         raise PoiseError("this is no glTF: it starts with neither 'glTF' nor '{'", path)
@@ -206,5 +202,4 @@ def _beside(uri: str, index: int, path: Path) -> Path:
         raise PoiseError(
             f"its buffer file {shown(name)} is missing", path, "Put the buffer beside the file"
         )
-    check_file(target)
     return target

@@ -23,7 +23,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.motion.io.numpy.arrays import MAX_ARRAY_BYTES, NPY_MAGIC, npy_header
 from poise.motion.io.numpy.pickled_arrays import CALLS, Array, Dtype, array_of, checked, plain_dict, text
-from poise.motion.io.text import CUT_OFF, check_file, shown
+from poise.motion.io.text import CUT_OFF, read_binary, shown
 
 _MAX_STEPS = 5_000_000
 _Library: Any = pickle._Unpickler  # type: ignore[attr-defined]
@@ -45,11 +45,7 @@ def load_restricted(path: str | Path) -> dict[str, Any]:
         PoiseError: the file names anything but NumPy data, is damaged, or holds no dict.
     """
     path = Path(path)
-    check_file(path, MAX_ARRAY_BYTES)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+    data = read_binary(path, MAX_ARRAY_BYTES)
     if data.startswith(NPY_MAGIC):
         file = io.BytesIO(data)
         header = npy_header(file, path)
@@ -104,11 +100,7 @@ class _Machine(_Library):
         named = f"{module}.{name}"
         for core in _CORE:
             named = named.replace(core, "numpy.core.", 1) if named.startswith(core) else named
-        if named not in CALLS and named not in (
-            "numpy.ndarray",
-            "__builtin__.object",
-            "builtins.object",
-        ):
+        if named not in CALLS and named not in _TYPES:
             raise PoiseError(
                 f"the pickle names {shown(named)}, which is no plain data, and was not read",
                 self.where,

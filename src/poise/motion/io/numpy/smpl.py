@@ -21,8 +21,8 @@ from poise.motion.info import sampled
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
 from poise.motion.io.raw import (
-    Options,
     RawMotion,
+    ReadOptions,
     assemble,
     vectors_from_z_up,
 )
@@ -50,7 +50,7 @@ def is_smpl(keys: Mapping[str, Any] | Sequence[str]) -> bool:
     )
 
 
-def read_smpl(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """A clip from named arrays: `poses (T, 66|72|156|165)` rad (or its parts), `trans (T, 3)` m,
     `betas`, `gender`, `mocap_framerate`.
 
@@ -93,7 +93,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
         notes=tuple(notes),
         extra=_extra(data, layout, pelvis, up),
     )
-    clip = assemble(raw, Options(fps=options.fps))
+    clip = assemble(raw, ReadOptions(fps=options.fps))
     source = {"up_axis": up, "unit_m": world_unit / scale}
     return clip.replaced(skeleton=clip.skeleton.with_source(**source))
 
@@ -163,7 +163,7 @@ def _parts(data: Mapping[str, Any], path: Path) -> np.ndarray:
     return np.concatenate(found, 1)
 
 
-def _scale(data: Mapping[str, Any], path: Path, options: Options) -> tuple[float, float]:
+def _scale(data: Mapping[str, Any], path: Path, options: ReadOptions) -> tuple[float, float]:
     """What `trans` is divided by (AIST++ `smpl_scaling`), and metres per its unit."""
     scale = 1.0
     if "smpl_scaling" in data:
@@ -199,7 +199,7 @@ def _rest(
 
 def _up(
     data: Mapping[str, Any],
-    options: Options,
+    options: ReadOptions,
     layout: Layout,
     root_pos: np.ndarray,
     quat: torch.Tensor,

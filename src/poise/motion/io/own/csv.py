@@ -20,7 +20,7 @@ from poise.motion.io.own.record import (
     source_from_json,
     source_to_json,
 )
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import (
     CUT_OFF,
     append_numbers,
@@ -86,7 +86,7 @@ def looks_like_csv(head: bytes) -> bool:
     return head.startswith(MARK.encode())
 
 
-def read_csv(path: Path, options: Options) -> Clip:
+def read_csv(path: Path, options: ReadOptions) -> Clip:
     """The clip in a CSV of Poise, exactly as it was written.
 
     Raises:

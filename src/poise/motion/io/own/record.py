@@ -12,7 +12,7 @@ import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import CUT_OFF, MAX_JOINTS, MAX_VALUE, shown
 from poise.motion.skeleton import Skeleton, Source
 
@@ -125,7 +125,7 @@ def make_clip(
         raise PoiseError(error.what, path, error.hint) from None
 
 
-def refuse_overrides(options: Options, path: Path) -> None:
+def refuse_overrides(options: ReadOptions, path: Path) -> None:
     """Unit and vertical are stated in Poise's own files, so nothing may override them."""
     for flag, value in (("--unit", options.unit_m), ("--up", options.up_axis)):
         if value is not None:

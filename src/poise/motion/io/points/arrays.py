@@ -12,7 +12,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
 from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import MAX_JOINTS, shown
 from poise.motion.limits import check_rate
 
@@ -30,12 +30,12 @@ def is_points(data: Mapping[str, Any]) -> bool:
     return "positions" in data and "names" in data and not {"rot", "rotations", "quats"} & set(data)
 
 
-def read_points_arrays(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_points_arrays(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """Keypoint arrays as the clip of a skeleton that is fitted to them."""
     return points_clip(array_points(data, path, options), options)
 
 
-def array_points(data: Mapping[str, Any], path: Path, options: Options | None = None) -> RawPoints:
+def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions | None = None) -> RawPoints:
     """`positions (T, K, 3)` (NaN where missing), `names (K)`, `fps`; optional `confidence (T, K)`,
     `unit_m` and `up_axis`.
 
@@ -73,7 +73,7 @@ def is_mdm(data: Mapping[str, Any]) -> bool:
     return "motion" in data and "lengths" in data
 
 
-def read_mdm(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_mdm(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """One motion in the results of a motion diffusion model: the first, or number `options.take`."""
     take = options.take or "0"
     if not take.isdecimal():

@@ -11,7 +11,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
-from poise.motion.io.raw import Options, vectors_to_z_up
+from poise.motion.io.raw import ReadOptions, vectors_to_z_up
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
 from poise.motion.limits import check_poses, check_rate
@@ -49,7 +49,7 @@ _TREE |= {f"{s} {part}": above for s in SIDES for part, above in (("hip", "hips"
 _TREE |= {f"{s} knee": f"{s} hip" for s in SIDES} | {f"{s} ankle": f"{s} knee" for s in SIDES}
 
 
-def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
+def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     """Keypoints in metres, Z up, with every guess in the source's notes.
 
     Unit and vertical are guessed as for skeletons (`guess.py`), from the places of a body that the
@@ -84,7 +84,7 @@ def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
     )  # fmt: skip
 
 
-def points_clip(raw: RawPoints, options: Options) -> Clip:
+def points_clip(raw: RawPoints, options: ReadOptions) -> Clip:
     """The clip of a skeleton that follows the file's keypoints, see `fit_clip`."""
     return fit_clip(assemble_points(raw, options), FitConfig(smooth_hz=options.smooth_hz))
 
@@ -154,7 +154,7 @@ def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
     return out
 
 
-def _unit(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw: RawPoints) -> Guess:
+def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
     names, parents, pos = bones
     height, how = body_height(names, parents, _offsets(parents, pos), pos)
     if not height > 0:
@@ -167,7 +167,7 @@ def _unit(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw:
     return guess_unit(height, how, None, raw.path)
 
 
-def _up(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw: RawPoints) -> Guess:
+def _up(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
     names, _, pos = bones
     if options.up_axis is not None:
         return Guess(options.up_axis.upper())

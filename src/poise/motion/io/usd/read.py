@@ -13,7 +13,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.nodes import base_of, checked_unit, rigid_bones, unique_names
-from poise.motion.io.raw import Options, RawMotion, assemble
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, check_file, listed, shown
 from poise.motion.limits import check_poses
 from poise.spatial import matrix_to_quat
@@ -35,7 +35,7 @@ def pxr_package() -> Any:
         ) from None
 
 
-def read_usd(path: Path, options: Options) -> Clip:
+def read_usd(path: Path, options: ReadOptions) -> Clip:
     """The first animated UsdSkel skeleton of a .usda, .usd or .usdc file.
 
     Unit and vertical are the stage's. The file must stand alone: layers, references and payloads
@@ -88,7 +88,7 @@ def _animated_skeleton(pxr: Any, stage: Any, path: Path, notes: list[str]) -> tu
 
 
 def _raw_motion(
-    pxr: Any, stage: Any, rig: Any, query: Any, path: Path, options: Options, notes: list[str]
+    pxr: Any, stage: Any, rig: Any, query: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> RawMotion:
     order = [str(j) for j in query.GetJointOrder()]
     parents = [int(p) for p in query.GetTopology().GetParentIndices()]
@@ -135,7 +135,7 @@ def _raw_motion(
 
 
 def _codes(
-    stage: Any, query: Any, joints: int, options: Options, path: Path, notes: list[str]
+    stage: Any, query: Any, joints: int, options: ReadOptions, path: Path, notes: list[str]
 ) -> tuple[np.ndarray, float]:
     """The time codes `(T,)` at which the pose is read, and frames per second.
 
