@@ -1,4 +1,4 @@
-"""NumPy archives and pickles: what they hold decides who reads them."""
+"""NumPy archives and pickles: what they hold decides how they are read."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from poise.motion.io.text import listed, shown
 
 @dataclass(frozen=True)
 class Kind:
-    """Named arrays that are a motion: what they are called, how they are known, who reads them."""
+    """Named arrays that are a motion: what they are called, how they are known, what reads them."""
 
     name: str
     holds: Callable[[Mapping[str, Any]], bool]

@@ -32,24 +32,24 @@ def source_from_json(text: str, path: Path) -> Source:
     Fields that this version does not know are left out, fields that are not there get defaults.
     """
     try:
-        return _fit(loads(text, path, "source"), Source)
+        return fitted(loads(text, path, "source"), Source)
     except (KeyError, TypeError, ValueError) as error:
         raise PoiseError(
             f"the record of the clip's source is damaged ({shown(error)})", path, CUT_OFF
         ) from None
 
 
-def _fit(value: Any, kind: Any) -> Any:
-    """JSON data as a value of the annotated type `kind`; anything else is a ValueError."""
+def fitted(value: Any, kind: Any) -> Any:
+    """JSON data as a value of the annotated type `kind`, where tuples are lists; else a ValueError."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is UnionType:
-        return None if value is None and NoneType in inner else _fit(value, inner[0])
-    if origin is tuple and isinstance(value, list):
+        return None if value is None and NoneType in inner else fitted(value, inner[0])
+    if origin is tuple and isinstance(value, list | tuple):
         kinds = [inner[0]] * len(value) if inner[-1] is ... else inner
-        return tuple(_fit(v, k) for v, k in zip(value, kinds, strict=True))
+        return tuple(fitted(v, k) for v, k in zip(value, kinds, strict=True))
     if is_dataclass(kind) and isinstance(value, dict):
         fields = get_type_hints(kind)
-        return kind(**{k: _fit(value[k], fields[k]) for k in fields if k in value})  # type: ignore[operator]
+        return kind(**{k: fitted(value[k], fields[k]) for k in fields if k in value})  # type: ignore[operator]
     if kind is float and type(value) in (int, float):
         return float(value)
     if type(value) is not kind:

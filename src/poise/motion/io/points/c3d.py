@@ -130,7 +130,7 @@ def _read_apart(path: Path, size: int) -> dict[str, np.ndarray]:
     Damaged files make the C++ library loop without end or take any memory, so it works under a limit of
     both and can be stopped.
     """
-    seconds = 60 + size / 1e6
+    seconds = 10 + size / 5e5
     command = [sys.executable, "-c", _READER, str(path.resolve()), str(int(4e9 + 40 * size))]
     try:
         done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
