@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from handmade_motion_files import bvh_text, deepmimic_text
+from handmade_numpy_files import odd_clip
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip, write_clip
@@ -172,3 +173,18 @@ def test_refusals(pxr: Any, tmp_path: Path, text: str, message: str) -> None:
         read_clip(path)
     assert str(error.value).startswith(str(path)) and message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_fault_within_the_library_is_a_refusal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damaged binary files fail anywhere in OpenUSD, long after they were opened."""
+    from poise.motion.io.usd import read
+
+    def fails(*_: object) -> None:
+        raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+
+    write_clip(odd_clip(), tmp_path / "a.usda")
+    monkeypatch.setattr(read, "_raw_motion", fails)
+    with pytest.raises(PoiseError, match=r"a\.usda: USD cannot read the file. It seems cut off"):
+        read_clip(tmp_path / "a.usda")

@@ -19,6 +19,7 @@ from poise.motion.limits import check_poses
 from poise.spatial import matrix_to_quat
 
 _EVEN_TIME = 0.01
+_DAMAGED = "It seems cut off or is no USD file"
 _SHEAR = 1e-3
 
 
@@ -46,13 +47,23 @@ def read_usd(path: Path, options: ReadOptions) -> Clip:
     """
     pxr = pxr_package()
     check_file(path)
+    notes: list[str] = []
     try:
-        # Anonymous, so that a file that has changed is read anew.
-        layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path.resolve()))
-    except pxr.Tf.ErrorException:
-        layer = None
+        stage = _stage(pxr, path)
+        rig, query = _animated_skeleton(pxr, stage, path, notes)
+        raw = _raw_motion(pxr, stage, rig, query, path, options, notes)
+    except (pxr.Tf.ErrorException, UnicodeDecodeError):
+        raise PoiseError(
+            "USD cannot read the file", path, "It seems cut off or is no USD file"
+        ) from None
+    return assemble(raw, options)
+
+
+def _stage(pxr: Any, path: Path) -> Any:
+    # Anonymous, so that a file that has changed is read anew.
+    layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path.resolve()))
     if layer is None:
-        raise PoiseError("USD cannot read the file", path, "It seems cut off or is no USD file")
+        raise PoiseError("USD cannot read the file", path, _DAMAGED)
     others = sorted(set(layer.GetCompositionAssetDependencies()))
     if others:
         raise PoiseError(
@@ -60,10 +71,7 @@ def read_usd(path: Path, options: ReadOptions) -> Clip:
             path,
             "Flatten it into one file first: usdcat --flatten IN -o OUT",
         )
-    stage = pxr.Usd.Stage.Open(layer)
-    notes: list[str] = []
-    rig, query = _animated_skeleton(pxr, stage, path, notes)
-    return assemble(_raw_motion(pxr, stage, rig, query, path, options, notes), options)
+    return pxr.Usd.Stage.Open(layer)
 
 
 def _animated_skeleton(pxr: Any, stage: Any, path: Path, notes: list[str]) -> tuple[Any, Any]:
