@@ -217,7 +217,7 @@ def outcome(tracked: Tracked, reset: bool) -> str:
 def read(path: Path, reading: Reading) -> Clip | Keypoints:
     """The motion in a file; keypoints stay keypoints."""
     from poise.jobs.track.points import points_of
-    from poise.motion.io.raw import Options as Stated
+    from poise.motion.io.raw import ReadOptions as Stated
 
     clip = reading.read(path)
     if reading.ground is not None or reading.swap_sides:
