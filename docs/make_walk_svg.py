@@ -69,7 +69,9 @@ def figure(clip: Clip, lane: float, kind: str, middle: np.ndarray) -> str:
         frames = [outline(f, bones(clip, name)) for f in flat]
         colour = "#{:02x}{:02x}{:02x}".format(*(int(c * light) for c in COLOURS[kind]))
         stroke = f'stroke="{colour}" stroke-width="{width * SCALE:.0f}"'
-        parts.append(f'<path {stroke} d="{frames[len(frames) // 2]}">{animate("d", frames, seconds)}</path>')
+        parts.append(
+            f'<path {stroke} d="{frames[len(frames) // 2]}">{animate("d", frames, seconds)}</path>'
+        )
         if name == "":
             head = clip.skeleton.names.index("Head")
             crown = flat[:, head] + [2, -0.1 * SCALE]
