@@ -78,9 +78,8 @@ def figure(clip: Clip, lane: float, kind: str, middle: np.ndarray) -> str:
             x, y = ([f"{v:.0f}" for v in crown[:, i]] for i in (0, 1))
             k = len(x) // 2
             move = animate("cx", x, seconds) + animate("cy", y, seconds)
-            parts.append(
-                f'<circle r="{0.105 * SCALE:.0f}" fill="{colour}" cx="{x[k]}" cy="{y[k]}">{move}</circle>'
-            )
+            at = f'cx="{x[k]}" cy="{y[k]}"'
+            parts.append(f'<circle r="{0.105 * SCALE:.0f}" fill="{colour}" {at}>{move}</circle>')
     return "\n".join(parts)
 
 
@@ -97,7 +96,8 @@ def shadow(places: np.ndarray, right: np.ndarray, up: np.ndarray, seconds: float
 def animate(name: str, values: list[str], seconds: float) -> str:
     """The values of an attribute over time, again and again."""
     listed = ";".join(values)
-    return f'<animate attributeName="{name}" dur="{seconds:.2f}s" repeatCount="indefinite" values="{listed}"/>'
+    often = f'dur="{seconds:.2f}s" repeatCount="indefinite"'
+    return f'<animate attributeName="{name}" {often} values="{listed}"/>'
 
 
 def main(clip: Path, simulated: Path, out: Path) -> None:

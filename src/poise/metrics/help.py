@@ -19,11 +19,16 @@ from poise.spatial import GRAVITY
 class HelpAudit:
     """Help over the valid frames; zero wrenches give exactly zero.
 
-    force_mean_n, force_p95_n: mean and 95th percentile over frames of `sum_m ||F_m||`, N.
-    torque_mean_nm, torque_p95_nm: the same of `sum_m ||tau_m||`, N m.
-    work_j_per_s: mean over frames of `sum_m |F_m . v_m + tau_m . omega_m|`, J/s.
-    share_of_body_weight: `force_mean_n / (m g)`.
-    force_n, torque_nm, power_w: the per-frame values `(..., T)`.
+    Attributes:
+        force_mean_n: N, mean over frames of `sum_m ||F_m||`.
+        force_p95_n: N, its 95th percentile.
+        torque_mean_nm: N m, mean over frames of `sum_m ||tau_m||`.
+        torque_p95_nm: N m, its 95th percentile.
+        work_j_per_s: J/s, mean over frames of `sum_m |F_m . v_m + tau_m . omega_m|`.
+        share_of_body_weight: `force_mean_n / (m g)`.
+        force_n: `(..., T)` N, per frame.
+        torque_nm: `(..., T)` N m, per frame.
+        power_w: `(..., T)` W, per frame.
     """
 
     force_mean_n: float
