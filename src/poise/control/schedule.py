@@ -67,8 +67,7 @@ class SuccessHelp:
     """Less help while episodes succeed, more when they fail.
 
     Exploration fails many episodes that the policy itself would not: where the policy succeeds from
-        97 % of
-    the starts, training shows 0.65.
+    97 % of the starts, training shows 0.65.
 
     Attributes:
         lower_at: success from which the scale is multiplied by `factor`.

@@ -55,9 +55,8 @@ def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
 def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
     """MPJPE after the best similarity (rotation, translation, scale) per frame, mm; returns `(..., T)`.
 
-    Procrustes: with centred X, Y the rotation R of `Y^T X` (`spatial.best_rotation`); its singular
-        values are
-    S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
+    Procrustes: with centred X, Y the rotation R of `Y^T X` (`spatial.best_rotation`), with the singular
+    values S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
     """
     _check_pair(pos, ref)
     x, y = pos.double(), ref.double()
