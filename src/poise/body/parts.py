@@ -101,8 +101,9 @@ def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
     """The body parts of a human skeleton: by its joints' names, else by its shape.
 
     Args:
-        skeleton: any human tree. clips: motions of it; their first frame shows how it stands, for
-            skeletons with names that say nothing and a folded rest pose.
+        skeleton: any human tree.
+        clips: motions of it; their first frame shows how it stands, for skeletons with names that
+            say nothing and a folded rest pose.
 
     Raises:
         PoiseError: where a foot or a hand can be told neither by name nor by shape.

@@ -71,8 +71,12 @@ def stable_pd_torque(
     Args:
         mass: `(..., nv, nv)` joint-space inertia M with a six-dimensional root first.
         bias: `(..., nv)` Coriolis, centrifugal and gravity forces C.
-        kp, kd: `(n)` gains. q: `(..., n)` hinge angles. qvel: `(..., nv)`. target: `(..., n)` rad.
-        dt: physics step in s. limit: `(n)` N m, torques are clipped after the implicit solve.
+        kp, kd: `(n)` gains.
+        q: `(..., n)` hinge angles.
+        qvel: `(..., nv)`.
+        target: `(..., n)` rad.
+        dt: physics step in s.
+        limit: `(n)` N m, torques are clipped after the implicit solve.
     """
     n, nv = kp.shape[-1], qvel.shape[-1]
     zeros = qvel.new_zeros(*qvel.shape[:-1], nv - n)

@@ -24,8 +24,10 @@ class HelpSchedule(Protocol):
         """The scale from now on.
 
         Args:
-            scale: the present one. steps: control steps that each world has made. success: the share
-                of recent episodes that did not end by failure, in [0, 1]; NaN when none has ended yet.
+            scale: the present one.
+            steps: control steps that each world has made.
+            success: the share of recent episodes that did not end by failure, in [0, 1]; NaN when
+                none has ended yet.
         """
         ...
 

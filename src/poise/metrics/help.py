@@ -57,9 +57,10 @@ def help_audit(
     Args:
         force, torque: N and N m, as applied (after clipping and the curriculum's scale).
         point_vel: m/s, velocity of the body at the point where the force acts.
-        ang_vel: rad/s, the body's angular velocity. Force and velocity must share one frame,
-            torque and angular velocity too (the world's, or the root's).
-        mass: kg, the whole character. mask: `(..., T)` bool, valid frames.
+        ang_vel: rad/s, the body's angular velocity. Force and velocity must share one frame, torque
+            and angular velocity too (the world's, or the root's).
+        mass: kg, the whole character.
+        mask: `(..., T)` bool, valid frames.
     """
     parts = (force, torque, point_vel, ang_vel)
     if any(p.shape != force.shape for p in parts) or force.ndim < 2 or force.shape[-1] != 3:

@@ -100,7 +100,8 @@ class RTN(nn.Module):
     """The generator; see the module's text.
 
     Args:
-        layout: the skeleton. generator: source of the first weights.
+        layout: the skeleton.
+        generator: source of the first weights.
     """
 
     velocity_std: Tensor
@@ -221,7 +222,8 @@ class Critic(nn.Module):
     """A sliding critic: a window of frames at a time, the mean over windows (LSGAN).
 
     Args:
-        channels: of one frame. window: 2 frames for the short, 10 for the long one.
+        channels: of one frame.
+        window: 2 frames for the short, 10 for the long one.
     """
 
     def __init__(self, channels: int, window: int, *, generator: torch.Generator):

@@ -54,8 +54,9 @@ def pose_rows(
     at one moment is seen apart.
 
     Args:
-        frames: the moments shown. side: rad, azimuth of the direction that points right; by default the
-            one along which the first row's joints move most about its root, as seen from beside a walk.
+        frames: the moments shown.
+        side: rad, azimuth of the direction that points right; by default the one along which the
+            first row's joints move most about its root, as seen from beside a walk.
         path: also writes the SVG there.
 
     Raises:
