@@ -86,7 +86,7 @@ def test_python_snippets_run(
     code = _blocks(page, "python")[index]
     for long, short in _SHORTER:
         code = code.replace(long, short)
-    for name in re.findall(r"read_clip\(\"([\w.]+)\"\)", code):
+    for name in re.findall(r"(?:read_clip|poise\.read)\(\"([\w.]+)\"\)", code):
         shutil.copy(_example_clip(request), tmp_path / name)
     if "policy.safetensors" in code:
         shutil.copytree(request.getfixturevalue("policy"), tmp_path, dirs_exist_ok=True)
@@ -94,10 +94,8 @@ def test_python_snippets_run(
         shutil.copytree(request.getfixturevalue("net"), tmp_path / "net")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
-    if "deliver(" in code:
-        assert {"simulated.bvh", "score.json", "report.html", "run"} <= {
-            p.name for p in (tmp_path / "out").iterdir()
-        }
+    if '.save("out")' in code:
+        assert {"score.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
 
 
 def test_commands_are_shown() -> None:
