@@ -19,7 +19,8 @@ from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise import __version__
-from poise.cli.console import out, say, say_json
+from poise.cli.answer import Answer
+from poise.cli.console import out, say
 from poise.cli.options import Reading
 from poise.errors import PoiseError
 
@@ -51,24 +52,23 @@ class Options:
     """Mend what kinematics can mend, and write the result to OUT."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """The mended motion on the same skeleton; its suffix names the format."""
+    force: bool = False
+    """Write over files that are there."""
     json: bool = False
-    """Print JSON alone."""
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """For a clip see `doctor_motion`; for the machine exit code 0 if all is there, else 1."""
     if options.clip is not None:
         from poise.cli.doctor_motion import run_on
 
-        return run_on(options.clip, options.fix, options.out, options.json, options.reading)
+        return run_on(options.clip, options)
     if options.fix or options.out is not None:
         raise PoiseError("no clip was given", hint="Write poise doctor CLIP --fix -o OUT")
     checks = [check() for check in CHECKS]
     ready = all(c.state != "missing" for c in checks)
-    if options.json:
-        say_json({"poise": __version__, "ready": ready, "checks": [asdict(c) for c in checks]})
-        return 0 if ready else 1
     wide = max(len(c.name) for c in checks)
     styles = {"ok": "green", "missing": "bold red", "optional": "yellow"}
     for c in checks:
@@ -76,7 +76,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
         line = Text.assemble((f"{c.state:<9}", styles[c.state]), f"{c.name:<{wide}}  {c.found}{todo}")
         out().print(line, soft_wrap=True)
     say("This machine is ready." if ready else "Something needed is missing; see above.")
-    return 0 if ready else 1
+    facts = {"poise": __version__, "ready": ready, "checks": [asdict(c) for c in checks]}
+    return Answer(facts, exit_code=0 if ready else 1)
 
 
 def python() -> Check:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import say, table, tell
 from poise.cli.output import claimed
 from poise.cli.parse import parse
@@ -56,8 +57,11 @@ class Options:
     """Run on a Ray cluster: HOST:PORT, ray://HOST:PORT, auto or local. Its machines must see the
     same files. By default the jobs run on this machine, without Ray."""
 
+    json: bool = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
 
-def run(options: Options, argv: Sequence[str]) -> int:
+
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Exit code 0 if every job is done, 1 if one has failed, 130 after Ctrl-C."""
     o = options
     if o.workers < 0:
@@ -78,12 +82,16 @@ def run(options: Options, argv: Sequence[str]) -> int:
     for record in result.records:
         if record.state == "failed":
             tell(f"{record.name} failed {record.attempts} times: {record.error}")
-    say(str(o.out / FLEET_FILE))
+    keys = ("name", "state", "seconds", "attempts", "error", "score")
+    jobs_done = [{key: getattr(r, key) for key in keys} for r in result.records]
+    answer = Answer({"jobs": jobs_done}, {"table": o.out / FLEET_FILE})
     if result.interrupted:
         tell(f"Stopped; {result.count('done')} of {len(jobs)} jobs are done. Go on with:")
         tell(f"  {shlex.join(('poise', 'fleet', *argv))}")
-        return 130
-    return 1 if result.count("failed") else 0
+        answer.exit_code = INTERRUPTED
+    elif result.count("failed"):
+        answer.exit_code = 1
+    return answer
 
 
 def plan(o: Options) -> list[FleetJob]:

@@ -99,7 +99,7 @@ def check_going_on(primitives: Primitives, body: Body, library: Library, returns
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    free = ["recovery", "ways", "single", "going_on"]
+    free = ["recovery", "recovery_clips", "single", "going_on"]
     if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.append("max_primitives")
     own = {name: getattr(primitives, name) for name in free}

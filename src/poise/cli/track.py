@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.console import notes, say, tell
+from poise.cli.answer import INTERRUPTED, LOST, Answer
+from poise.cli.console import say, tell
 from poise.cli.options import Reading
-from poise.cli.output import claimed
+from poise.cli.output import claimed, may_deliver, may_write, places
 from poise.cli.progress import clock, showing, working
 from poise.cli.results import print_card
 from poise.errors import PoiseError
@@ -68,10 +69,14 @@ class Options:
     """In the written motion standing feet are held to the spot; so they stay as simulated."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the policy as one file (.safetensors), which starts faster than a run folder."""
+    force: bool = False
+    """Write over files that are there."""
+    json: bool = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Opens the policy, reads, tracks, writes; says where the character failed."""
     o = options
     if not 1 <= o.count <= 64:
@@ -89,7 +94,13 @@ def run(options: Options, argv: Sequence[str]) -> int:
         raise PoiseError(f"--rounds must lie in 1 to 20, got {o.rounds}")
     if o.threads < 0:
         raise PoiseError(f"--threads must be at least 0, got {o.threads}")
-    out, motion = places(o.clip, o.out)
+    from poise.jobs.runs import RUN_FILE
+
+    out, motion = places(o.out)
+    goes_on = o.learn > 0 and (out / "learned" / RUN_FILE).exists()
+    may_deliver(out, motion, o.force or goes_on, o.clip)
+    if o.save_policy is not None:
+        may_write(o.save_policy, o.force)
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
     from poise.jobs.track import TrackConfig, track, write
@@ -109,7 +120,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
             tracked = track(tracker, given, plain)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
-                return 130
+                return Answer(exit_code=INTERRUPTED, outcome="interrupted")
             tracker = learned
             tracked = track(tracker, given, replace(config, search=None))
         if o.search and tracked.failures:
@@ -119,13 +130,23 @@ def run(options: Options, argv: Sequence[str]) -> int:
             if o.save_policy is not None:
                 save_tracker(tracked.tracker, o.save_policy)
     print_card(done.card)
-    notes((*tracked.notes, *done.notes))
-    say(outcome(tracked, o.reset_on_fail))
-    if tracked.failures:
+    said, lost = outcome(tracked, o.reset_on_fail), is_lost(tracked)
+    say(said)
+    if lost:
         say(advice(o))
-    for path in (*done.paths.values(), *((o.save_policy,) if o.save_policy else ())):
-        say(str(path))
-    return 0
+    word = "lost" if lost else "found" if tracked.found else "came back" if tracked.losses else "tracked"
+    failures = [{"character": who, "seconds": t} for who, t in tracked.failures]
+    result = {"outcome": word, "sentence": said, "failures": failures, "score": done.card.to_dict()}
+    saved = {"policy": o.save_policy} if o.save_policy else {}
+    told = (*tracked.notes, *done.notes)
+    code = LOST if lost else 0
+    return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
+
+
+def is_lost(tracked: Tracked) -> bool:
+    """Whether the character failed and did not end on the motion."""
+    losses = tracked.losses
+    return bool(tracked.failures) and (losses is None or len(losses.back) < len(losses.lost))
 
 
 def searches(options: Options) -> SamplingConfig | None:
@@ -193,7 +214,7 @@ def outcome(tracked: Tracked, reset: bool) -> str:
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
     count, fell = len(reference.length), {who for who, _ in tracked.failures}
     if count > 1:
-        first = f", the first at {tracked.failures[0][1]:.1f} s" if fell else ""
+        first = f", the first lost at {tracked.failures[0][1]:.1f} s" if fell else ""
         again = f"; they were put back {len(tracked.failures)} times" if fell and reset else ""
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if tracked.losses is not None:
@@ -204,13 +225,13 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"Tracked to its end, {seconds:.1f} s, without help."
     if not reset:
         return (
-            f"The character failed at {times[0]:.1f} s of {seconds:.1f} s, where it was 0.5 m off; "
+            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; "
             "what follows is not tracking. --reset-on-fail puts it back and goes on."
         )
     named = ", ".join(f"{t:.1f}" for t in times[:NAMED]) + (", ..." if len(times) > NAMED else "")
     return (
-        f"The character failed {len(times)} times in {seconds:.1f} s and was put back, at {named} s; "
-        "the score ends at the first failure."
+        f"Lost: the character failed {len(times)} times in {seconds:.1f} s and was put back, at {named} "
+        "s; the score ends at the first failure."
     )
 
 
@@ -225,15 +246,3 @@ def read(path: Path, reading: Reading) -> Clip | Keypoints:
         return clip
     stated = Stated(fps=reading.fps, unit_m=reading.unit, up_axis=reading.up)
     return points_of(clip, stated) or clip
-
-
-def places(clip: Path, out: Path) -> tuple[Path, Path | None]:
-    """The folder of the results, and the file of the motion where one was named."""
-    if not out.suffix or out.is_dir():
-        return out, None
-    from poise.motion.io import check_writable
-
-    check_writable(out)
-    if out.exists() and clip.exists() and out.samefile(clip):
-        raise PoiseError("the motion would be written over itself", out, "Give -o another name")
-    return out.with_suffix(""), out

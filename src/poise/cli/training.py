@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
+from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.callbacks import First, beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Body, Reading, Training
@@ -104,11 +105,16 @@ class Job:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)
 
-    def stopped(self, what: str) -> int:
-        """Says how to go on after Ctrl-C, and gives the exit code."""
-        tell(f"{what} Go on with:")
-        tell(f"  {self.again}")
-        return 130
+    def stopped(self, what: str) -> Answer:
+        """Says how to go on after Ctrl-C."""
+        return stopped(what, self.again)
+
+
+def stopped(what: str, again: str) -> Answer:
+    """Says what Ctrl-C left, and the command line that goes on with it."""
+    tell(f"{what} Go on with:")
+    tell(f"  {again}")
+    return Answer({"again": again}, exit_code=INTERRUPTED)
 
 
 def command_line(verb: str, argv: Sequence[str]) -> str:
