@@ -59,11 +59,31 @@ def test_version_and_help_come_quickly_and_without_torch() -> None:
     assert done.stdout == f"poise {poise.__version__}\n" and done.returncode == 0
     # A loaded machine gets some slack; the command itself takes 0.1 s.
     assert time.perf_counter() - start < 2.0
+    for argv, heavy in (
+        *((x, ("torch", "mujoco", "numpy", "rich", "tyro")) for x in ([], ["--help"], ["--version"])),
+        (["imitate", "--help"], ("torch", "mujoco", "numpy")),
+    ):
+        code = f"import sys, poise.cli.main as m; code = m.main({argv}); "
+        code += f"sys.exit(code or 3 * any(x in sys.modules for x in {heavy}))"
+        assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0, argv
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str) -> None:
+    argv = {
+        "doctor": [],
+        "convert": ["a.bvh", "b.bvh"],
+        "retarget": ["a.bvh", "--onto", "b.bvh", "-o", "c.bvh"],
+        "train": ["residual-force", "a.bvh", "-o", "out"],
+        "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
+    }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "fleet") else [])])
     code = (
-        "import sys, poise.cli.main as m; code = m.main(['imitate', '--help']); "
-        "sys.exit(code or 3 * any(x in sys.modules for x in ('torch', 'mujoco', 'numpy')))"
+        "import sys, poise.cli.console as c, poise.cli.main as m\n"
+        "def tell(text, style=''):\n"
+        "    sys.exit(7 + any(x in sys.modules for x in ('torch', 'mujoco', 'numpy')))\n"
+        f"c.tell = tell\nsys.exit(m.main({[verb, *argv]}))"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 7
 
 
 def test_an_unknown_verb_is_answered_with_the_nearest(refused) -> None:

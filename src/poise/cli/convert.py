@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +11,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import say
+from poise.cli.folder import each
 from poise.cli.options import Reading
-from poise.cli.output import may_write
+from poise.cli.output import claimed, may_write
 from poise.errors import PoiseError
 
 
@@ -21,13 +22,15 @@ class Options:
     """Write a motion file in another format or at another frame rate."""
 
     source: Annotated[Positional[Path], arg(metavar="IN")]
-    """The motion file to read."""
+    """The motion file to read, or a folder of such files."""
     target: Annotated[Positional[Path | None], arg(metavar="OUT", help_behavior_hint="")] = None
-    """The motion file to write; its suffix names the format (.bvh)."""
+    """The motion file to write; its suffix names the format (.bvh). For a folder the folder to write."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """The same as OUT."""
     resample: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None
     """Frames per second of the result."""
+    to: Annotated[str, arg(metavar="FORMAT")] = "bvh"
+    """The format of the files that are made of a folder: bvh, glb, npz, ..."""
     force: bool = False
     """Write over files that are there."""
     json: bool = False
@@ -38,9 +41,20 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, resamples where asked to, writes."""
     from poise.motion import resample
-    from poise.motion.io import write_clip
+    from poise.motion.io import check_writable, write_clip
 
     target = target_of(options)
+    if options.source.is_dir():
+        to = "." + options.to.lstrip(".")
+        check_writable(Path(f"OUT{to}"))
+
+        def one(path: Path, name: str) -> Answer:
+            into = target / f"{name}{to}"
+            into.parent.mkdir(parents=True, exist_ok=True)
+            return run(replace(options, source=path, target=into, out=None), argv)
+
+        with claimed(target):
+            return each("convert", (options.source,), target, one)
     may_write(target, options.force, options.source)
     clip = options.reading.read(options.source)
     if options.resample is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
@@ -9,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +22,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise import __version__
 from poise.cli.answer import Answer
 from poise.cli.console import out, say
+from poise.cli.folder import each
 from poise.cli.options import Reading
+from poise.cli.output import claimed
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -47,11 +50,11 @@ class Options:
     """Say what is wrong with a motion, and mend it; without a clip, what works on this machine."""
 
     clip: Annotated[Positional[Path | None], arg(metavar="[CLIP]", help_behavior_hint="")] = None
-    """A motion file: sliding, floating, penetration, jumps, flips, jitter, frames, bones."""
+    """A motion file or a folder of them: sliding, floating, penetration, jumps, flips, jitter, bones."""
     fix: bool = False
     """Mend what kinematics can mend, and write the result to OUT."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """The mended motion on the same skeleton; its suffix names the format."""
+    """The mended motion on the same skeleton; its suffix names the format. For a folder a folder."""
     force: bool = False
     """Write over files that are there."""
     json: bool = False
@@ -64,7 +67,15 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if options.clip is not None:
         from poise.cli.doctor_motion import run_on
 
-        return run_on(options.clip, options)
+        if not options.clip.is_dir():
+            return run_on(options.clip, options)
+        o, folder = options, options.out
+
+        def one(path: Path, name: str) -> Answer:
+            return run_on(path, replace(o, out=None if folder is None else folder / f"{name}.bvh"))
+
+        with contextlib.nullcontext() if folder is None else claimed(folder):
+            return each("doctor", (options.clip,), folder, one)
     if options.fix or options.out is not None:
         raise PoiseError("no clip was given", hint="Write poise doctor CLIP --fix -o OUT")
     checks = [check() for check in CHECKS]

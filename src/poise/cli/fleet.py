@@ -13,6 +13,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import say, table, tell
+from poise.cli.folder import clips_in
 from poise.cli.output import claimed
 from poise.cli.parse import parse
 from poise.cli.progress import clock
@@ -118,46 +119,6 @@ def plan(o: Options) -> list[FleetJob]:
                 facts = {"clip": str(path), "seed": seed, "set": chosen}
                 jobs.append(FleetJob(name, tuple(command), out / name / "score.json", facts))
     return jobs
-
-
-def clips_in(library: Sequence[Path], out: Path) -> list[tuple[str, Path]]:
-    """Every motion file with a name of its own; results below `out` are none."""
-    found: list[tuple[str, Path]] = []
-    for path in library:
-        if not path.exists():
-            raise PoiseError("there is no such file or folder", path, "Give a folder of motion files")
-        root = path.absolute()
-        files = [root] if path.is_file() else sorted(f for f in root.rglob("*") if _is_clip(f))
-        base = root.parent if path.is_file() else root
-        found += [
-            ("-".join(f.relative_to(base).with_suffix("").parts), f)
-            for f in files
-            if not f.is_relative_to(out)
-        ]
-    if not found:
-        where = ", ".join(map(str, library)) or None
-        raise PoiseError("holds no motion file", where, "Give a folder with BVH, AMC or DeepMimic files")
-    seen: dict[str, int] = {}
-    named = []
-    for name, path in found:
-        seen[name] = seen.get(name, 0) + 1
-        named.append((name if seen[name] == 1 else f"{name}-{seen[name]}", path))
-    return named
-
-
-def _is_clip(path: Path) -> bool:
-    """Whether a file of a library is a motion; text files that are none may lie beside."""
-    from poise.motion.io.formats import READERS
-
-    suffix = path.suffix.lower()
-    if suffix in (".bvh", ".amc"):
-        return path.is_file()
-    readers = [r for r in READERS if suffix in r.suffixes and r.name != "ASF" and not r.asks]
-    if not path.is_file() or not readers:
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096).lstrip()
-    return any(r.looks_like(head) for r in readers)
 
 
 def _setting(text: str) -> tuple[str, list[str]]:

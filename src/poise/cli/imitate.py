@@ -16,6 +16,7 @@ from poise.cli.output import may_deliver, places
 from poise.cli.progress import working
 from poise.cli.results import print_card
 from poise.cli.training import Job, command_line
+from poise.errors import PoiseError
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Trains, evaluates, delivers; Ctrl-C during training saves and evaluates nothing."""
     o = options
+    if o.clip.is_dir():
+        hint = "Give one clip, or all of them to poise fleet DIR -o OUT"
+        raise PoiseError("is a folder", o.clip, hint)
     again = command_line("imitate", argv)
     from poise.jobs.runs import RUN_FILE
 

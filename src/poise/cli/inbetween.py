@@ -72,6 +72,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     adaptation = replace(EACH_GAP, iterations=o.adapt) if o.adapt else None
     filling = Filling(o.samples, o.foot_lock, adaptation=adaptation, seed=o.seed)
     begun = time.monotonic()
+    tell(f"filling {len(keys) - 1} gaps", "dim")
     with showing("filling", at_once=False) as show:
 
         def count(done: int, of: int) -> None:

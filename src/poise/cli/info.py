@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import notes, say, table
+from poise.cli.folder import each
 from poise.cli.options import Reading
 from poise.errors import PoiseError
 
@@ -28,7 +29,7 @@ class Options:
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
-    """Motion files: BVH, AMC with its ASF, DeepMimic."""
+    """Motion files, or folders of them."""
     json: bool = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
@@ -38,6 +39,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads every file before the first line is printed."""
     if not options.clips:
         raise PoiseError("no clip was given", hint="Write poise info CLIP")
+    if any(path.is_dir() for path in options.clips):
+        return each("info", options.clips, None, lambda p, _: run(replace(options, clips=(p,)), argv))
     from poise.kin import find_faults, find_guesses
     from poise.motion.info import describe
 

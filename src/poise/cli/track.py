@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.console import say, tell
+from poise.cli.folder import each
 from poise.cli.options import Reading
 from poise.cli.output import claimed, may_deliver, may_write, places
 from poise.cli.progress import clock, showing, working
@@ -36,7 +37,7 @@ class Options:
     the motion, score.json and report.html. For a motion that it loses it can --search, or --learn it."""
 
     clip: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The motion file: a clip of any human skeleton, or keypoints."""
+    """The motion file: a clip of any human skeleton, or keypoints; or a folder of them."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
@@ -77,8 +78,26 @@ class Options:
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
-    """Opens the policy, reads, tracks, writes; says where the character failed."""
-    o = options
+    """One motion, or each of a folder with one policy, into a folder of its name."""
+    check(o := options)
+    if not o.clip.is_dir():
+        return track_one(o)
+    if o.save_policy is not None:
+        raise PoiseError("--save-policy is for one motion", hint="Leave it out")
+    from poise.jobs.track.policy import open_tracker
+
+    with claimed(o.out):
+        with working("opening the policy"):
+            tracker = open_tracker(o.policy)
+
+        def one(path: Path, name: str) -> Answer:
+            return track_one(replace(o, clip=path, out=o.out / name), tracker, o.out / name)
+
+        return each("track", (o.clip,), o.out, one)
+
+
+def check(o: Options) -> None:
+    """Refuses numbers that make no sense, before anything is read or made."""
     if not 1 <= o.count <= 64:
         raise PoiseError(f"--count must lie in 1 to 64, got {o.count}")
     if not 0 <= o.seed < 2**31:
@@ -94,9 +113,15 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError(f"--rounds must lie in 1 to 20, got {o.rounds}")
     if o.threads < 0:
         raise PoiseError(f"--threads must be at least 0, got {o.threads}")
+
+
+def track_one(options: Options, tracker: Tracker | None = None, folder: Path | None = None) -> Answer:
+    """Opens the policy, reads, tracks, writes; says where the character failed. folder: of the results,
+    where that is settled."""
+    o = options
     from poise.jobs.runs import RUN_FILE
 
-    out, motion = places(o.out)
+    out, motion = places(o.out) if folder is None else (folder, None)
     goes_on = o.learn > 0 and (out / "learned" / RUN_FILE).exists()
     may_deliver(out, motion, o.force or goes_on, o.clip)
     if o.save_policy is not None:
@@ -109,8 +134,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
-    with working("opening the policy"):
-        tracker = open_tracker(o.policy)
+    if tracker is None:
+        with working("opening the policy"):
+            tracker = open_tracker(o.policy)
     config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
     config = replace(config, search=searches(o), search_threads=o.threads)
     with claimed(out):
