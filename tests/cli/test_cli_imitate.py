@@ -153,3 +153,17 @@ def test_claimed_leaves_no_folder_after_a_failure(tmp_path: Path) -> None:
 
 def test_clock() -> None:
     assert [clock(s) for s in (0, 59.6, 245, 3725)] == ["0:00", "1:00", "4:05", "1:02:05"]
+
+
+def test_ctrl_c_while_cloning_says_that_nothing_is_saved(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("poise.jobs.runs.start_training", stopped)
+    assert main(["imitate", str(clip), "-o", str(tmp_path / "out"), *MINIATURE]) == 130
+    told = capsys.readouterr().err
+    assert (
+        "Stopped before there was anything to save. Begin again with:" in told and "saved." not in told
+    )

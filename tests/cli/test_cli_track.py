@@ -124,6 +124,21 @@ def test_another_skeleton_with_noise_and_resets(
     assert (out / "body.bvh").exists()
 
 
+def test_the_report_tells_of_the_file_that_came_in(
+    file: Path, tmp_path: Path, refused, capsys: pytest.CaptureFixture[str]
+) -> None:
+    person, out = put(tmp_path, "person.txt", deepmimic(45)), tmp_path / "out"
+    main(["track", str(person), "--policy", str(file), "-o", str(out)])
+    page = (out / "report.html").read_text("utf-8")
+    assert "deepmimic" in page and "The file states no unit" not in page
+    put(out, "score.json", "{}")
+    for verb in ("eval", "play"):
+        refused(verb, out, words=("result of poise track", "report.html"))
+    (out / "learned").mkdir()
+    put(out / "learned", "run.safetensors", "")
+    refused("eval", out, words=(str(out / "learned"),))
+
+
 def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["track", str(short), "--policy", str(file), "-o", str(out), "--count", "2"]) == LOST

@@ -154,6 +154,8 @@ def test_info_takes_the_reading_options(tmp_path: Path, answered) -> None:
     walk = put(tmp_path, "walk.bvh", bvh())
     facts = answered("info", walk, "--fps", "25", "--unit", "0.012", "--up", "Z")["result"]
     assert (facts["fps"], facts["unit_m"], facts["up_axis"]) == (25.0, 0.012, "Z")
+    facts = answered("info", walk, "--unit", "cm")["result"]
+    assert facts["unit_m"] == 0.01 and main(["info", str(walk), "--unit", "feet"]) == 2
     motion = put(tmp_path, "02_01.amc", amc())
     skeleton = put(tmp_path, "other.asf", ASF)
     assert answered("info", motion, "--skeleton", skeleton)["result"]["joints"] == 5

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import table
-from poise.cli.options import Body, Reading
+from poise.cli.options import Body, Flag, Reading
 
 if TYPE_CHECKING:
     from poise.body import BodyConfig
@@ -24,7 +24,7 @@ class Options:
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.folder import each
-from poise.cli.options import Reading
+from poise.cli.options import Flag, Reading
 from poise.cli.output import claimed, may_write
 from poise.errors import PoiseError
 
@@ -31,9 +31,9 @@ class Options:
     """Frames per second of the result."""
     to: Annotated[str, arg(metavar="FORMAT")] = "bvh"
     """The format of the files that are made of a folder: bvh, glb, npz, ..."""
-    force: bool = False
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 

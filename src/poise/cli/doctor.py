@@ -23,7 +23,7 @@ from poise import __version__
 from poise.cli.answer import Answer
 from poise.cli.console import out, say
 from poise.cli.folder import each
-from poise.cli.options import Reading
+from poise.cli.options import Flag, Reading
 from poise.cli.output import claimed
 from poise.errors import PoiseError
 
@@ -51,13 +51,13 @@ class Options:
 
     clip: Annotated[Positional[Path | None], arg(metavar="[CLIP]", help_behavior_hint="")] = None
     """A motion file or a folder of them: sliding, floating, penetration, jumps, flips, jitter, bones."""
-    fix: bool = False
+    fix: Flag = False
     """Mend what kinematics can mend, and write the result to OUT."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """The mended motion on the same skeleton; its suffix names the format. For a folder a folder."""
-    force: bool = False
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from poise.cli.answer import Answer
-from poise.cli.options import Device, Rule, check_device
+from poise.cli.options import Device, Flag, Rule, check_device
 from poise.cli.output import run_folder
 from poise.cli.progress import working
 from poise.cli.results import print_card
@@ -22,7 +22,7 @@ class Options:
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a result or of a run."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""

@@ -14,6 +14,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import say, table, tell
 from poise.cli.folder import clips_in
+from poise.cli.options import Flag
 from poise.cli.output import claimed
 from poise.cli.parse import parse
 from poise.cli.progress import clock
@@ -58,7 +59,7 @@ class Options:
     """Run on a Ray cluster: HOST:PORT, ray://HOST:PORT, auto or local. Its machines must see the
     same files. By default the jobs run on this machine, without Ray."""
 
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
 
 

@@ -11,11 +11,11 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.callbacks import first_delivery
-from poise.cli.options import Body, Reading, Training
+from poise.cli.options import Body, Flag, Reading, Training
 from poise.cli.output import may_deliver, places
 from poise.cli.progress import working
 from poise.cli.results import print_card
-from poise.cli.training import Job, command_line
+from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError
 
 
@@ -29,11 +29,11 @@ class Options:
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
-    hold_feet: bool = True
-    """In the written motion standing feet are held to the spot; so they stay as simulated."""
-    force: bool = False
+    hold_feet: Flag = True
+    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
@@ -60,7 +60,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         imitation = job.start(comm)
         result = job.train(imitation, comm, first_delivery(imitation, out, motion, o.hold_feet))
     if result.interrupted:
-        return job.stopped("Stopped; the training so far is saved.")
+        return stopped(job.run, again)
     if comm.rank:
         return Answer()
     from poise.jobs.deliver import deliver
@@ -73,6 +73,6 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             curve = learning_curve(job.run)
             done = deliver(imitation, evaluation, out, curve, motion, o.hold_feet)
     except KeyboardInterrupt:
-        return job.stopped("Stopped in the evaluation; the training is saved.")
+        return stopped(job.run, again, " in the evaluation")
     print_card(done.card)
     return Answer(done.card.to_dict(), {**done.paths, "run": job.run}, done.notes)

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import say, tell
-from poise.cli.options import Reading
+from poise.cli.options import Flag, Reading
 from poise.cli.output import may_write
 from poise.cli.progress import clock, showing
 from poise.errors import PoiseError
@@ -36,8 +36,9 @@ class Options:
     comes with Poise."""
     samples: Annotated[int, arg(metavar="N")] = 1
     """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others are variants."""
-    foot_lock: bool = True
-    """Feet that stand are held, and step clear of the floor; so they are left as they are."""
+    foot_lock: Flag = True
+    """Leave feet as the network made them; by default standing feet are held, and step clear of the
+    floor."""
     adapt: Annotated[int, arg(metavar="N")] = 20
     """Iterations of test-time adaptation for each gap, about a second in all: its feet slide less.
     0 does without."""
@@ -45,9 +46,9 @@ class Options:
     """Seed of the variants."""
     picture: Annotated[Path | None, arg(metavar="FILE.svg", help_behavior_hint="")] = None
     """Also draw the poses, keyframes black, over the clip that came in."""
-    force: bool = False
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import notes, say, table
 from poise.cli.folder import each
-from poise.cli.options import Reading
+from poise.cli.options import Flag, Reading
 from poise.errors import PoiseError
 
 #: The keys of a clip in the result, which programs rely on.
@@ -30,7 +30,7 @@ class Options:
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
     """Motion files, or folders of them."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 

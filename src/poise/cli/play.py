@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from poise.cli.answer import Answer
+from poise.cli.options import Flag
 from poise.cli.output import may_write, run_folder
 from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
@@ -33,11 +34,11 @@ class Options:
     """The frame of the clip to start from."""
     clip: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The clip, where the run has several; by default the first one."""
-    open: bool = False
+    open: Flag = False
     """Open the page in the browser."""
-    force: bool = False
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
 
 

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import say, table
-from poise.cli.options import Reading
+from poise.cli.options import Flag, Reading
 from poise.cli.output import may_write
 from poise.errors import PoiseError
 
@@ -35,11 +35,11 @@ class Options:
     such as left_upper_arm=upperarm_l."""
     onto_skeleton: Annotated[Path | None, arg(metavar="ASF", help_behavior_hint="")] = None
     """The ASF skeleton where FILE is an AMC."""
-    contacts: bool = True
-    """Hold standing feet and hands where the clip has them."""
-    force: bool = False
+    contacts: Flag = True
+    """Do not hold standing feet and hands where the clip has them."""
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 

@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.console import say, tell
 from poise.cli.folder import each
-from poise.cli.options import Reading
+from poise.cli.options import Flag, Reading
 from poise.cli.output import claimed, may_deliver, may_write, places
 from poise.cli.progress import clock, showing, working
 from poise.cli.results import print_card
@@ -44,7 +44,7 @@ class Options:
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
     Poise."""
-    search: bool = False
+    search: Flag = False
     """If the policy loses the motion, look for it: many characters try at once, those that come near it
     go on. What is found is one simulation, without help; it takes seconds for each of the motion."""
     characters: Annotated[int, arg(metavar="N")] = 512
@@ -56,23 +56,23 @@ class Options:
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores for --search and --learn; 0 is all."""
-    reset_on_fail: bool = False
+    reset_on_fail: Flag = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
-    recover: bool = False
+    recover: Flag = False
     """A character that is 0.5 m off gets up, walks back and goes on where the motion waits for it."""
     count: Annotated[int, arg(metavar="N")] = 1
-    """Characters who do the motion side by side in one world, where they may collide."""
+    """Characters that do the motion side by side in one world, where they may collide."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise, and of what --search and --learn draw."""
-    hold_feet: bool = True
-    """In the written motion standing feet are held to the spot; so they stay as simulated."""
+    hold_feet: Flag = True
+    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the policy as one file (.safetensors), which starts faster than a run folder."""
-    force: bool = False
+    force: Flag = False
     """Write over files that are there."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
@@ -270,5 +270,5 @@ def read(path: Path, reading: Reading) -> Clip | Keypoints:
     if reading.ground is not None or reading.swap_sides:
         # What was stated about the skeleton is known to the clip alone.
         return clip
-    stated = Stated(fps=reading.fps, unit_m=reading.unit, up_axis=reading.up)
+    stated = Stated(fps=reading.fps, unit_m=reading.unit_m(), up_axis=reading.up)
     return points_of(clip, stated) or clip

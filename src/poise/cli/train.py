@@ -12,10 +12,10 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Reading, Training
+from poise.cli.options import Body, Flag, Reading, Training
 from poise.cli.perpetual_options import Primitives
 from poise.cli.train_inbetween import Network
-from poise.cli.training import Job, command_line
+from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
 
 #: Recipes that can be trained.
@@ -45,7 +45,7 @@ class Options:
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
     """Motion files."""
-    json: bool = False
+    json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     library: OmitArgPrefixes[Library] = field(default_factory=Library)
@@ -74,7 +74,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         imitation = job.start(comm)
         result = job.train(imitation, comm)
     if result.interrupted:
-        return job.stopped("Stopped; the training so far is saved.")
+        return stopped(job.run, again)
     if result.last is None:
         say(f"{o.out} had reached its limit before; nothing was trained.")
     else:

@@ -78,7 +78,7 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
             task, out, steps, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}")
         )
     if stopped:
-        return interrupted("Stopped; the training so far is saved.", again)
+        return interrupted(out, again)
     if stats is None:
         say(f"{out} had reached its last step before; nothing was trained.")
     else:

@@ -69,7 +69,7 @@ def run(
         )  # fmt: skip
     if result is None or result.interrupted:
         where = "" if result is None or result.last is None else f" in {result.last.stage.name}"
-        return stopped(f"Stopped{where}; the training so far is saved.", again)
+        return stopped(out, again, where)
     return report(imitation, result, out)
 
 

@@ -105,14 +105,15 @@ class Job:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)
 
-    def stopped(self, what: str) -> Answer:
-        """Says how to go on after Ctrl-C."""
-        return stopped(what, self.again)
 
+def stopped(run: Path, again: str, where: str = "") -> Answer:
+    """Says what Ctrl-C left in the run folder, and the command line that goes on with it."""
+    from poise.learn import LATEST
 
-def stopped(what: str, again: str) -> Answer:
-    """Says what Ctrl-C left, and the command line that goes on with it."""
-    tell(f"{what} Go on with:")
+    if (run / LATEST).exists():
+        tell(f"Stopped{where}; the training so far is saved. Go on with:")
+    else:
+        tell(f"Stopped{where} before there was anything to save. Begin again with:")
     tell(f"  {again}")
     return Answer({"again": again}, exit_code=INTERRUPTED)
 
