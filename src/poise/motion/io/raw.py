@@ -143,7 +143,7 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
             frame_time=raw.frame_time,
             travel_joint=raw.travel_joint,
             notes=tuple(notes),
-            evidence=_evidence(raw, options, up, unit),
+            evidence=evidence(options, up, unit, _rate(raw)),
             mended=tuple(mended),
             extra=raw.extra,
         ),
@@ -151,22 +151,23 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
     return Clip(skeleton, root_pos, quats_to_z_up(rot, axis), fps, raw.path.stem, raw.cyclic)
 
 
-def _evidence(
-    raw: RawMotion, options: ReadOptions, up: Guess, unit: Guess
-) -> tuple[tuple[str, str], ...]:
+#: Why a value is what it is, where nothing was guessed.
+BY_FORMAT = "The format itself states it"
+
+
+def evidence(options: ReadOptions, up: Guess, unit: Guess, rate: str) -> tuple[tuple[str, str], ...]:
     """Why the vertical, the unit and the frame rate are what they are, one sentence each."""
-    by_format = "The format itself states it"
-    if options.fps is not None:
-        rate = "Stated with --fps"
-    elif raw.frame_time is not None:
-        rate = f"The file's frame time is {raw.frame_time:.6g} s"
-    else:
-        rate = next((n for n in raw.notes if "frame rate" in n), by_format)
     return (
-        ("up", "Stated with --up" if options.up_axis else up.note or by_format),
-        ("unit", "Stated with --unit" if options.unit_m else unit.note or by_format),
-        ("fps", rate),
+        ("up", "Stated with --up" if options.up_axis else up.note or BY_FORMAT),
+        ("unit", "Stated with --unit" if options.unit_m else unit.note or BY_FORMAT),
+        ("fps", "Stated with --fps" if options.fps is not None else rate),
     )
+
+
+def _rate(raw: RawMotion) -> str:
+    if raw.frame_time is not None:
+        return f"The file's frame time is {raw.frame_time:.6g} s"
+    return next((n for n in raw.notes if "frame rate" in n), BY_FORMAT)
 
 
 def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[float, float, float]:

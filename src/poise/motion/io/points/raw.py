@@ -11,7 +11,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
-from poise.motion.io.raw import ReadOptions, vectors_to_z_up
+from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
 from poise.motion.limits import check_poses, check_rate
@@ -71,6 +71,8 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
         # Half a turn about X keeps left and right, which a mirror would not.
         positions = positions * (1.0, -1.0, -1.0)
         notes.append(f"The heads lie below the feet along {axis}: the points were turned over")
+    stated = f"The file has {raw.fps:.6g} frames per second"
+    rate = next((n for n in raw.notes if "frame rate" in n), stated)
     return Keypoints(
         raw.names,
         positions,
@@ -79,7 +81,7 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
         raw.confidence,
         Source(
             format=raw.format, path=str(raw.path), unit_m=scale, up_axis=axis, notes=tuple(notes),
-            frame_time=1.0 / raw.fps,
+            frame_time=1.0 / raw.fps, evidence=evidence(options, up, unit, rate),
         ),
     )  # fmt: skip
 
