@@ -149,7 +149,8 @@ def _imitation(options: Options) -> Imitation:
 
     path = options.clip or Path(poise.__file__).parent / "data" / "walk.bvh"
     envs = options.envs or (_ENVS if options.device == "cpu" else _GPU_ENVS)
-    return build(read_clip(path, skeleton=options.skeleton), ResidualForce(num_envs=envs))
+    config = ResidualForce(help_limit=100.0, help_start=None, num_envs=envs)
+    return build(read_clip(path, skeleton=options.skeleton), config)
 
 
 def _told(what: str) -> None:

@@ -35,7 +35,8 @@ def imitate(data: Path, name: str, minutes: float, out: Path, seed: int) -> dict
     begun = time.perf_counter()
     path, asf = CLIPS[name]
     clip = read_clip(data / path, skeleton=data / asf if asf else None)
-    imitation = begin(out / "run", ClipLibrary.of(clip), ResidualForce(seed=seed))
+    config = ResidualForce(help_limit=100.0, help_start=None, seed=seed)
+    imitation = begin(out / "run", ClipLibrary.of(clip), config)
     train(imitation, out / "run", Until(minutes=minutes))
     policy, meta = trained_policy(out / "run", imitation)
     evaluation = evaluate(imitation, policy, meta)

@@ -31,10 +31,11 @@ SEEDS = (0, 1)
 
 def settings(name: str, method: str, seed: int) -> ResidualForce:
     """The compared setting: "poise" is the default recipe, "paper" its observation and action."""
+    same = {"method": method, "seed": seed, "help_limit": 100.0, "help_start": None}
     if name == "poise":
-        return ResidualForce(method=method, seed=seed)
+        return ResidualForce(**same)
     more = {"observation": "phase", "action": "absolute", "done": "height"}
-    return ResidualForce(method=method, seed=seed, ppo=PPOConfig(std=0.1, policy_lr=3e-4), **more)
+    return ResidualForce(ppo=PPOConfig(std=0.1, policy_lr=3e-4), **same, **more)
 
 
 def one(data: Path, name: str, clip_name: str, method: str, seed: int, samples: int) -> dict:

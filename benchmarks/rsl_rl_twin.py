@@ -21,7 +21,6 @@ import json
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
@@ -173,7 +172,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     svg = args.out.with_suffix(".svg")
-    config = replace(ResidualForce(), num_envs=args.envs)
+    config = ResidualForce(help_limit=100.0, help_start=None, num_envs=args.envs)
     task = build(ClipLibrary.of(read_clip(args.clip)), config)
     curves: dict[str, list[Curve]] = {"poise": [], "rsl_rl": []}
     for seed in range(args.seeds):

@@ -35,7 +35,7 @@ CLIP = ("cmu_amc/rfc/90_02.amc", "cmu_amc/rfc/08.asf")
 
 def settings(kind: str, seed: int) -> ResidualForce:
     """The compared settings; the paper's on the same physics."""
-    ours = ResidualForce(seed=seed, expert=kind == "expert")
+    ours = ResidualForce(help_limit=100.0, help_start=None, seed=seed, expert=kind == "expert")
     return replace(paper(ours), sim=SimConfig(), done="bodies") if kind == "paper" else ours
 
 

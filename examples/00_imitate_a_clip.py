@@ -18,7 +18,7 @@ clip_path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(poise.__file__).par
 out = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("out")
 
 clip = read_clip(clip_path)
-config = ResidualForce(method="rfc-implicit", help_limit=100.0)
+config = ResidualForce(method="rfc-implicit")
 imitation = begin(out / "run", ClipLibrary.of(clip), config)
 train(imitation, out / "run", Until(minutes=1.0))
 policy, meta = trained_policy(out / "run", imitation)

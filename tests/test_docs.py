@@ -19,7 +19,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 WALK = ROOT / "src" / "poise" / "data" / "walk.bvh"
 
 # Shortens what a snippet does without changing which functions it calls.
-_SHORTER = (("minutes=3", "iterations=1"), ("help_limit=50.0", "help_limit=50.0, num_envs=16"))
+_SHORTER = (("minutes=3", "iterations=1"), ("ResidualForce()", "ResidualForce(num_envs=16)"))
 
 
 def _blocks(page: Path, language: str) -> list[str]:

@@ -110,8 +110,7 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
         mine.seed,
         512,
     )
-    # The paper keeps its help, a user's result should end without.
-    assert (plain.help_limit, mine.help_start, mine.help_limit) == (100.0, 100.0, 0.0)
+    assert (plain.help_start, plain.help_limit) == (mine.help_start, mine.help_limit) == (100.0, 0.0)
 
 
 def test_info_json_holds_exactly_the_keys(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -77,7 +77,9 @@ def record(imitation: Imitation, action: torch.Tensor):
 
 @pytest.mark.parametrize("bodies", [(0,), (0, 3)])
 def test_explicit_help_is_recorded_at_the_point_where_it_acts(bodies):
-    imitation = build(swing(speed=1.0), ResidualForce(method="rfc-explicit", help_limit=30.0))
+    imitation = build(
+        swing(speed=1.0), ResidualForce(method="rfc-explicit", help_start=None, help_limit=30.0)
+    )
     kind = ExplicitResidual(bodies=bodies, limit_n=30.0, limit_nm=30.0)
     imitation = replace(imitation, task=replace(imitation.task, residual=kind))
     action = torch.zeros(len(imitation.humanoid.hinges) + kind.dims)
@@ -99,7 +101,7 @@ def test_explicit_help_is_recorded_at_the_point_where_it_acts(bodies):
 
 
 def test_implicit_help_acts_at_the_roots_origin():
-    imitation = build(swing(speed=1.0), ResidualForce(help_limit=30.0))
+    imitation = build(swing(speed=1.0), ResidualForce(help_start=None, help_limit=30.0))
     action = torch.zeros(len(imitation.humanoid.hinges) + 6)
     action[-6:] = torch.tensor([0.3, 0, 0.2, 0, 0.5, 0.1])
     rollouts, steps = record(imitation, action)

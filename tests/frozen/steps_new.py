@@ -76,7 +76,9 @@ def lively() -> ClipLibrary:
 
 
 def imitating(**changes: Any) -> ResidualForce:
-    return ResidualForce(**({"num_envs": cases.WORLDS, "seed": cases.SEED} | changes))
+    # What was the default then: 100 N for ever.
+    then = {"help_limit": 100.0, "help_start": None}
+    return ResidualForce(**(then | {"num_envs": cases.WORLDS, "seed": cases.SEED} | changes))
 
 
 def tiny(**changes: Any) -> Perpetual:

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from poise.body import BodyConfig
-from poise.control import ExplicitResidual, ImplicitResidual
+from poise.control import ExplicitResidual, ImplicitResidual, SuccessHelp
 from poise.env.terms import reward
 from poise.errors import PoiseError
 from poise.eval import run_episodes, start_frames
 from poise.jobs.runs import begin, reopen
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
-from poise.recipes.residual_force import paper
+from poise.recipes.residual_force import config_of, most_help, paper, schedule
 from toy_human import swing
 
 
@@ -52,7 +52,7 @@ def test_where_paper_and_code_differ():
 
 
 def test_methods_and_the_papers_own_setting():
-    explicit = build(swing(), ResidualForce(method="rfc-explicit", help_limit=40.0))
+    explicit = build(swing(), ResidualForce(method="rfc-explicit", help_start=None, help_limit=40.0))
     assert isinstance(explicit.task.residual, ExplicitResidual)
     assert explicit.task.residual.limit_nm == 40.0 and explicit.task.residual.bodies[0] == 0
     plain = build(swing(), ResidualForce(method="deepmimic"))
@@ -122,3 +122,13 @@ def test_the_world_is_built_on_the_reference_for_a_real_deepmimic_clip(data_dir)
     torch.testing.assert_close(sim.pos, ref.pos, atol=1e-4, rtol=0)
     torch.testing.assert_close(sim.com, ref.com, atol=1e-4, rtol=0)
     env.close()
+
+
+def test_the_default_takes_the_help_away_and_old_runs_keep_what_they_did():
+    plain = ResidualForce()
+    assert (plain.help_start, plain.help_limit) == (100.0, 0.0)
+    assert most_help(plain) == 100.0 and schedule(plain) == SuccessHelp(final=0.0)
+    # What an earlier version left out was 100 N for ever.
+    then = config_of({"method": "rfc-explicit"})
+    assert (then.help_start, then.help_limit) == (None, 100.0) and schedule(then) is None
+    assert config_of({"help_limit": 0.0, "help_start": 100.0}) == plain

@@ -50,7 +50,8 @@ class ResidualForce:
 
     method: rfc-implicit, rfc-explicit, or deepmimic (no residual force).
     help_limit: N, the most residual force that is left at the end; the torque limit is the same
-    number in N m. help_start: N, the limit at the beginning; None (or a lower number) keeps it constant.
+    number in N m. help_start: N, the limit at the beginning; None (or a number that is not above
+    help_limit) keeps the limit constant, as the paper does.
     help_schedule: from start to end by success (`control.SuccessHelp`) or linear in time over
     `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
     reward: world (App. B.1) or local (App. B.2). observation: reference (state and next reference
@@ -65,8 +66,8 @@ class ResidualForce:
     """
 
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
-    help_limit: float = 100.0
-    help_start: float | None = None
+    help_limit: float = 0.0
+    help_start: float | None = 100.0
     help_schedule: Literal["success", "linear"] = "success"
     help_steps: tuple[int, int] = (1600, 16000)
     reward: Literal["world", "local"] = "world"
@@ -194,8 +195,10 @@ def paper(config: ResidualForce) -> ResidualForce:
     return replace(config, ppo=PPOConfig.paper(), completion_bonus=False, **faithful)
 
 
-#: What earlier versions called the settings.
-MIGRATION = Migration(keys={"finish": "completion_bonus"})
+#: What earlier versions called the settings, and what runs did that do not name a setting.
+MIGRATION = Migration(
+    keys={"finish": "completion_bonus"}, absent={"help_limit": 100.0, "help_start": None}
+)
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> ResidualForce:
