@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.jobs.library.folder import library_of
 from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.perpetual.evaluation import ClipResults, bare_env, evaluate_clips
+from poise.jobs.perpetual.evaluation import ClipResults, evaluate_clips
 from poise.jobs.runs import RUN_FILE
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
@@ -36,7 +36,6 @@ from poise.motion import Clip, ClipLibrary
 from poise.nets import Composer
 from poise.recipes.imitation import Imitation
 from poise.settings import to_data
-from poise.sim import make_backend
 
 Tell = Callable[[str], None]
 #: Frames of all episodes that are recorded at once, which bounds the memory of a table.
@@ -209,7 +208,7 @@ def table(
 
     def make(worlds: int) -> ImitationEnv:
         # A world that goes bad after its character was lost is no reason to stop.
-        return bare_env(task, worlds, 0.0, threads, "cpu")
+        return task.bare().env(worlds, None, False, threads, help_scale=0.0, guard=False)
 
     return field_table(rollouts(), method=method, data=data)
 
@@ -245,10 +244,8 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
     task = trial_task(run.imitation.task, falls=trials, guided=recovery_clips is not None)
 
     def make(worlds: int) -> ImitationEnv:
-        backend = make_backend(humanoid.model, worlds, threads=threads)
-        env = ImitationEnv(reference, backend, task, config.sim.substeps, int(config.seed))
-        env.help.set(0.0)
-        return env
+        tried = replace(run.imitation, reference=reference, task=task)
+        return tried.env(worlds, None, False, threads, help_scale=0.0, guard=False)
 
     card = recovery_card(
         make, run.policy, trials, method=run.name, kinds=(kind,), recovery_clips=recovery_clips

@@ -57,13 +57,9 @@ def _servos(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]
 
 
 def _stable(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]:
-    task = replace(imitation.task, auto_reset=False)
-
     def make(n: int) -> ImitationEnv:
         backend = StablePDBackend(imitation.humanoid.model, n)
-        env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
-        env.help.set(scale)
-        return env
+        return imitation.env(None, 0, False, help_scale=scale, guard=False, backend=backend)
 
     return make
 

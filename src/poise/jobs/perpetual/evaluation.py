@@ -10,18 +10,17 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from poise.env import Acts, ImitationEnv
+from poise.env import Acts
 from poise.learn import PolicyBundle
 from poise.learn.checkpoint import write_atomic
 from poise.metrics import mpjpe_global, mpjpe_root, success_rule
 from poise.recipes.imitation import Imitation
-from poise.sim import make_backend
 
 #: The file of a run folder with every evaluation of every clip.
 SUCCESS = "success.csv"
@@ -117,7 +116,8 @@ def _batch(
     device: str,
 ) -> tuple[Tensor, ...]:
     """Success, frames tracked, mean errors `(E,)` of clips that are simulated together."""
-    env = bare_env(imitation, len(clip), scale, threads, device)
+    task = imitation.bare(groups=isinstance(scale, Tensor))
+    env = task.env(len(clip), None, False, threads, None, scale, device, guard=False)
     limit = success_rule("phc").limit_m * 1000.0
     last = imitation.reference.length[clip].to(env.device) - 1
     clip = clip.to(env.device)
@@ -144,29 +144,6 @@ def _batch(
     finally:
         env.close()
     return tuple(x.cpu() for x in (alive, tracked, local / count, far / count))
-
-
-def bare_env(
-    imitation: Imitation,
-    worlds: int,
-    scale: float | Tensor,
-    threads: int,
-    device: str,
-    rewards: bool = False,
-) -> ImitationEnv:
-    """Worlds without a guard and ends: one that goes bad is a failure and no reason to stop.
-
-    scale: what is left of the residual force's limits, or of those of each of the task's groups `(G,)`.
-    rewards: whether they are worked out; else only what the policy sees is.
-    """
-    config = imitation.config
-    backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
-    task = replace(imitation.task, dones=(), style=(), auto_reset=False)
-    task = task if rewards else replace(task, rewards=())
-    task = task if isinstance(scale, Tensor) else replace(task, help_by="all")
-    env = ImitationEnv(imitation.reference, backend, task, config.sim.substeps, int(config.seed))
-    env.help.set(scale)
-    return env
 
 
 class History:

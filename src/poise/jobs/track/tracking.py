@@ -17,7 +17,7 @@ from poise.eval.judged import judge
 from poise.jobs.deliver import simulated_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.runs import Evaluation
-from poise.jobs.track.crowd import crowd_env, places
+from poise.jobs.track.crowd import Crowd, places
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.points import fitted, follow
 from poise.jobs.track.policy import Tracker
@@ -160,10 +160,10 @@ def track(
     keeper = Keeper(acts, config.reset_on_fail)
 
     def make_env(worlds: int) -> ImitationEnv:
-        if worlds > 1:
-            keeper.env = crowd_env(imitation, worlds)
-        else:
-            keeper.env = imitation.env(1, auto_reset=False, threads=config.threads, help_scale=0.0)
+        crowd = Crowd(imitation.humanoid, imitation.config.sim, worlds) if worlds > 1 else None
+        keeper.env = imitation.env(
+            1, None, False, config.threads, help_scale=0.0, guard=crowd is None, backend=crowd
+        )
         check_fits(tracker, keeper.env)
         return keeper.env
 
