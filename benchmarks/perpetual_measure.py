@@ -16,6 +16,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
 from poise.errors import PoiseError
+from poise.eval import ClipResults
 from poise.eval.episodes import run_episodes
 from poise.eval.field_card import FieldTable
 from poise.eval.field_table import field_table
@@ -25,7 +26,7 @@ from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.jobs.library.folder import library_of
 from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.perpetual.evaluation import ClipResults, evaluate_clips
+from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.runs import RUN_FILE
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place

@@ -12,9 +12,9 @@ import torch
 
 from poise.env.recovery.config import FALLEN, FAR
 from poise.errors import PoiseError
+from poise.eval import ClipResults
 from poise.jobs.library.folder import library_of
 from poise.jobs.perpetual import recovery as perpetual_recovery
-from poise.jobs.perpetual.evaluation import ClipResults
 from poise.jobs.perpetual.progress import Progress, Stage
 from poise.jobs.perpetual.recovery import back, check_falls, try_recovery
 from poise.jobs.perpetual.run import begin, config_of, reopen, to_data, train

@@ -128,8 +128,7 @@ def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
     placed = [place(walk(0, 40), tracker), place(walk(20, 60), tracker)]
     imitation = imitation_of(tracker, placed)
     env = imitation.env(2, auto_reset=False, threads=1, help_scale=0.0)
-    keeper = Keeper(tracker.policy, True)
-    keeper.env = env
+    keeper = Keeper(env, tracker.policy, True)
     try:
         obs = env.reset_to(torch.tensor([0, 1]), torch.zeros(2, dtype=torch.long))
         for _ in range(3):

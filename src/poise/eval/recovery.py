@@ -22,6 +22,7 @@ from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.config import FALLEN, FAR
 from poise.env.recovery.controller import RecoveryController
 from poise.errors import PoiseError
+from poise.eval.episodes import simulate
 from poise.eval.field_paper import PHC_RECOVERY
 
 #: The fail-states by name.
@@ -184,6 +185,23 @@ def back_after(near: Tensor, stay: int) -> Tensor:
     return torch.where(runs.any(1), first.double(), math.inf)
 
 
+class _Apart:
+    """Observes how far the bodies are from their reference on average, m, after each step."""
+
+    def __init__(self, clip: Tensor, controller: RecoveryController | None):
+        self.clip, self.controller = clip, controller
+        self.apart: list[Tensor] = []
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        if step == 0:
+            return
+        own, frame = env.reference, env.frame
+        if self.controller is not None:
+            own, frame = self.controller.reference, self.controller.frame
+        ref = own.gather(self.clip, frame)
+        self.apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+
+
 def _trial(
     env: ImitationEnv,
     policy: Acts,
@@ -199,14 +217,11 @@ def _trial(
     if recovery_clips is not None:
         policy = controller = RecoveryController(env, policy, recovery_clips)
         obs = controller.lead(torch.arange(env.num_envs))
-    apart = []
-    for _ in range(steps):
-        obs = env.step(policy.act(obs)).final_obs
-        ref = reference.gather(clip * many, env.frame if controller is None else controller.frame)
-        apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+    seen = _Apart(clip * many, controller)
+    simulate(env, policy, obs, steps, seen)
     if controller is not None:
         env.set_goal(reference, clip * many, frame * many)
-    return torch.stack(apart, 1)
+    return torch.stack(seen.apart, 1)
 
 
 def _row(kind: str, back: Tensor, seconds: Sequence[float]) -> Recovered:

@@ -6,8 +6,8 @@ import json
 from dataclasses import dataclass
 
 from poise import __version__
-from poise.eval import RecoveryCard
-from poise.jobs.perpetual.evaluation import FINAL_STAGE, ClipResults, evaluate_clips
+from poise.eval import ClipResults, RecoveryCard
+from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips
 from poise.jobs.perpetual.progress import Progress
 from poise.jobs.perpetual.recovery import try_recovery
 from poise.jobs.perpetual.stage_initialisation import staged

@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import run_episodes, score_rollouts
+from poise.eval import record, score_rollouts
 from poise.eval.judged import judge
 from poise.jobs.deliver import simulated_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
@@ -157,19 +157,18 @@ def track(
         notes.append(sentence(found, config.search, imitation.reference.rate_hz))
     if config.recover and (back := with_returns(tracker, placed, imitation, config.threads)):
         placed, imitation, acts, losses = back
-    keeper = Keeper(acts, config.reset_on_fail)
-
-    def make_env(worlds: int) -> ImitationEnv:
-        crowd = Crowd(imitation.humanoid, imitation.config.sim, worlds) if worlds > 1 else None
-        keeper.env = imitation.env(
-            1, None, False, config.threads, help_scale=0.0, guard=crowd is None, backend=crowd
-        )
-        check_fits(tracker, keeper.env)
-        return keeper.env
-
     all_of_them = torch.arange(config.count)
-    starts = torch.zeros_like(all_of_them)
-    rollouts, recordings = run_episodes(make_env, keeper, all_of_them, starts, cycles=1)
+    starts, sim = torch.zeros_like(all_of_them), imitation.config.sim
+    crowd = Crowd(imitation.humanoid, sim, config.count) if config.count > 1 else None
+    env = imitation.env(
+        1, None, False, config.threads, help_scale=0.0, guard=crowd is None, backend=crowd
+    )
+    try:
+        check_fits(tracker, env)
+        keeper = Keeper(env, acts, config.reset_on_fail)
+        rollouts, recordings = record(env, keeper, all_of_them, starts, cycles=1)
+    finally:
+        env.close()
     about, rate = tracker.about, imitation.reference.rate_hz
     card = score_rollouts(
         rollouts,
@@ -261,7 +260,6 @@ def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
     have = (tracker.policy.num_obs, tracker.policy.num_actions)
     need = (env.num_obs, env.num_actions)
     if have != need:
-        env.close()
         raise PoiseError(
             f"the policy takes {have[0]} observations and gives {have[1]} actions, and its body here "
             f"has {need[0]} and {need[1]}",
@@ -275,16 +273,15 @@ class Keeper:
     resets: off, it only acts. fallen: (world, frame) of every failure that it mended.
     """
 
-    def __init__(self, policy: Acts, resets: bool):
-        self.policy, self.resets = policy, resets
-        self.env: ImitationEnv | None = None
+    def __init__(self, env: ImitationEnv, policy: Acts, resets: bool):
+        self.env, self.policy, self.resets = env, policy, resets
         self.fallen: list[tuple[int, int]] = []
         self._limit_mm = success_rule(RULE).limit_m * 1000.0
 
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
         env = self.env
-        if self.resets and env is not None:
+        if self.resets:
             ref = env.reference.gather(env.clip, env.frame).pos
             failed = ~(mpjpe_global(env.pose().pos, ref) <= self._limit_mm)
             if bool(failed.any()):
