@@ -25,7 +25,7 @@ from poise.eval.rolloutset import RolloutSet
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.jobs.library.folder import library_of
-from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.runs import RUN_FILE
 from poise.jobs.track import imitation_of
@@ -65,7 +65,7 @@ class Run:
             folder = folder / "run"
         if not (folder / RUN_FILE).exists():
             raise PoiseError(f"is no run folder: there is no {RUN_FILE} in it", folder)
-        imitation = perpetual_run.reopen(folder)
+        imitation = open_run(folder).task
         owner = None
         if (folder / LATEST).exists():
             owner = load_checkpoint(folder / LATEST)[0].get("ledger/owner")

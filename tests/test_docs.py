@@ -49,11 +49,12 @@ def _example_clip(request: pytest.FixtureRequest) -> Path:
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a toy `run` and its `policy.safetensors`."""
-    from poise.jobs.track.policy import export_policy
+    from poise.jobs.open import open_run
+    from poise.jobs.track.policy import save_tracker
     from toy_policy import toy_run
 
     folder = tmp_path_factory.mktemp("policy")
-    export_policy(toy_run(folder / "run"), folder / "policy.safetensors")
+    save_tracker(open_run(toy_run(folder / "run")).tracker, folder / "policy.safetensors")
     return folder
 
 

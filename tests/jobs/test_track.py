@@ -14,11 +14,12 @@ import torch
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
 from poise.eval import Recording, run_episodes, score_rollouts
+from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
 from poise.jobs.track import Keeper, TrackConfig, check_fits, imitation_of, track, write
 from poise.jobs.track.placement import home, place
 from poise.jobs.track.points import points_of
-from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.jobs.track.policy import Tracker
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, read_clip
 from poise.motion.io.raw import Options
@@ -32,12 +33,12 @@ from toy_policy import toy_run, walk
 
 @pytest.fixture(scope="module")
 def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+    return open_run(toy_run(tmp_path_factory.mktemp("run"))).tracker
 
 
 @pytest.fixture(scope="module")
 def pointed(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("points"), "keypoints"))
+    return open_run(toy_run(tmp_path_factory.mktemp("points"), "keypoints")).tracker
 
 
 def points(clip: Clip) -> Keypoints:

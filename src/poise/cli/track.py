@@ -92,14 +92,15 @@ def run(options: Options, argv: Sequence[str]) -> int:
     out, motion = places(o.clip, o.out)
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
+    from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, track, write
     from poise.jobs.track.noise import noise_of
-    from poise.jobs.track.policy import open_tracker, save_tracker
+    from poise.jobs.track.policy import save_tracker
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
     with working("opening the policy"):
-        tracker = open_tracker(o.policy)
+        tracker = open_run(o.policy).tracker
     config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
     config = replace(config, search=searches(o), search_threads=o.threads)
     with claimed(out):

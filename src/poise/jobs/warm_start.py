@@ -28,6 +28,7 @@ from poise.learn import (
     load_checkpoint,
 )
 from poise.learn.parallel import ALONE, Comm, any_of, together
+from poise.learn.schema import PolicyMeta
 from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
 from poise.recipes.imitation import Imitation
 from poise.sim import UnstableError
@@ -70,7 +71,9 @@ def start_training(
     tell = tell or TrainingCallbacks()
     make = partial(_trainer, imitation, threads, folder / "dumps", comm, device)
     if (folder / LATEST).exists():
-        warm = load_checkpoint(folder / LATEST)[1].get("metadata", {}).get("start") == "expert"
+        warm = (
+            load_checkpoint(folder / LATEST, PolicyMeta)[1].get("metadata", {}).get("start") == "expert"
+        )
         return make(None, warm)
     if not imitation.config.expert:
         return make(None, False)

@@ -40,7 +40,7 @@ from poise.kin.own_body import on_own_body
 from poise.learn import PPOConfig
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
-from poise.settings import Migration, from_data
+from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
 
@@ -84,6 +84,9 @@ class ResidualForce:
     body: BodyConfig = BodyConfig()
     sim: SimConfig = SimConfig()
     ppo: PPOConfig = PPOConfig(std=0.055, policy_lr=3e-4)
+
+    def __post_init__(self) -> None:
+        validate(self)
 
 
 def most_help(config: ResidualForce) -> float:

@@ -12,7 +12,7 @@ from poise.jobs.perpetual.progress import Progress
 from poise.jobs.perpetual.recovery import try_recovery
 from poise.jobs.perpetual.stage_initialisation import staged
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.runs import FINAL
+from poise.jobs.run_file import FINAL
 from poise.learn.checkpoint import write_atomic
 
 RESULT = "result.json"
