@@ -19,7 +19,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 WALK = ROOT / "src" / "poise" / "data" / "walk.bvh"
 
 # Shortens what a snippet does without changing which functions it calls.
-_SHORTER = (("minutes=3", "iterations=1"), ("ResidualForce()", "ResidualForce(num_envs=16)"))
+_SHORTER = (("minutes=3", "iterations=1, num_envs=16"),)
 
 
 def _blocks(page: Path, language: str) -> list[str]:
@@ -87,7 +87,7 @@ def test_python_snippets_run(
     code = _blocks(page, "python")[index]
     for long, short in _SHORTER:
         code = code.replace(long, short)
-    for name in re.findall(r"read_clip\(\"([\w.]+)\"\)", code):
+    for name in re.findall(r"(?:read_clip|imitate|track|inbetween|read)\(\"([\w.]+)\"", code):
         shutil.copy(_example_clip(request), tmp_path / name)
     if "policy.safetensors" in code:
         shutil.copytree(request.getfixturevalue("policy"), tmp_path, dirs_exist_ok=True)
@@ -95,7 +95,7 @@ def test_python_snippets_run(
         shutil.copytree(request.getfixturevalue("net"), tmp_path / "net")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
-    if "deliver(" in code:
+    if "imitate(" in code:
         assert {"simulated.bvh", "score.json", "report.html", "run"} <= {
             p.name for p in (tmp_path / "out").iterdir()
         }

@@ -95,6 +95,20 @@ def validate(config: Any) -> None:
             raise PoiseError(f"seed must be a whole number from 0 to 2**63 - 1, got {value!r}", name)
 
 
+def changed(config: T, settings: Mapping[str, Any]) -> T:
+    """The settings with some of them changed.
+
+    Raises:
+        PoiseError: a setting that there is not, or a value that it cannot have.
+    """
+    known = [f.name for f in fields(config) if f.init]  # type: ignore[arg-type]
+    for name in settings:
+        if name not in known:
+            what = f"there is no setting '{name}'"
+            raise PoiseError(what, type(config).__name__, did_you_mean(name, known))
+    return dataclasses.replace(config, **settings)  # type: ignore[type-var]
+
+
 def _choices(kind: Any) -> tuple[Any, ...]:
     """The values of a `Literal`, or of one that may be None; () where anything goes."""
     origin, args = get_origin(kind), get_args(kind)

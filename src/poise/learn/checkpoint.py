@@ -20,9 +20,9 @@ from safetensors.torch import load as parse_tensors
 from safetensors.torch import save as serialise_tensors
 from torch import Tensor
 
-from poise import __version__
 from poise.errors import PoiseError
 from poise.settings import check_data
+from poise.version import __version__
 
 FORMAT = 1
 LATEST = "checkpoint.safetensors"

@@ -17,12 +17,30 @@ from poise.kin import FitReport
 from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Style
-from poise.motion import ClipLibrary
+from poise.motion import Clip, ClipLibrary, read_clip
 from poise.recipes.memory import FEW, check_memory, free_bytes, learner_bytes
 from poise.sim import Backend, NanGuard, make_backend
 
+#: What a recipe is built of: a clip, the file of one, or a library.
+Clips = Clip | ClipLibrary | str | Path
 
-@dataclass(frozen=True, eq=False)
+
+def as_library(clips: Clips) -> ClipLibrary:
+    """A library as it is, or of one clip or motion file.
+
+    Raises:
+        PoiseError: neither of them, or a file that cannot be read.
+    """
+    if isinstance(clips, ClipLibrary):
+        return clips
+    clip = read_clip(clips) if isinstance(clips, str | Path) else clips
+    if not isinstance(clip, Clip):
+        what = f"a recipe is built of a clip, a motion file or a ClipLibrary, got {type(clip).__name__}"
+        raise PoiseError(what, hint="Put several clips into ClipLibrary.of([...])")
+    return ClipLibrary.of(clip)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Imitation:
     """A library with a body, ready to be learned.
 
@@ -37,6 +55,11 @@ class Imitation:
     config: Any
     task: TaskConfig
     recovery_clips: RecoveryClips | None = None
+
+    def __repr__(self) -> str:
+        clips, seconds = len(self.library), self.library.seconds
+        body = f"{len(self.humanoid.bodies)} bodies, {len(self.humanoid.hinges)} hinges"
+        return f"Imitation({type(self.config).__name__}, {clips} clips, {seconds:.1f} s, {body})"
 
     def env(
         self,

@@ -38,8 +38,7 @@ from poise.env.terms import done, obs, reward
 from poise.kin import fit_humanoid
 from poise.kin.own_body import on_own_body
 from poise.learn import PPOConfig
-from poise.motion import Clip, ClipLibrary
-from poise.recipes.imitation import Imitation
+from poise.recipes.imitation import Clips, Imitation, as_library
 from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
@@ -174,10 +173,10 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
     )
 
 
-def build(clips: Clip | ClipLibrary, config: ResidualForce | None = None) -> Imitation:
-    """Body, reference and task for a clip or a library; train with `.trainer()`."""
+def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
+    """Body, reference and task for a clip, a motion file or a library; train with `.trainer()`."""
     config = config or ResidualForce()
-    library = ClipLibrary.of(clips) if isinstance(clips, Clip) else clips
+    library = as_library(clips)
     library, _ = on_own_body(library, config.body)
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
     config.sim.apply(humanoid.model)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
-from poise import __version__
 from poise.eval import ClipResults, RecoveryCard
 from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips
 from poise.jobs.perpetual.progress import Progress
@@ -14,6 +13,7 @@ from poise.jobs.perpetual.stage_initialisation import staged
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL
 from poise.learn.checkpoint import write_atomic
+from poise.version import __version__
 
 RESULT = "result.json"
 

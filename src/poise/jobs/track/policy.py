@@ -17,7 +17,6 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
-from poise import __version__
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env.recovery.clips import RecoveryClips
@@ -36,6 +35,7 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import RECIPE, Perpetual
 from poise.recipes.perpetual.config import config_of
 from poise.settings import check_data, to_data
+from poise.version import __version__
 
 
 class _About(TypedDict, total=False):

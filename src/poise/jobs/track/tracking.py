@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,17 +14,19 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import record, score_rollouts
+from poise.eval import ScoreCard, record, score_rollouts
 from poise.eval.judged import judge
-from poise.jobs.deliver import simulated_clip
+from poise.jobs.deliver import finished, simulated_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
 from poise.jobs.track.crowd import Crowd, places
-from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.placement import Placed, home, place
 from poise.jobs.track.points import fitted, follow
 from poise.jobs.track.policy import Tracker
 from poise.jobs.track.recovering import Losses, with_returns
 from poise.jobs.track.searching import replay, search, sentence
+from poise.kin import hold_feet
 from poise.kin.fit import widen
 from poise.metrics import mpjpe_global, success_rule
 from poise.motion import Clip, ClipLibrary
@@ -92,8 +96,8 @@ class Clean:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Tracked:
+@dataclass(frozen=True, eq=False, repr=False)
+class Tracked(Result):
     """What came of tracking.
 
     imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
@@ -118,6 +122,33 @@ class Tracked:
     def failed_s(self) -> tuple[float, ...]:
         """Seconds at which the first character failed."""
         return tuple(t for who, t in self.failures if who == 0)
+
+    @cached_property
+    def card(self) -> ScoreCard:
+        """The score of the simulation, help 0, with what holding the feet did."""
+        return finished(self.imitation, self.evaluation).card
+
+    @property
+    def clip(self) -> Clip:
+        """The first character's motion on the skeleton that came in, standing feet held."""
+        return self.delivered()
+
+    def delivered(self, character: int = 0, hold: bool = True) -> Clip:
+        """A character's motion on the skeleton that came in. hold: standing feet are held."""
+        made = self.motion(character)
+        if hold:
+            made = hold_feet(made, self.imitation.humanoid.table)[0]
+        if self.placed.moved is None:
+            return made
+        return home(made, self.placed, self.tracker).replaced(name=made.name)
+
+    def _shown(self) -> Shown:
+        return Shown(self.clip, self.placed.source, self.card, self.notes)
+
+    def _save_all(self, folder: Path) -> dict[str, Path]:
+        from poise.jobs.track.written import write
+
+        return write(self, folder).paths
 
     def motion(self, character: int = 0) -> Clip:
         """The simulated motion on the body's skeleton, as it was simulated."""
