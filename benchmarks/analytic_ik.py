@@ -65,7 +65,7 @@ def bodies_of(clip: Clip, more: bool) -> dict[str, IkBody]:
 def points(body: IkBody, q: np.ndarray) -> np.ndarray:
     """World positions `(T, P, 3)` of a humanoid's joints and toes."""
     state = Kinematics(body.table)(torch.tensor(q))
-    return body_points(body, state.pos.numpy(), quat_to_matrix(state.quat).numpy())
+    return body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
 
 
 def file_jumps(path: Path) -> int:

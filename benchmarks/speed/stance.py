@@ -70,7 +70,7 @@ def relaxed_stance(humanoid: Humanoid) -> Stance:
 
 def support_polygon(points: np.ndarray) -> np.ndarray:
     """`(K, 2)` m, the convex hull of `points (N, 2)`, counter-clockwise."""
-    # Here, since whoever only tracks a motion would wait for SciPy otherwise.
+    # Imported here, since SciPy takes its time.
     from scipy.spatial import ConvexHull, QhullError
 
     try:

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
-from poise.env.bins import EVERY, KEPT, PRIOR, FailureRates, MotionBins, Outcomes
+from poise.env.adaptive_sampling import EVERY, KEPT, PRIOR, AdaptiveSampling, FailureRates
+from poise.env.bins import MotionBins, Outcomes
 from poise.env.starts import Starts
 from poise.errors import PoiseError
 from poise.recipes.imitation import Imitation
@@ -213,7 +214,7 @@ def test_starts_stay_within_clips():
 def task(make_task: Callable[..., Imitation]) -> Imitation:
     clips = swing(3.0), swing(2.0, bend=0.4, name="second")
     built = make_task(*clips, help_start=100.0, help_limit=0.0)
-    own = replace(built.task, help=RULE, help_by="bin", hard=0.5)
+    own = replace(built.task, help=RULE, help_by="bin", adaptive=0.5)
     return replace(built, task=own)
 
 
@@ -248,7 +249,8 @@ def test_a_run_goes_on_where_it_was(task: Imitation):
     one.reset()
     for _ in range(EVERY + 20):
         one.step(torch.randn(6, one.num_actions, generator=rng))
-    assert one.failure_rates is not None and float(one.failure_rates.odds.max()) > 0.1
+    rates = one.plugin(AdaptiveSampling)
+    assert rates is not None and float(rates.rates.odds.max()) > 0.1
     two.load_state(one.state())
     for _ in range(EVERY):
         action = torch.randn(6, one.num_actions, generator=rng)

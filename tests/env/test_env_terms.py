@@ -62,9 +62,9 @@ def a_pose(seed: int = 0) -> Pose:
 
 def a_frame(sim: Pose, ref: Pose | None = None) -> Frame:
     ahead = a_pose(5)
-    return Frame(
-        sim, ref or sim, ahead, torch.tensor([0.25, 0.5]), torch.zeros(N, 6),
-        torch.tensor([1.0, 0.7]), torch.tensor([0.8, 0.9]),
+    return Frame.given(
+        sim=sim, ref=ref or sim, ahead=ahead, phase=torch.tensor([0.25, 0.5]), residual=torch.zeros(N,
+        6), reg=torch.tensor([1.0, 0.7]), min_height=torch.tensor([0.8, 0.9]),
     )  # fmt: skip
 
 
@@ -179,8 +179,7 @@ def test_local_end_effectors_forgive_where_in_the_world():
 def test_observations_are_free_of_place_and_heading(term):
     frame = a_frame(a_pose())
     assert frame.ahead is not None
-    moved = replace(
-        frame,
+    moved = frame.replaced(
         sim=turned(frame.sim, 2.3, (4.0, -7.0)),
         ref=turned(frame.ref, 2.3, (4.0, -7.0)),
         ahead=turned(frame.ahead, 2.3, (4.0, -7.0)),
@@ -205,7 +204,7 @@ def test_observations_by_hand():
     )
     assert obs.phase(frame).tolist() == [[0.25], [0.5]]
     with pytest.raises(ValueError, match="next reference frame"):
-        obs.target_root(replace(frame, ahead=None))
+        obs.target_root(frame.replaced(ahead=None))
 
 
 def test_failures_by_hand():

@@ -53,7 +53,8 @@ def a_frame(
     sim: Pose, ahead: Pose | None = None, ref: Pose | None = None, **more: torch.Tensor
 ) -> Frame:
     ones = torch.ones(N)
-    return Frame(sim, ref or sim, ahead, ones, torch.zeros(N, 0), ones, ones, **more)
+    given = {"phase": ones, "residual": torch.zeros(N, 0), "reg": ones, "min_height": ones}
+    return Frame.given(sim=sim, ref=ref or sim, ahead=ahead, **(given | more))
 
 
 def moved(pose: Pose, yaw: float, shift: tuple[float, float]) -> Pose:

@@ -47,7 +47,7 @@ def test_following_a_frame_equals_looking_up_the_next():
         frame = frame + 1
         assert torch.equal(rows, ref.rows(clip, frame))
         assert torch.equal(packed, ref.gather_packed(clip, frame))
-        place = ref.place(packed)
+        place = ref.layout.place(packed)
         assert torch.equal(place.phase, ref.phase(clip, frame))
         assert torch.equal(place.low, ref.min_height[clip])
         done = (frame >= ref.length[clip] - 1) & ~ref.cyclic[clip]

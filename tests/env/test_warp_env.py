@@ -105,6 +105,9 @@ class FakeState(SimpleNamespace):
         for name in names:
             setattr(self, name, torch.zeros_like(self.qvel))
 
+    def __contains__(self, name: str) -> bool:
+        return hasattr(self, name)
+
     def __getitem__(self, name: str) -> Tensor:
         return getattr(self, name)
 
@@ -148,7 +151,8 @@ def test_no_step_mixes_devices(make_task, settings):
             assert value.device == env.device
         env.pose()
         ids = torch.arange(2, device=ELSEWHERE)
-        env._terms.observe(env._seen(env._goal[ids], env._goal[ids], ids))
+        ahead = env.goal.ahead()[ids]
+        env._terms.observe(env._sources.of(ahead, ahead, ids))
         env.reset()
 
 

@@ -17,6 +17,8 @@ import poise
 from poise.cli.main import main as command
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
+from poise.env.adaptive_sampling import AdaptiveSampling
+from poise.env.recovery.clock import RecoveryClock
 from poise.eval import read_score
 from poise.jobs.deliver import deliver
 from poise.jobs.open import open_run
@@ -200,10 +202,10 @@ def step(env: ImitationEnv, action: Tensor) -> dict[str, Any]:
 
 def state(env: ImitationEnv) -> dict[str, Any]:
     out: dict[str, Any] = {"help": env.help.now, "weights": env.weights}
-    if env.failure_rates is not None:
-        out["hardness"] = env.failure_rates.state()
-    if env.recoveries is not None:
-        out["kind"] = env.recoveries.kind
+    if (sampling := env.plugin(AdaptiveSampling)) is not None:
+        out["hardness"] = sampling.rates.state()
+    if (clock := env.plugin(RecoveryClock)) is not None:
+        out["kind"] = clock.kind
     return out
 
 

@@ -68,8 +68,8 @@ def test_old_and_new_are_the_same_to_the_bit(tmp_path: Path) -> None:
     assert str(new.pop("poise")).startswith(str(NEW))
     missing = sorted(old.keys() ^ new.keys())
     assert not missing, f"only one of them has {missing[:20]}"
-    # Changed on purpose: the lowest point of a solid is found in one way, which adds its terms in another
-    # order than the metrics did: the last digits of what is measured at the soles.
+    # Changed on purpose: the lowest point of a solid is found in one way, which adds its terms in
+    # another order than the metrics did: the last digits of what is measured at the soles.
     for k in [k for k in old if k.endswith(SOLES)]:
         np.testing.assert_allclose(new.pop(k), old.pop(k), rtol=1e-4, atol=1e-4, err_msg=k)
     differing = [f"{k}: {_difference(old[k], new[k])}" for k in old if not _same(old[k], new[k])]

@@ -18,7 +18,7 @@ from poise.jobs.library.folder import LibraryConfig, library_of, split
 from poise.jobs.library.report import LibraryReport
 from poise.kin import Kinematics, fit_humanoid
 from poise.kin.coords import clip_to_qpos
-from poise.kin.ground import stance_heights
+from poise.kin.feet.contact import stance_heights
 from poise.motion import Clip, shifted, write_clip
 from toy_human import human, swing
 

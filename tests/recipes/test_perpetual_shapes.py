@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from poise.body import make_humanoid
-from poise.env.body_assignment import differing
+from poise.env.body_assignment import BodyAssignment, differing
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
@@ -148,7 +148,8 @@ def test_worlds_change_bodies_when_episodes_begin(imitation: Imitation) -> None:
         env.step(torch.zeros(16, env.num_actions))
         body = imitation.reference.body[env.clip]
         worn |= set(body.tolist())
-        assert env._bodies is not None and torch.equal(env._bodies.worn, body)
+        bodies = env.plugin(BodyAssignment)
+        assert bodies is not None and torch.equal(bodies.body, body)
         mass = env.backend.expand("body_mass").sum(1)
         own = torch.tensor([h.mass for h in imitation.reference.bodies], dtype=torch.float64)
         torch.testing.assert_close(mass, own[body])

@@ -7,7 +7,7 @@ together as ever, and a new episode only copies the numbers of its body.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -16,6 +16,8 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from poise.body import Humanoid
+from poise.env.frame import Observable
+from poise.env.plugins import Plugin
 from poise.env.terms.phc_obs import shape_of
 from poise.errors import PoiseError
 from poise.sim import Backend
@@ -44,39 +46,39 @@ def differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     return out
 
 
-class BodyAssignment:
-    """The bodies of a backend's worlds.
+class BodyAssignment(Plugin):
+    """The bodies of a backend's worlds, as a plug-in.
 
-    worn: `(N,)`, which body each world has. sizes: `(S, K)` float32 of the bodies, see `shape_of`.
+    Attributes:
+        body: `(N,)`, which body each world has.
+        sizes: `(S, K)` float32 of the bodies, see `shape_of`.
 
     Args:
         backend: its model is that of the first body, which all worlds have at first.
-        humanoids: S bodies. of_clip: `(C,)`, the body that each clip is for.
+        humanoids: S bodies.
     """
 
-    def __init__(self, backend: Backend, humanoids: Sequence[Humanoid], of_clip: Tensor):
+    def __init__(self, backend: Backend, humanoids: Sequence[Humanoid]):
         fields = differing([backend.model, *(h.model for h in humanoids[1:])])
-        self.of_clip = of_clip.to(backend.device)
         self._live = {name: backend.expand(name) for name in fields}
         self._values = {
             name: torch.from_numpy(fields[name]).to(live).view(len(humanoids), *live.shape[1:])
             for name, live in self._live.items()
         }
         self.sizes = torch.stack([shape_of(h) for h in humanoids]).to(backend.device)
-        self.worn = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
+        self.body = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
 
-    def sizes_of(self, body: Tensor) -> Tensor:
-        """`(n, K)` sizes of bodies `body (n,)`, float32 as the packed reference has them."""
-        return self.sizes.index_select(0, body.long())
+    @property
+    def observables(self) -> Mapping[str, Observable]:
+        """The sizes of each character's body."""
+        return {"sizes": lambda frame: self.sizes.index_select(0, frame.place.body.long())}
 
-    def take(self, rows: Tensor | None, clip: Tensor) -> None:
-        """Worlds `rows (n,)`, all for None, take the bodies of `clip (n,)`; write their states then."""
-        new = self.of_clip[clip]
-        old = self.worn if rows is None else self.worn[rows]
-        changed = (new != old).nonzero().squeeze(-1)
+    def assign(self, rows: Tensor | None, body: Tensor) -> None:
+        old = self.body if rows is None else self.body[rows]
+        changed = (body != old).nonzero().squeeze(-1)
         if not len(changed):
             return
-        ids, new = changed if rows is None else rows[changed], new[changed]
-        self.worn[ids] = new
+        ids, new = changed if rows is None else rows[changed], body[changed]
+        self.body[ids] = new
         for name, live in self._live.items():
             live[ids] = self._values[name].index_select(0, new)

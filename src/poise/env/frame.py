@@ -1,15 +1,16 @@
-"""What a term sees: the simulated and the reference character at one control step."""
+"""What a term sees: the simulated and the reference character at one control step, by name."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from poise.errors import PoiseError
+from poise.errors import PoiseError, did_you_mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +32,56 @@ class Pose:
     com: Tensor
     local: Tensor
     heading: Tensor
+
+
+#: The fields of a pose in the order in which they are packed.
+FIELDS = tuple(f.name for f in fields(Pose))
+
+
+class Place(NamedTuple):
+    """What a packed pose says of its clip, float32 `(N)` each.
+
+    phase: place in the clip, 0 to 1.
+    low: the clip's lowest root height, m.
+    end: 1 on the last frame of a clip that does not go on, else 0.
+    body: which of the goal's bodies the clip is for.
+    """
+
+    phase: Tensor
+    low: Tensor
+    end: Tensor
+    body: Tensor
+
+
+class Layout:
+    """Where the numbers of a pose and of its place stand in a row of packed poses `(N, W)`."""
+
+    def __init__(self, pose: Pose):
+        self._shapes = tuple(getattr(pose, name).shape[1:] for name in FIELDS)
+        self._widths = [*(math.prod(shape) for shape in self._shapes), len(Place._fields)]
+
+    def pack(self, pose: Pose, place: Tensor) -> Tensor:
+        """Poses and their places `(N, 4)` as rows `(N, W)`."""
+        return torch.cat((packed_pose(pose), place), 1)
+
+    def unpacked(self, packed: Tensor) -> Pose:
+        """The poses whose numbers are the rows of `packed (N, W)`, as views of it."""
+        parts = packed.split_with_sizes(self._widths, -1)[: len(FIELDS)]
+        return Pose(
+            *(
+                part if len(shape) == 1 else part.unflatten(-1, shape)
+                for part, shape in zip(parts, self._shapes, strict=True)
+            )
+        )
+
+    def place(self, packed: Tensor) -> Place:
+        """What the rows of `packed (N, W)` say of their clips, as views of it."""
+        return Place(*packed[:, -len(Place._fields) :].unbind(-1))
+
+
+def packed_pose(pose: Pose) -> Tensor:
+    """The numbers of poses, without their places."""
+    return torch.cat([getattr(pose, name).flatten(1) for name in FIELDS], 1)
 
 
 class LazyPose(Pose):
@@ -63,18 +114,24 @@ class PointGoal(NamedTuple):
     before: Tensor
 
 
-@dataclass(frozen=True, eq=False)
 class Frame:
-    """Everything that a term may use; tensors only.
+    """Everything that a term may use, looked up by name when a term first asks for it, and kept.
 
-    sim: the character now. ref: the reference at the same time. ahead: the reference one control
-    step later, where it is known. phase `(N,)` in [0, 1]: place in the clip.
-    residual `(N, k)`: unscaled residual action of the last step. reg `(N,)`: its regularizer.
-    min_height `(N,)` m: lowest root height of the reference clip.
-    age `(N,)`: control steps since the episode began. torque `(N, n)` N m: what servos and damping
-    exert on each hinge at the end of the step, where a term asks for it (`uses_torque`). point: how far
-    the character is, in a task with recovery; `ahead` is a point there for those who are far. sizes
-    `(N, K)`: of each character's body, see `phc_obs.shape_of`; None where all have one.
+    A name is that of an observable: a function of the frame in `env.observables`, in a plug-in, or in
+    `TaskConfig.observables`. An observable reads tensors through `source`, or other observables.
+
+    The observables that every task has:
+        sim: the character now.
+        ref: the reference at the same time.
+        ahead: the reference one control step later, None where it is not known.
+        phase: `(N,)` in [0, 1], place in the clip.
+        residual: `(N, k)` unscaled residual action of the last step.
+        reg: `(N,)` the regularizer of the residual.
+        min_height: `(N,)` m, lowest root height of the reference clip.
+        age: `(N,)` control steps since the episode began.
+        torque: `(N, n)` N m that servos and damping exert on each hinge at the end of the step.
+        point: where the reference's root is, in a task with recovery; else None.
+        sizes: `(N, K)` of each character's body, see `phc_obs.shape_of`; None where all have one.
     """
 
     sim: Pose
@@ -84,20 +141,54 @@ class Frame:
     residual: Tensor
     reg: Tensor
     min_height: Tensor
-    age: Tensor | None = None
-    torque: Tensor | None = None
-    point: PointGoal | None = None
-    sizes: Tensor | None = None
+    age: Tensor | None
+    torque: Tensor | None
+    point: PointGoal | None
+    sizes: Tensor | None
+    #: What frames of one environment share, see `env.observables.Context`.
+    context: Any
+
+    def __init__(
+        self, sources: Mapping[str, Tensor], observables: Mapping[str, Observable], context: Any = None
+    ):
+        self.__dict__.update(_sources=sources, _observables=observables, context=context)
+
+    @classmethod
+    def given(cls, **values: Any) -> Frame:
+        """A frame whose observables are `values`; others that are asked for are None."""
+        frame = cls({}, dict.fromkeys(cls.__annotations__, _none))
+        frame.__dict__.update(values)
+        return frame
+
+    def replaced(self, **values: Any) -> Frame:
+        """The same frame with other values of some observables."""
+        other = Frame(self._sources, self._observables, self.context)
+        other.__dict__.update(self.__dict__ | values)
+        return other
+
+    def source(self, name: str) -> Tensor:
+        """A tensor by its name: a field of MuJoCo's state such as "qfrc_constraint" `(N, ...)`, the
+        "action" `(N, A)`, the "age" `(N,)`, or a column of a plug-in."""
+        return self._sources[name]
+
+    def __getattr__(self, name: str) -> Any:
+        observables: Mapping[str, Observable] = self.__dict__.get("_observables", {})
+        if name not in observables:
+            known = did_you_mean(name, sorted(observables))
+            raise AttributeError(f"a frame has no observable '{name}'. {known}")
+        value = self.__dict__[name] = observables[name](self)
+        return value
+
+
+#: A function of a frame, whose value the frame keeps.
+Observable = Callable[[Frame], Any]
+
+
+def _none(frame: Frame) -> None:
+    return None
 
 
 TermFunction = Callable[..., Tensor]
-AnyTerm = TypeVar("AnyTerm", bound=TermFunction)
-
-
-def uses_torque(fn: AnyTerm) -> AnyTerm:
-    """Marks a term that looks at `Frame.torque`, which is fetched for tasks with such a term alone."""
-    fn.__dict__["uses_torque"] = True
-    return fn
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from poise.control import HelpSchedule
+from poise.env.goals.goal import Group
+from poise.env.plugins import Ended, Plugin
 from poise.errors import PoiseError
 
 #: How much older episodes count, at each decision, against the ones since the last.
@@ -176,6 +178,30 @@ class HelpBudget:
             own = own.reshape(3, self.groups)
             self.set(own[0])
             self._counts.copy_(own[1:])
+
+
+class HelpCounter(Plugin):
+    """Counts what becomes of an environment's episodes for its budget of help.
+
+    by: whether all worlds have one share of help left, or each "clip" or "bin" its own.
+    """
+
+    def __init__(self, budget: HelpBudget, by: Group):
+        self.budget = budget
+        self.by: Group = by
+
+    def count(self, ended: Ended) -> None:
+        if self.by != "bin":
+            group = ended.goal.group(self.by)[ended.ids]
+            self.budget.count_worlds(group, ended.failed[ended.ids])
+        elif self.budget.schedule is not None:
+            self.budget.add(*ended.bins)
+
+    def state(self) -> dict[str, Tensor]:
+        return {"help": self.budget.state()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        self.budget.load_state(state["help"])
 
 
 def scale_in(state: Mapping[str, Tensor]) -> float:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,31 +11,17 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.bins import MotionBins
-from poise.env.frame import Pose
+from poise.env.frame import FIELDS, Layout, Pose
+from poise.env.poser import Poser
 from poise.errors import PoiseError
-from poise.kin import Kinematics, cycle_step, cycle_velocity, qpos_velocity
-from poise.spatial import heading_quat, quat_mul, quat_rotate
+from poise.kin import cycle_step, cycle_velocity, qpos_velocity
+from poise.spatial import quat_mul, quat_rotate
 
-#: The fields of a pose in the order in which they are packed.
-FIELDS = tuple(f.name for f in fields(Pose))
 # What references have one of for each clip or each frame.
 _JOINED = (
     "qpos", "qvel", "hinges", "length", "cyclic", "min_height", "cycle_turn", "cycle_travel", "body",
     "_place", "_packed",
 )  # fmt: skip
-
-
-class Place(NamedTuple):
-    """What a packed pose says of its clip, float32 `(N)` each.
-
-    phase: place in the clip, 0 to 1. low: the clip's lowest root height, m. end: 1 on the last frame
-    of a clip that does not go on, else 0. body: which of the reference's bodies the clip is for.
-    """
-
-    phase: Tensor
-    low: Tensor
-    end: Tensor
-    body: Tensor
 
 
 class Reference:
@@ -78,8 +61,8 @@ class Reference:
         self.body = torch.tensor([0] * len(motions) if body is None else list(body))
         if self.bodies[0] is not humanoid or len(self.body) != len(motions):
             raise PoiseError("a reference needs a body for each clip, and its own as the first")
-        self.kinematics = Kinematics(humanoid.table)
-        self._fast = Kinematics(humanoid.table, torch.float32)
+        self.poser = Poser(humanoid)
+        self.kinematics = self.poser.kinematics
         qpos = torch.tensor(np.concatenate(motions), dtype=torch.float64)
         speed = [cycle_velocity if c else qpos_velocity for c in cyclic]
         qvel = torch.tensor(
@@ -103,7 +86,10 @@ class Reference:
         self._place = torch.stack(told, 1)
         #: The row that follows each row.
         self._after = self.rows(clip, frame + 1)
-        self.pose = self._poses(qpos, qvel, self.body[clip])
+        pose = self._poses(qpos, qvel, self.body[clip])
+        #: Where the numbers of packed poses stand.
+        self.layout = Layout(pose)
+        self._packed = self.layout.pack(pose, self._place)
         # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
         steps = [cycle_step(q) for q in motions]
         self.cycle_turn = torch.stack([turn for turn, _ in steps])
@@ -118,7 +104,7 @@ class Reference:
             if isinstance(value, Tensor):
                 setattr(there, name, value.to(device))
         there.bins = self.bins.to(device)
-        there._fast = Kinematics(self.humanoid.table, torch.float32, device)
+        there.poser = Poser(self.humanoid, device)
         return there
 
     def joined(self, *others: Reference) -> Reference:
@@ -138,33 +124,16 @@ class Reference:
     def _poses(self, qpos: Tensor, qvel: Tensor, body: Tensor) -> Pose:
         """The poses of frames, of which each is one of the body `body (F,)`."""
         if len(self.bodies) == 1:
-            return self._pose(qpos, qvel)
+            return self.poser(qpos, qvel)
         rows = [(body == k).nonzero().squeeze(-1) for k in range(len(self.bodies))]
         pairs = zip(rows, self.bodies, strict=True)
-        parts = [self._pose(qpos[own], qvel[own], humanoid) for own, humanoid in pairs]
+        parts = [Poser(humanoid)(qpos[own], qvel[own]) for own, humanoid in pairs]
         back = torch.cat(rows).argsort()
         return Pose(*(torch.cat([getattr(p, name) for p in parts])[back] for name in FIELDS))
 
-    def _pose(self, qpos: Tensor, qvel: Tensor, humanoid: Humanoid | None = None) -> Pose:
-        """Poses of one body, by default the first."""
-        kinematics = self.kinematics if humanoid is None else Kinematics(humanoid.table)
-        body, humanoid = kinematics(qpos, qvel), humanoid or self.humanoid
-        quat32 = qpos[:, 3:7].float()
-        return Pose(
-            qpos.float(),
-            qvel.float(),
-            body.pos.float(),
-            body.quat.float(),
-            body.linvel.float(),
-            body.angvel.float(),
-            _com(humanoid, body.pos, body.quat),
-            self.local(qpos.float()),
-            heading_quat(quat32),
-        )
-
     def local(self, qpos: Tensor) -> Tensor:
         """`(N, J, 4)` wxyz local turns of hinged bodies."""
-        return self._fast.local_quats(qpos)
+        return self.poser.local(qpos)
 
     @property
     def frames(self) -> int:
@@ -193,18 +162,17 @@ class Reference:
     @property
     def pose(self) -> Pose:
         """Every frame of every clip, as it stands in the clip."""
-        return self.unpacked(self._packed)
+        return self.layout.unpacked(self._packed)
 
-    @pose.setter
-    def pose(self, pose: Pose) -> None:
-        shapes = [getattr(pose, name).shape[1:] for name in FIELDS]
-        self._shapes = tuple(shapes)
-        self._widths = [*(math.prod(shape) for shape in shapes), self._place.shape[1]]
-        self._packed = torch.cat((_pack(pose), self._place), 1)
+    def with_pose(self, pose: Pose) -> Reference:
+        """The same clips with other goals: every frame's pose, of the same shapes as `pose` has."""
+        other = copy.copy(self)
+        other._packed = self.layout.pack(pose, self._place)
+        return other
 
     def gather(self, clip: Tensor, frame: Tensor) -> Pose:
         """The reference pose of `frame (N)` of `clip (N)`; cyclic clips are carried on."""
-        return self.unpacked(self.gather_packed(clip, frame))
+        return self.layout.unpacked(self.gather_packed(clip, frame))
 
     def gather_packed(self, clip: Tensor, frame: Tensor, rows: Tensor | None = None) -> Tensor:
         """The same poses as rows `(N, W)` of all their numbers, for `unpacked`.
@@ -215,8 +183,8 @@ class Reference:
         carry = self.carry(clip, frame)
         if carry is None:
             return packed
-        pose = _carried(self.unpacked(packed), carry[0].float(), carry[1].float())
-        return torch.cat((_pack(pose), packed[:, -self._place.shape[1] :]), 1)
+        pose = _carried(self.layout.unpacked(packed), carry[0].float(), carry[1].float())
+        return self.layout.pack(pose, packed[:, -self._place.shape[1] :])
 
     def packed(self, rows: Tensor) -> Tensor:
         """Packed poses of `rows (N)` as they stand in their clips."""
@@ -235,20 +203,6 @@ class Reference:
             return rows, self._packed.index_select(0, rows)
         ahead = frame + 1 if held is None else frame + 1 - held.long()
         return rows, self.gather_packed(clip, ahead, rows)
-
-    def unpacked(self, packed: Tensor) -> Pose:
-        """The poses whose numbers are the rows of `packed (N, W)`, as views of it."""
-        parts = packed.split_with_sizes(self._widths, -1)[: len(FIELDS)]
-        return Pose(
-            *(
-                part if len(shape) == 1 else part.unflatten(-1, shape)
-                for part, shape in zip(parts, self._shapes, strict=True)
-            )
-        )
-
-    def place(self, packed: Tensor) -> Place:
-        """What the rows of `packed (N, W)` say of their clips, as views of it."""
-        return Place(*packed[:, -self._place.shape[1] :].unbind(-1))
 
     def coordinates(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """`qpos (N, 7 + n)` and `qvel (N, 6 + n)`, float64, of the poses that `gather` gives."""
@@ -300,16 +254,3 @@ def _carried(pose: Pose, turn: Tensor, move: Tensor) -> Pose:
         pose.local,
         quat_mul(turn, pose.heading),
     )
-
-
-def _com(humanoid: Humanoid, pos: Tensor, quat: Tensor) -> Tensor:
-    """The centre of mass `(F, 3)` of a body's parts."""
-    model = humanoid.model
-    mass = torch.tensor(model.body_mass[1:])
-    inertial = torch.tensor(model.body_ipos[1:])
-    centre = pos + quat_rotate(quat, inertial.expand_as(pos))
-    return ((centre * mass[:, None]).sum(-2) / mass.sum()).float()
-
-
-def _pack(pose: Pose) -> Tensor:
-    return torch.cat([getattr(pose, name).flatten(1) for name in FIELDS], 1)

@@ -46,9 +46,9 @@ class ClipFeatures:
 
     def _of(self, rows: Tensor) -> Tensor:
         packed = self.reference.packed(rows)
-        pose, place = self.reference.unpacked(packed), self.reference.place(packed)
-        nothing, one = packed[:, :0], torch.ones_like(place.phase)
-        return seen_by(self.terms, Frame(pose, pose, None, place.phase, nothing, one, place.low))
+        pose, place = self.reference.layout.unpacked(packed), self.reference.layout.place(packed)
+        frame = Frame.given(sim=pose, ref=pose, phase=place.phase, min_height=place.low)
+        return seen_by(self.terms, frame)
 
     def past(self, clip: Tensor, frame: Tensor, count: int) -> Tensor | None:
         """`(n, count, F)` of the `count` frames that end with `frame (n,)` of `clip (n,)`.

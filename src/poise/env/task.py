@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
 from torch import Tensor
 
 from poise.control import HelpSchedule, PDTargets, Residual
-from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
+from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
+from poise.env.plugins import Plugin
 from poise.env.recovery.config import Recovery
 from poise.errors import PoiseError
 
@@ -39,21 +40,28 @@ class EnvStep(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """Imitation as terms.
+    """A task as terms.
 
-    obs, rewards, dones: the terms, in order. pd: how actions become joint targets. residual: the kind
-    of residual force, None for plain DeepMimic. help: how its limits change while episodes are
-    counted, which is with auto_reset alone; None leaves them. help_by: whether "all" worlds have one
-    share of them left, or each "clip" or each "bin" of the clips its own, see `HelpBudget`.
-    horizon: control steps until an episode times out. completion_bonus: what a clip done to its end is
-    worth, in rewards of its last step; a discount g makes g / (1 - g) of a character that goes on as it
-    ended. first: share of the episodes that begin on their clip's frame 0, as evaluations do. hard:
-    share of the others that begin before moments in which episodes lately failed, those of the drawn
-    clip or of all clips as `adaptive_over` says, see `Starts`. style: what a motion prior sees of a
-    frame, terms that look at `frame.sim` alone, see `ImitationEnv.features`. auto_reset: start a new
-    episode where one ended (off while evaluating). recovery: falls and getting up, being far and coming
-    back as part of the episodes, see `poise.env.recovery.config`; None for episodes that begin and stay
-    on their clip.
+    obs, rewards, dones: the terms, in order.
+    pd: how actions become joint targets.
+    residual: the kind of residual force, None for plain DeepMimic.
+    help: how its limits change while episodes are counted, which is with auto_reset alone; None leaves
+        them.
+    help_by: whether "all" worlds have one share of help left, or each "clip" or each motion "bin" its
+        own, see `HelpBudget`.
+    horizon: control steps until an episode times out.
+    completion_bonus: what a clip done to its end is worth, in rewards of its last step; a discount g
+        makes g / (1 - g) of a character that goes on as it ended.
+    first: share of the episodes that begin on their clip's frame 0, as evaluations do.
+    adaptive: share of the others that begin before motion bins in which episodes lately failed.
+    adaptive_over: bins of the drawn "clip", or of the whole "library", see `Starts`.
+    style: what a motion prior sees of a frame, terms that look at `frame.sim` alone, see
+        `ImitationEnv.features`.
+    auto_reset: start a new episode where one ended (off while evaluating).
+    recovery: falls and getting up, being far and coming back as part of the episodes, see
+        `poise.env.recovery.config`; None for episodes that begin and stay on their clip.
+    observables: more of what terms can ask a frame for, by name, see `env.observables`.
+    plugins: more parts of the environment, see `env.plugins`.
     """
 
     obs: tuple[ObsTerm, ...]
@@ -66,11 +74,13 @@ class TaskConfig:
     horizon: int = 300
     completion_bonus: float = 0.0
     first: float = 0.0
-    hard: float = 0.0
+    adaptive: float = 0.0
     adaptive_over: Literal["clip", "library"] = "clip"
     style: tuple[ObsTerm, ...] = ()
     auto_reset: bool = True
     recovery: Recovery | None = None
+    observables: Mapping[str, Observable] = field(default_factory=dict)
+    plugins: tuple[Plugin, ...] = ()
 
     def __post_init__(self) -> None:
         if self.help_by not in ("all", "clip", "bin"):

@@ -17,10 +17,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from poise.env import Acts, ImitationEnv, Recovery, TaskConfig
+from poise.env import Acts, ImitationEnv, Recovery, Reference, TaskConfig
+from poise.env.goals.led import LedGoal
 from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import FALLEN, FAR
-from poise.env.recovery.controller import RecoveryController
 from poise.errors import PoiseError
 from poise.eval.episodes import simulate
 from poise.eval.field_paper import PHC_RECOVERY
@@ -148,12 +149,13 @@ def recovery_card(
         raise PoiseError(what, "recovery", f"Fail-states are {', '.join(KINDS)}")
     env = make_env(min(trials, at_once))
     try:
-        if env.recoveries is None or env.task.auto_reset:
+        clock = env.plugin(RecoveryClock)
+        if clock is None or env.task.auto_reset:
             raise PoiseError("the task is none for trials of recovery", hint="Make it with trial_task")
         if not 0 <= clip < len(env.reference.names):
             raise PoiseError(f"there is no clip {clip}, they are 0 to {len(env.reference.names) - 1}")
         env.reseed(seed)
-        env.recoveries.drop_anew(seed)
+        clock.drop_anew(seed)
         rate, rows = env.reference.rate_hz, []
         stay = max(1, math.ceil(held * rate))
         steps = math.ceil(max(seconds) * rate) + stay - 1
@@ -163,7 +165,7 @@ def recovery_card(
             apart = [_trial(env, policy, *trial) for _ in range(parts)]
             back = back_after(torch.cat(apart)[:trials] < near, stay) / rate
             rows.append(_row(kind, back, seconds))
-        name, distance = env.reference.names[clip], env.recoveries.config.distance
+        name, distance = env.reference.names[clip], clock.config.distance
     finally:
         env.close()
     times = tuple(float(s) for s in seconds)
@@ -188,18 +190,17 @@ def back_after(near: Tensor, stay: int) -> Tensor:
 class _Apart:
     """Observes how far the bodies are from their reference on average, m, after each step."""
 
-    def __init__(self, clip: Tensor, controller: RecoveryController | None):
-        self.clip, self.controller = clip, controller
+    def __init__(self, reference: Reference, clip: Tensor, led: LedGoal | None):
+        self.reference, self.clip, self.led = reference, clip, led
         self.apart: list[Tensor] = []
+        self._at: Tensor | None = None
 
     def see(self, env: ImitationEnv, step: int) -> None:
-        if step == 0:
-            return
-        own, frame = env.reference, env.frame
-        if self.controller is not None:
-            own, frame = self.controller.reference, self.controller.frame
-        ref = own.gather(self.clip, frame)
-        self.apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+        if step:
+            ref = self.reference.gather(self.clip, env.frame if self._at is None else self._at)
+            self.apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+        # Where somebody is led, the frame that was told before the step.
+        self._at = None if self.led is None else self.led.frame.clone()
 
 
 def _trial(
@@ -212,15 +213,15 @@ def _trial(
     recovery_clips: RecoveryClips | None,
 ) -> Tensor:
     """Mean distance of the bodies from their reference after each step, m `(N, steps)` on the CPU."""
-    many, reference, controller = env.clip.new_ones(env.num_envs), env.reference, None
+    many, reference, led = env.clip.new_ones(env.num_envs), env.reference, None
+    env.set_goal(env.goal.clips)
     obs = env.reset_to(clip * many, frame * many, kind * many)
     if recovery_clips is not None:
-        policy = controller = RecoveryController(env, policy, recovery_clips)
-        obs = controller.lead(torch.arange(env.num_envs))
-    seen = _Apart(clip * many, controller)
+        led = LedGoal(env.goal.clips, recovery_clips)
+        led.lead(torch.arange(env.num_envs), env.backend.state.qpos)
+        obs = env.set_goal(led)
+    seen = _Apart(reference, clip * many, led)
     simulate(env, policy, obs, steps, seen)
-    if controller is not None:
-        env.set_goal(reference, clip * many, frame * many)
     return torch.stack(seen.apart, 1)
 
 

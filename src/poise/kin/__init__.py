@@ -1,26 +1,27 @@
 """Kinematics of a humanoid: clips cleaned and healed, to generalized coordinates and back, ground."""
 
 from poise.kin.coords import clip_to_qpos, qpos_to_clip
-from poise.kin.cycle import Cycle, close_cycle, cycle_step, cycle_velocity
-from poise.kin.doctor.clean import CleanReport, Faults, clean_clip, find_faults
+from poise.kin.cycle import close_cycle, cycle_step, cycle_velocity
+from poise.kin.doctor.clean import clean_clip, find_faults
 from poise.kin.doctor.doctor import Examination, examine, heal
 from poise.kin.doctor.faults import Fault, by_kind
-from poise.kin.doctor.guesses import Guess, find_guesses, grounded
+from poise.kin.doctor.guesses import find_guesses, grounded
 from poise.kin.doctor.sides import swap_sides
 from poise.kin.doctor.support import Support, anatomy_of, support_of
-from poise.kin.feet.contacts import contact_labels
-from poise.kin.feet.hold import Held, hold_feet
-from poise.kin.feet.level import Levelled, level_feet
+from poise.kin.feet.contact import contact_labels
+from poise.kin.feet.hold import hold_feet
+from poise.kin.feet.level import level_feet
 from poise.kin.fit import FitReport, fit_humanoid
 from poise.kin.fk import Kinematics
-from poise.kin.ground import GroundFit, fit_ground
+from poise.kin.ground import fit_ground
 from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik.analytic import analytic_ik, clip_ik
 from poise.kin.ik.body import IkBody, ik_body
 from poise.kin.ik.config import CORRECTIONS, IkConfig
 from poise.kin.ik.paper import paper_humanoid
-from poise.kin.ik.polish import PolishConfig, Polished, polish
-from poise.kin.limbs import Limb, TwoBone, limb_of, match_positions, two_bone
+from poise.kin.ik.polish import PolishConfig, polish
+from poise.kin.limbs import limb_of, match_positions, two_bone
+from poise.kin.place import place_on_body
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
@@ -28,26 +29,16 @@ from poise.kin.velocity import qpos_velocity
 
 __all__ = [
     "CORRECTIONS",
-    "CleanReport",
-    "Cycle",
     "Examination",
     "Fault",
-    "Faults",
     "FitReport",
-    "GroundFit",
-    "Guess",
-    "Held",
     "IkBody",
     "IkConfig",
     "Kinematics",
-    "Levelled",
-    "Limb",
     "PolishConfig",
-    "Polished",
     "RetargetConfig",
     "RetargetReport",
     "Support",
-    "TwoBone",
     "analytic_ik",
     "anatomy_of",
     "by_kind",
@@ -74,6 +65,7 @@ __all__ = [
     "lowest_height",
     "match_positions",
     "paper_humanoid",
+    "place_on_body",
     "polish",
     "qpos_to_clip",
     "qpos_velocity",

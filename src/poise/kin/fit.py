@@ -13,22 +13,16 @@ import numpy as np
 import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
-from poise.errors import PoiseError
-from poise.kin.coords import clip_to_qpos
-from poise.kin.cycle import Cycle, join_cycle
+from poise.kin.cycle import Cycle
 from poise.kin.doctor.clean import CleanReport, clean_clip
-from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
-from poise.kin.ground import GroundFit, clip_flights, fit_ground
-from poise.kin.own_body import on_own_body
-from poise.kin.solids import lowest_height
+from poise.kin.ground import GroundFit, clip_flights
+from poise.kin.place import on_own_body, place_on_body
 from poise.motion import Clip, ClipLibrary, resample
 from poise.spatial import quat_conj, quat_mul, quat_to_euler
 
 #: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
 OVERLAP_M = 0.01
-#: How much deeper (m) than the clip its closed cycle may go; beyond, closing it made another motion.
-CYCLE_SINK_M = 0.1
 #: Middle Euler angle (rad) beyond which another hinge order is looked for.
 GIMBAL = 1.2
 
@@ -42,7 +36,7 @@ class FitReport:
     ends of cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance
     per clip between its joints and the humanoid's after conversion (turns that a chain cannot make),
     before a cycle was closed. widened: hinges whose range had to grow, with the growth in degrees.
-    excluded: body pairs that overlap in the reference. fastest: (hinge, rad/s), the largest joint speed.
+    excluded: body pairs that overlap in the reference.
     """
 
     names: tuple[str, ...]
@@ -54,7 +48,6 @@ class FitReport:
     joint_error_mm: tuple[float, ...]
     widened: tuple[tuple[str, float], ...]
     excluded: tuple[tuple[str, str], ...]
-    fastest: tuple[str, float]
 
     @property
     def cyclic(self) -> tuple[bool, ...]:
@@ -125,28 +118,16 @@ def fit_humanoid(
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
-    library, own = on_own_body(library, config)
+    own = None
+    if table is None:
+        library, own = on_own_body(library, config)
     repaired = [clean_clip(c) for c in library]
     clips = [resample(c, rate_hz) for c, _ in repaired]
-    # A body of the user's own keeps its hinges as they are.
+    # A body that is there already keeps its hinges as they are.
     table = table or own or _choose_orders(generate_table(clips[0].skeleton, config, clips), clips)
-    motions = [clip_to_qpos(c, table) for c in clips]
-    for clip, q in zip(clips, motions, strict=True):
-        if not np.isfinite(q).all():
-            raise PoiseError("its coordinates are not finite", clip.name)
-    error = [_joint_error(c, q, table) for c, q in zip(clips, motions, strict=True)]
-    hinges = [name for row in table.rows for name in row.hinge_names()]
-    joined = [
-        _join(q, hinges, table) if c.cyclic else (q, None) for c, q in zip(clips, motions, strict=True)
-    ]
-    motions, cycles = [q for q, _ in joined], tuple(c for _, c in joined)
+    placed = [place_on_body(c, table, clean=False, level=False, join=True) for c in clips]
+    motions = [p.qpos for p in placed]
     table, widened = widen(table, motions, config.margin) if widens else (table, ())
-    closed = [c is not None and c.closed for c in cycles]
-    known = [c.skeleton.source.ground_m is not None for c in clips]
-    fits = [
-        fit_ground(q, table, rate_hz, c, known=k) for q, c, k in zip(motions, closed, known, strict=True)
-    ]
-    motions = [q for q, _ in fits]
     humanoid = make_humanoid(clips[0].skeleton, table)
     overlaps = _overlaps(humanoid, motions)
     if overlaps:
@@ -157,26 +138,13 @@ def fit_humanoid(
         tuple(c.fps for c in library),
         tuple(clip_flights(c, table) for c, _ in repaired),
         tuple(found for _, found in repaired),
-        cycles,
-        tuple(f for _, f in fits),
-        tuple(error),
+        tuple(p.cycle for p in placed),
+        tuple(p.ground for p in placed),
+        tuple(p.joint_error_mm for p in placed),
         widened,
         overlaps,
-        _fastest(humanoid, motions, rate_hz),
     )
     return humanoid, motions, report
-
-
-def _join(qpos: np.ndarray, hinges: list[str], table: BodyTable) -> tuple[np.ndarray, Cycle]:
-    """`join_cycle`, unless closing the gap would bend the motion into the floor."""
-    joined, cycle = join_cycle(qpos, hinges)
-    depths = []
-    for q in (qpos, joined):
-        state = Kinematics(table)(torch.tensor(q))
-        low = lowest_height(table, state.pos, state.quat).min(-1).values
-        depths.append(float(low.quantile(0.1)))
-    sunk = depths[0] - depths[1]
-    return (qpos, replace(cycle, sunk_m=sunk)) if sunk > CYCLE_SINK_M else (joined, cycle)
 
 
 def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
@@ -224,13 +192,6 @@ def widen(
     return replace(table, rows=tuple(rows)), tuple(widened)
 
 
-def _joint_error(clip: Clip, qpos: np.ndarray, table: BodyTable) -> float:
-    """Mean distance in mm between the clip's joints and the humanoid's bodies."""
-    here = Kinematics(table)(torch.tensor(qpos)).pos.numpy()
-    there = clip.positions()[:, [r.joint for r in table.rows]]
-    return float(np.linalg.norm(here - there, axis=-1).mean() * 1000)
-
-
 def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str, str], ...]:
     """Pairs of bodies whose shapes overlap by more than `OVERLAP_M` in some reference frame."""
     model = humanoid.model
@@ -250,10 +211,3 @@ def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str,
                 if a and b:
                     found.add((humanoid.bodies[a - 1], humanoid.bodies[b - 1]))
     return tuple(sorted(found))
-
-
-def _fastest(humanoid: Humanoid, motions: list[np.ndarray], rate_hz: float) -> tuple[str, float]:
-    """The hinge with the largest speed between frames, and that speed in rad/s."""
-    speeds = np.max([np.abs(np.diff(q[:, 7:], axis=0)).max(0) for q in motions], 0) * rate_hz
-    k = int(speeds.argmax())
-    return humanoid.hinges[k], float(speeds[k])

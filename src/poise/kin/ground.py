@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable
+from poise.kin.feet.contact import stance_heights
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, find_flights
 from poise.kin.runs import find_runs
 from poise.kin.solids import centre_of_mass, lowest_height
 from poise.motion import Clip
-from poise.spatial import quat_rotate
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
 SINK_M = 0.02
@@ -131,7 +131,8 @@ def fit_heights(
     # The mirror image of a clearance: a running minimum, so that no frame is lowered beyond its excess.
     settle = np.maximum(-smooth_hull(-_hover(low + lift, flights), reach, cyclic), 0.0)
     low_now = low + lift - settle
-    clear = _clearance(np.maximum(-low_now - sink_m, 0.0), reach, cyclic)
+    depth = np.maximum(-low_now - sink_m, 0.0)
+    clear = smooth_lift(depth, fps, 0.1, cyclic) * float(depth.max() > 1e-4)
     after = low_now + clear
     return GroundFit(lift, clear, settle, flights, float(low.min()), float(min(after.min(), 0.0)))
 
@@ -151,9 +152,9 @@ def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
     return np.minimum(np.interp(at, at[~air], excess[~air]), excess)
 
 
-def _clearance(depth: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
-    """The smooth lift `(T,)` that covers `depth (T,)`, both in m."""
-    return np.maximum(smooth_hull(depth, reach, cyclic), 0.0) * float(depth.max() > 1e-4)
+def smooth_lift(depth: np.ndarray, fps: float, seconds: float, cyclic: bool = False) -> np.ndarray:
+    """The smooth lift `(T,)` that covers `depth (T,)`, both in m, spread over +-`seconds`."""
+    return np.maximum(smooth_hull(depth, max(1, round(seconds * fps)), cyclic), 0.0)
 
 
 def smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
@@ -167,27 +168,3 @@ def smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
     window = np.hanning(2 * reach + 3)[1:-1]
     smooth = np.convolve(np.pad(hull, reach, mode=mode), window / window.sum(), "valid")
     return np.append(smooth, smooth[0]) if cyclic else smooth
-
-
-def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> np.ndarray:
-    """Heights (m) of the middle of the soles in all frames in which a foot stands.
-
-    A foot stands when its sole is within 20 degrees of level, moves slower than 0.4 m/s, and is
-    among the lower half of such moments (a foot may also rest level in the air).
-    """
-    found: list[Tensor] = []
-    for i, row in enumerate(table.rows):
-        box = next((g for g in row.geoms if g.kind == "box"), None)
-        if row.kind != "foot" or box is None:
-            continue
-        turn = torch.tensor(box.quat, dtype=pos.dtype)
-        up = quat_rotate(turn, torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype))
-        sole = torch.tensor(box.pos, dtype=pos.dtype) - up * box.size[2]
-        point = pos[:, i] + quat_rotate(quat[:, i], sole.expand_as(pos[:, i]))
-        ahead = torch.arange(len(point)).add(1).clamp(max=len(point) - 1)
-        behind = torch.arange(len(point)).sub(1).clamp(min=0)
-        speed = (point[ahead] - point[behind]).norm(dim=-1) * fps / (ahead - behind)
-        level = quat_rotate(quat[:, i], up.expand_as(pos[:, i]))[:, 2] > 0.94
-        found.append(point[level & (speed < 0.4), 2])
-    heights = torch.cat(found).numpy() if found else np.zeros(0)
-    return heights[heights <= np.median(heights) + 0.02] if len(heights) else heights

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
-from poise.env.recovery.controller import LOST
+from poise.env.goals.led import LOST
 from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.metrics import mpjpe_global
@@ -181,7 +181,7 @@ class SamplingControl:
         parent = torch.arange(n) % self.states
         env.backend.restore(now.sim[parent])
         if int(env.frame[0]) != done:
-            env.set_goal(env.reference, env.clip, torch.full_like(env.frame, done))
+            env.seek(env.clip, torch.full_like(env.frame, done))
         obs, cost, error = now.obs[parent], c.memory * now.cost[parent], now.error[parent].clone()
         drawn, lost = self._drawn(n), torch.zeros(n, dtype=torch.bool)
         made: list[Tensor] = []

@@ -36,7 +36,7 @@ from poise.control import (
 from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
 from poise.env.terms import done, obs, reward
 from poise.kin import fit_humanoid
-from poise.kin.own_body import on_own_body
+from poise.kin.place import on_own_body
 from poise.learn import PPOConfig
 from poise.recipes.imitation import Clips, Imitation, as_library
 from poise.settings import Migration, from_data, validate
@@ -176,9 +176,8 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
 def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
     """Body, reference and task for a clip, a motion file or a library; train with `.trainer()`."""
     config = config or ResidualForce()
-    library = as_library(clips)
-    library, _ = on_own_body(library, config.body)
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz)
+    library, own = on_own_body(as_library(clips), config.body)
+    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, own)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))

@@ -8,16 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.kin.feet.lead import Lead, Sole, lead, led
+from poise.kin.feet.contact import Sole
+from poise.kin.feet.hold import FIRM, Standing, hold
+from poise.kin.feet.lead import Lead, led
 from poise.motion import Skeleton
 from poise.spatial import forward_kinematics
 from poise.synth.steps import missing_steps, rises, stepping
-
-#: How much a foot bears that the network says stands; how a foot is led is made for weights up to 1, at
-#: which it may drift by millimetres per second.
-_FIRM = 100.0
-#: How often it is done: tilts are small, but not infinitely.
-_ROUNDS = 2
 
 
 def lock_feet(
@@ -41,13 +37,20 @@ def lock_feet(
     gap = _gap(free)
     if gap is not None:
         contact = _with_steps(skeleton, soles, root, rot, contact, gap, fps)
-    bears = (contact[1:] & contact[:-1]).to(rot.dtype) * _FIRM
-    for _ in range(_ROUNDS):
-        rot = _lock_once(skeleton, soles, root, rot, bears, free, fps)
+    bears = (contact[1:] & contact[:-1]).to(rot.dtype) * FIRM
+
+    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
+        return {
+            s.ankle: Standing(Sole(pos[:, s.ankle], pos[:, [s.ankle, s.toe]]), bears[:, list(s.columns)])
+            for s in soles
+            if bool(bears[:, list(s.columns)].any())
+        }
+
+    rot = hold(skeleton, root, rot, fps, standing, ~free, vertical=True)
     return rot if gap is None else _cleared(skeleton, soles, root, rot, contact, gap)
 
 
-class _Sole(NamedTuple):
+class _Foot(NamedTuple):
     """An ankle and its toe, and their columns among the contacts."""
 
     ankle: int
@@ -55,13 +58,13 @@ class _Sole(NamedTuple):
     columns: tuple[int, int]
 
 
-def _soles(skeleton: Skeleton, feet: Sequence[int]) -> list[_Sole]:
+def _soles(skeleton: Skeleton, feet: Sequence[int]) -> list[_Foot]:
     out = []
     for k, toe in enumerate(feet):
         ankle = skeleton.parents[toe]
         # A leg has a knee and a hip above its ankle.
         if ankle in feet and len(skeleton.ancestors(ankle)) > 2:
-            out.append(_Sole(ankle, toe, (list(feet).index(ankle), k)))
+            out.append(_Foot(ankle, toe, (list(feet).index(ankle), k)))
     return out
 
 
@@ -78,18 +81,18 @@ def _gap(free: Tensor) -> slice | None:
     return slice(int(inside[0]) - 1, int(inside[-1]) + 2)
 
 
-def _ends(skeleton: Skeleton, soles: list[_Sole], root: Tensor, rot: Tensor) -> Tensor:
+def _ends(skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor) -> Tensor:
     """`(T, K, 2, 3)` m, ankles and toes."""
     return _positions(skeleton, root, rot)[:, [[s.ankle, s.toe] for s in soles]]
 
 
-def _stands(contact: Tensor, soles: list[_Sole]) -> Tensor:
+def _stands(contact: Tensor, soles: list[_Foot]) -> Tensor:
     """`(T, K)` bool, on either end."""
     return torch.stack([contact[:, list(s.columns)].any(1) for s in soles], 1)
 
 
 def _with_steps(
-    skeleton: Skeleton, soles: list[_Sole], root: Tensor, rot: Tensor, contact: Tensor, gap: slice,
+    skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor, contact: Tensor, gap: slice,
     fps: float,
 ) -> Tensor:  # fmt: skip
     """The contacts with the steps that are missing."""
@@ -101,7 +104,7 @@ def _with_steps(
 
 
 def _cleared(
-    skeleton: Skeleton, soles: list[_Sole], root: Tensor, rot: Tensor, contact: Tensor, gap: slice
+    skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor, contact: Tensor, gap: slice
 ) -> Tensor:
     """The motion with the feet raised that swing too low."""
     up = rises(_ends(skeleton, soles, root[gap], rot[gap]), _stands(contact[gap], soles))
@@ -116,17 +119,3 @@ def _cleared(
     if leads:
         rot[gap] = led(skeleton, rot[gap], root[gap], leads)
     return rot
-
-
-def _lock_once(
-    skeleton: Skeleton, soles: list[_Sole], root: Tensor, rot: Tensor, bears: Tensor, free: Tensor,
-    fps: float,
-) -> Tensor:  # fmt: skip
-    pos = _positions(skeleton, root, rot)
-    leads = {}
-    for s in soles:
-        weight = bears[:, list(s.columns)]
-        if bool(weight.any()):
-            sole = Sole(pos[:, s.ankle], pos[:, [s.ankle, s.toe]])
-            leads[s.ankle] = lead(sole, weight.numpy(), fps, (~free).numpy(), vertical=True)
-    return led(skeleton, rot, root, leads) if leads else rot.clone()

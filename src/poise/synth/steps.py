@@ -23,7 +23,7 @@ SWING_S, SWING_S_PER_M = 0.3, 0.15
 #: swings of CMU clips, of all lengths from 0.1 to 1.5 m.
 CLEAR_M = 0.05
 #: What a step may have of the gap, and what is left standing at its ends, in frames.
-_MOST, _EDGE = 0.45, 2
+_MOST_OF_GAP, _EDGE_FRAMES = 0.45, 2
 #: The share of a swing, about its middle, in which a foot must be clear.
 _MIDDLE = 0.6
 
@@ -54,8 +54,8 @@ def missing_steps(soles: Tensor, stands: Tensor, fps: float) -> tuple[Step, ...]
     found: list[Step] = []
     for k in sorted(wanting, key=lambda k: _moved(ankles[:, k])):
         seconds = SWING_S + SWING_S_PER_M * float(apart[k])
-        length = round(min(seconds * fps, _MOST * frames))
-        if length < 2 or frames < length + 2 * _EDGE:
+        length = round(min(seconds * fps, _MOST_OF_GAP * frames))
+        if length < 2 or frames < length + 2 * _EDGE_FRAMES:
             continue
         others = [j for j in range(feet) if j != k]
         later = len(wanting) - len(found) - 1
@@ -112,8 +112,8 @@ def _when(middle: float, busy: Tensor, length: int, later: int) -> int:
     """Where a step of `length` frames begins: with little of it while other feet are in the air (`busy`
     `(T)`), room after it for `later` more steps, then near `middle`."""
     frames = len(busy)
-    last = max(_EDGE, frames - _EDGE - (later + 1) * length)
-    starts = torch.arange(_EDGE, last + 1)
+    last = max(_EDGE_FRAMES, frames - _EDGE_FRAMES - (later + 1) * length)
+    starts = torch.arange(_EDGE_FRAMES, last + 1)
     in_air = torch.cat((torch.zeros(1), busy.double().cumsum(0)))
     clash = in_air[starts + length] - in_air[starts]
     off = (starts + 0.5 * length - middle).abs() / frames

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.env import DoneTerm, ImitationEnv, ObsTerm, Recovery
+from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import CONTINUED, FALLEN, FAR, TRACKED, toward
 from poise.env.recovery.falls import Drop, lies
 from poise.env.terms import done, phc_obs, phc_recovery
@@ -86,9 +87,9 @@ def test_paper_and_code_differ_where_they_do():
 
 def test_episodes_begin_in_their_kinds_at_their_odds(built):
     env = env_of(built, 60, replace(QUICK, fallen=0.3, far=0.2))
-    r, state = env.recoveries, env.backend.state
+    r, state = env.plugin(RecoveryClock), env.backend.state
     assert r is not None
-    drawn = r.draw(4000, torch.Generator().manual_seed(0))
+    drawn = r.kinds(4000, torch.Generator().manual_seed(0))
     fallen, far = (drawn & FALLEN).bool(), (drawn & FAR).bool()
     for got, want in ((fallen, 0.3), (far, 0.2), (fallen & far, 0.06)):
         assert float(got.float().mean()) == pytest.approx(want, abs=0.03)
@@ -110,12 +111,12 @@ def test_the_reference_waits_for_the_fallen_alone(built):
     env = env_of(built, 3, auto_reset=False)
     env.reset_to(*at(3, 5), torch.tensor([TRACKED, FALLEN, FAR]))
     goal = env.reference.gather(env.clip, env.frame + torch.tensor([1, 0, 1])).qpos
-    torch.testing.assert_close(env.reference.unpacked(env._goal).qpos, goal)
+    torch.testing.assert_close(env.reference.layout.unpacked(env.goal.ahead()).qpos, goal)
     frames, goals = [], []
     for _ in range(5):
         env.step(rest(env))
         frames.append(env.frame.tolist())
-        goals.append((env._goal_rows - env.reference.rows(env.clip, env.frame)).tolist())
+        goals.append((env.goal.row() - env.reference.rows(env.clip, env.frame)).tolist())
     # Three steps of grace; after the last of them the reference goes on.
     assert frames == [[6, 5, 6], [7, 5, 7], [8, 5, 8], [9, 6, 9], [10, 7, 10]]
     assert goals == [[1, 0, 1], [1, 0, 1], [1, 1, 1], [1, 1, 1], [1, 1, 1]]
@@ -134,8 +135,9 @@ def test_who_recovers_cannot_fail_and_fails_again_once_settled(built):
     for _ in range(5):
         move(env, 0.0 * off)
         step = env.step(rest(env))
-        assert env.recoveries is not None
-        spare.append(int(env.recoveries.spare[0]))
+        clock = env.plugin(RecoveryClock)
+        assert clock is not None
+        spare.append(int(clock.spare[0]))
     # 2 steps near, and one more after which failures count.
     assert spare == [2, 1, 0, 0, 0]
     move(env, off)
@@ -159,8 +161,9 @@ def test_failures_go_on_at_their_odds_and_the_reference_waits_where_it_was_going
     env.reset_to(*at(400, 7))
     move(env, torch.tensor([0.0, 3.0, 0.0]).expand(400, 3))
     step = env.step(rest(env))
-    assert env.recoveries is not None
-    on = (env.recoveries.kind & CONTINUED).bool()
+    clock = env.plugin(RecoveryClock)
+    assert clock is not None
+    on = (clock.kind & CONTINUED).bool()
     assert float(on.float().mean()) == pytest.approx(0.4, abs=0.07)
     assert torch.equal(step.failed, ~on) and torch.equal(step.terminated, ~on)
     assert torch.equal(step.obs[on], step.final_obs[on]) and bool((env.age[on] == 1).all())
@@ -241,7 +244,7 @@ def test_what_a_policy_sees_of_a_point_does_not_depend_on_how_the_reference_move
         quat=torch.cat((root[1].expand(2, 1, 4), other.quat[:, 1:]), 1),
     )
     aims = toward(frame.sim, alike, torch.ones(2, dtype=torch.bool), 5.0)
-    seen = goal(replace(frame, ahead=aims))
+    seen = goal(frame.replaced(ahead=aims))
     assert len(qpos) == 2
     torch.testing.assert_close(seen[0], seen[1])
     env.close()
@@ -254,14 +257,15 @@ def test_the_point_goals_reward_by_hand(built):
     env = env_of(built, 3, auto_reset=False)
     env.reset_to(*at(3, 4))
     move(env, torch.tensor([[0.0, 0.1, 0.0], [0.0, 3.0, 0.0], [0.0, 9.0, 0.0]]))
-    assert env.recoveries is not None
-    env.recoveries.before.copy_(torch.tensor([0.3, 3.1, 8.0]))
+    clock = env.plugin(RecoveryClock)
+    assert clock is not None
+    clock.before.copy_(torch.tensor([0.3, 3.1, 8.0]))
     step = env.step(rest(env))
     now = (env.pose().pos[:, 0] - env.reference.gather(env.clip, env.frame).pos[:, 0]).norm(dim=-1)
     point, energy = env.terms["point_goal"], env.terms["energy_far"]
     expected = [0.0, 3.1 - float(now[1]), 8.0 - float(now[2])]
     torch.testing.assert_close(point, torch.tensor(expected), atol=1e-5, rtol=0)
-    torch.testing.assert_close(env.recoveries.before, now)
+    torch.testing.assert_close(env.plugin(RecoveryClock).before, now)
     # Imitation counts near the reference alone.
     assert env.terms["body_velocities"].gt(0).tolist() == [True, False, False]
     assert env.imitation.gt(0).tolist() == [True, False, False]
@@ -282,7 +286,7 @@ def test_the_codes_reward_counts_progress_everywhere_and_imitation_by_half(built
     frame = env._frame()
     before, now = torch.tensor([1.0, 3.0, 2.0]), torch.tensor([0.9, 2.0, 2.5])
     assert frame.point is not None
-    frame = replace(frame, point=frame.point._replace(before=before, distance=now))
+    frame = frame.replaced(point=frame.point._replace(before=before, distance=now))
     term = code["point_goal"]
     # 9 x 0.1; a metre counts as a third; going away costs.
     torch.testing.assert_close(term.fn(frame, **term.params), torch.tensor([0.9, 3.0, -4.5]))
@@ -311,13 +315,13 @@ def test_state_continues_bit_for_bit(built):
     other.load_state(saved)
     ours, theirs = rollout(clips, 25, 1), rollout(other, 25, 1)
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    assert clips.recoveries is not None and other.recoveries is not None
-    assert len(clips.recoveries.kind.unique()) > 2
-    assert torch.equal(clips.recoveries.table, other.recoveries.table)
+    assert clips.plugin(RecoveryClock) is not None and other.plugin(RecoveryClock) is not None
+    assert len(clips.plugin(RecoveryClock).kind.unique()) > 2
+    assert torch.equal(clips.plugin(RecoveryClock).table, other.plugin(RecoveryClock).table)
     # A state from before recovery goes on as tracked.
     old = {k: v for k, v in saved.items() if k not in ("recovery", "falls")}
     other.load_state(old)
-    assert not other.recoveries.table.any()
+    assert not other.plugin(RecoveryClock).table.any()
     clips.close()
     other.close()
 
@@ -345,7 +349,7 @@ def test_a_cyclic_reference_waits_where_it_has_come_to(built, make_phc):
         env.step(rest(env))
         ahead = env.frame + (torch.tensor([0, 1]) if k < 2 else 1)
         goal = env.reference.gather(env.clip, ahead)
-        torch.testing.assert_close(env.reference.unpacked(env._goal).pos, goal.pos)
+        torch.testing.assert_close(env.reference.layout.unpacked(env.goal.ahead()).pos, goal.pos)
     assert env.frame.tolist() == [23, 26]
     env.close()
 
@@ -354,7 +358,7 @@ def test_a_task_without_recovery_is_as_before(built, make_phc):
     """Odds of 0 and nobody far: the same numbers as without any recovery, bit for bit."""
     task = make_phc(WALK)
     plain = task.env(6, 3, False, threads=1)
-    assert plain.recoveries is None and "recovery" not in plain.state()
+    assert plain.plugin(RecoveryClock) is None and "recovery" not in plain.state()
     with pytest.raises(PoiseError, match="knows no falls"):
         plain.reset_to(*at(6, 0), torch.full((6,), FALLEN))
     never = Recovery(0.0, 0.0, 0.0, switch=50.0, reach=60.0)

@@ -105,7 +105,7 @@ def test_a_flipped_hand_comes_back(clip):
     hand = human().index("RightHand")
     fixed, (found,) = unflip(flipped(clip, hand, 10, 30, (0, 0, 1.0)), ANATOMY, TRUNK_SPEED)
     assert found.joint == "RightHand" and apart_deg(fixed, clip) < 2.0
-    assert found.sentence() == "RightHand: 20 frames from frame 10 on turned back by 180 degrees"
+    assert (found.joint, found.frames, found.start) == ("RightHand", 20, 10)
 
 
 def test_a_smeared_flip_is_turned_back_and_its_edges_interpolated(clip):

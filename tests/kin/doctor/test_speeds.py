@@ -110,4 +110,4 @@ def test_every_part_has_its_limit(clip):
     slow = np.where(np.arange(clip.frames) < 60, 0.0, 34.0 / 120.0)
     assert limit_speeds(twisted(clip, slow), ANATOMY)[1] == ()
     (found,) = limit_speeds(twisted(clip, slow, clip.skeleton.index("LeftFoot")), ANATOMY)[1]
-    assert found.joint == "LeftFoot" and "rad/s, now" in found.sentence()
+    assert found.joint == "LeftFoot"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from poise.kin.feet.lead import RETURN_PER_S, SMOOTH_S, Sole, lead
+from poise.kin.feet.contact import Sole
+from poise.kin.feet.lead import RETURN_PER_S, SMOOTH_S, lead
 from poise.spatial import axis_angle_to_quat, quat_rotate
 
 

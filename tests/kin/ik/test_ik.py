@@ -41,7 +41,7 @@ def t_pose(one_hinge: bool = False) -> IkBody:
 def pose(body: IkBody, q: np.ndarray) -> np.ndarray:
     """World positions `(T, P, 3)` of a body's points."""
     state = Kinematics(body.table)(torch.tensor(q))
-    return body_points(body, state.pos.numpy(), quat_to_matrix(state.quat).numpy())
+    return body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
 
 
 def random_motion(body: IkBody, frames: int, seed: int, size: float = 0.6) -> np.ndarray:

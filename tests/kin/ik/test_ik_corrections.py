@@ -66,7 +66,7 @@ def column(body: IkBody, hinge: str) -> int:
 
 def pose(body: IkBody, q: np.ndarray) -> np.ndarray:
     state = Kinematics(body.table)(torch.tensor(q))
-    return body_points(body, state.pos.numpy(), quat_to_matrix(state.quat).numpy())
+    return body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
 
 
 def error_mm(body: IkBody, wanted: np.ndarray, config: IkConfig) -> dict[str, float]:

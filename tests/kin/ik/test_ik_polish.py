@@ -27,7 +27,7 @@ def humanoid():
 def points(humanoid, q: np.ndarray) -> dict[str, np.ndarray]:
     body = IkBody.of(humanoid)
     state = Kinematics(humanoid.table)(torch.tensor(q))
-    at = body_points(body, state.pos.numpy(), quat_to_matrix(state.quat).numpy())
+    at = body_points(body, state.pos, quat_to_matrix(state.quat)).numpy()
     return {n: at[:, i] for i, n in enumerate(body.points)}
 
 

@@ -11,9 +11,10 @@ import torch
 
 from poise.errors import PoiseError
 from poise.kin import RetargetConfig, retarget
+from poise.kin.feet.contact import rest_height
 from poise.kin.limbs import match_positions
 from poise.kin.retarget.common_pose import common_pose, hanging
-from poise.kin.retarget.plant import BLEND_S, contact_weight, tread_height
+from poise.kin.retarget.plant import BLEND_S, contact_weight
 from poise.kin.retarget.standing import World, hinge_axis
 from poise.motion import Clip, Skeleton, find_roles, read_clip, resample, trim
 from poise.spatial import euler_to_quat, normalize, quat_conj, quat_distance, quat_mul, quat_rotate
@@ -397,7 +398,7 @@ def test_the_ground_is_where_feet_rest() -> None:
     for k, phase in enumerate((0.0, math.pi)):
         points[:, k, 2] = 0.03 + 0.2 * torch.sin(t + phase).clamp_min(0)
         points[:, k, 0] = torch.where(torch.sin(t + phase) > 0, t, 0.0)
-    assert tread_height(points, 60.0) == pytest.approx(0.03, abs=2e-3)
+    assert rest_height(points, 60.0) == pytest.approx(0.03, abs=2e-3)
 
 
 def test_hanging_is_the_subtree() -> None:

@@ -1,4 +1,4 @@
-"""Who of an environment's worlds recovers, from what, and since when."""
+"""Which of an environment's worlds recover, from what, and since when: a plug-in."""
 
 from __future__ import annotations
 
@@ -10,26 +10,51 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import PDTargets
-from poise.env.recovery.config import CONTINUED, FALLEN, FAR, Recovery
+from poise.env import observables
+from poise.env.frame import Frame, Layout, Observable, PointGoal, Pose
+from poise.env.plugins import Plugin, Start
+from poise.env.recovery.config import (
+    CONTINUED,
+    FALLEN,
+    FAR,
+    Recovery,
+    point_goal,
+    root_distance,
+    toward,
+)
 from poise.env.recovery.falls import fall_states, rest_angles
+from poise.errors import PoiseError
 from poise.sim import Backend
 
 
-class RecoveryClock:
+class RecoveryClock(Plugin):
     """The recoveries of an environment's worlds.
 
-    table: `(N, 4)` float32. grace: control steps for which the reference still waits. spare: above 0 as
-    long as nobody can fail. before: m, between the roots one step ago. kind: bits of the episode's kind.
+    Attributes:
+        table: `(N, 4)` float32; its columns are the next four.
+        grace: control steps for which the goal still waits.
+        spare: above 0 as long as the episode cannot fail.
+        before: m, between the roots one step ago.
+        kind: bits of the episode's kind.
 
     Args:
-        config: the settings. backend: the worlds, in which the fallen fall when they are first needed.
-        humanoid, pd: their body and its servos. seed: of the falls.
+        config: the settings.
+        backend: the worlds, in which characters fall when fallen ones are first needed.
+        humanoid, pd: their body and its servos.
+        layout: of the packed goals.
+        seed: of the falls.
     """
 
     def __init__(
-        self, config: Recovery, backend: Backend, humanoid: Humanoid, pd: PDTargets, seed: int = 0
+        self,
+        config: Recovery,
+        backend: Backend,
+        humanoid: Humanoid,
+        pd: PDTargets,
+        layout: Layout,
+        seed: int = 0,
     ):
-        self.config, self.seed = config, seed
+        self.config, self.seed, self._layout = config, seed, layout
         self._rest = rest_angles(humanoid).float().to(backend.device)
         self._made_with = backend, humanoid, pd
         self.table = torch.zeros(backend.num_envs, 4, device=backend.device)
@@ -44,7 +69,7 @@ class RecoveryClock:
         return self._falls
 
     def drop_anew(self, seed: int) -> None:
-        """Lets others fall when the fallen are next needed, those of `seed`."""
+        """The next fallen characters are those of another seed."""
         self.seed, self._falls = seed, None
 
     @property
@@ -52,70 +77,79 @@ class RecoveryClock:
         """`(N,)` bits of each episode's kind."""
         return self._kind.long()
 
-    @property
-    def held(self) -> Tensor:
-        """`(N,)` bool: whose reference waits. One that failed first reaches the frame it made for."""
-        return (self.grace > 0) & (self.grace <= self.config.grace)
+    # --- what terms see -----------------------------------------------------------------------
 
-    def targets(self, hinges: Tensor) -> Tensor:
-        """What additive actions add to, rad `(N, n)`: the reference's `hinges (N, n)`, or the body at
-        rest where the goal is a point, which tells nothing of the reference's."""
-        far = self.before > self.config.switch
-        return torch.where(far.unsqueeze(-1), self._rest.to(hinges), hinges)
+    @property
+    def observables(self) -> Mapping[str, Observable]:
+        """Where the reference's root is, and a goal that is a point where that is far."""
+
+        def point(frame: Frame) -> PointGoal:
+            before = frame.source("recovery")[:, 2]
+            return point_goal(frame.sim, frame.ref, before, self.config.switch)
+
+        def ahead(frame: Frame) -> Pose | None:
+            goal = observables.ahead(frame)
+            assert goal is not None and frame.point is not None
+            return toward(frame.sim, goal, frame.point.far, self.config.reach)
+
+        return {"point": point, "ahead": ahead}
+
+    def sources(self) -> Mapping[str, Tensor]:
+        return {"recovery": self.table}
 
     # --- starts -------------------------------------------------------------------------------
 
-    def draw(self, count: int, rng: torch.Generator) -> Tensor:
-        """`(count,)` kinds of new episodes."""
+    def kinds(self, count: int, rng: torch.Generator) -> Tensor:
         u, c = torch.rand(count, 2, dtype=torch.float64, generator=rng), self.config
         return FALLEN * (u[:, 0] < c.fallen) + FAR * (u[:, 1] < c.far)
 
-    def begin(
-        self, ids: Tensor | slice, kind: Tensor, qpos: Tensor, qvel: Tensor, rng: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Episodes of some kinds `(n,)` in worlds `ids`; the coordinates of their starts.
-
-        qpos `(n, nq)`, qvel `(n, nv)`: of the reference, where it begins.
-        """
-        c, kind = self.config, kind.cpu()
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        """Episodes of some kinds `(n,)`; begins them fallen, far, or on the reference."""
+        qpos, qvel = start
+        rows = slice(None) if ids is None else ids
+        kind = torch.zeros(len(qpos), dtype=torch.long) if kind is None else kind.cpu()
         # As many draws whatever the kinds, so that one episode's kind does not move the others.
-        u = torch.rand(len(kind), 3, dtype=torch.float64, generator=rng)
+        c, u = self.config, torch.rand(len(kind), 3, dtype=torch.float64, generator=rng)
         angle, length = 2 * math.pi * u[:, 0], c.radius(u[:, 1])
         offset = torch.stack((angle.cos(), angle.sin()), -1) * length.unsqueeze(-1)
         offset = offset * (kind & FAR).bool().unsqueeze(-1)
-        fallen, start = (kind & FALLEN).bool(), qpos.clone()
+        fallen, place = (kind & FALLEN).bool(), qpos.clone()
         if bool(fallen.any()):
             pick, down = (u[:, 2] * len(self.falls)).long()[fallen], fallen.to(qpos.device)
             lying = self.falls[pick].to(qpos)
             lying[:, :2] = qpos[down, :2]
-            start[down] = lying
+            place[down] = lying
             qvel = torch.where(down.unsqueeze(-1), 0.0, qvel)
-        start[:, :2] += offset.to(start)
-        self.table[ids, 0] = (c.grace * fallen).to(self.table)
-        self.table[ids, 1] = ((c.settle + 1) * (kind > 0)).to(self.table)
-        self.table[ids, 2] = (start[:, :3] - qpos[:, :3]).norm(dim=-1).to(self.table)
-        self.table[ids, 3] = kind.to(self.table)
-        return start, qvel
+        place[:, :2] += offset.to(place)
+        self.table[rows, 0] = (c.grace * fallen).to(self.table)
+        self.table[rows, 1] = ((c.settle + 1) * (kind > 0)).to(self.table)
+        self.table[rows, 2] = (place[:, :3] - qpos[:, :3]).norm(dim=-1).to(self.table)
+        self.table[rows, 3] = kind.to(self.table)
+        return place, qvel
 
     # --- stepping -----------------------------------------------------------------------------
 
-    def tick(self, frame: Tensor) -> Tensor:
-        """One control step has been made: takes it back in `frame (N,)` of references that waited.
+    def held(self) -> Tensor:
+        """`(N,)` bool. The goal of an episode that failed first reaches the frame it made for."""
+        return (self.grace > 0) & (self.grace <= self.config.grace)
 
-        Returns:
-            `(N,)` bool, whose reference waits in the next step.
-        """
-        frame.sub_(self.held.long())
+    def targets(self, hinges: Tensor) -> Tensor:
+        """The goal's hinges, or the body at rest where the goal is a point, which tells no angles."""
+        far = self.before > self.config.switch
+        return torch.where(far.unsqueeze(-1), self._rest.to(hinges), hinges)
+
+    def tick(self) -> None:
         self.grace.sub_(1.0).clamp_min_(0.0)
-        return self.held
 
-    def judge(self, ends: Tensor, distance: Tensor, late: Tensor, rng: torch.Generator | None) -> None:
-        """Notes who came how near, m `(N,)`, and takes back some failures in `ends (3, N)`.
+    def ends(self, frame: Frame, failed: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
+        free = frame.source("recovery")[:, 1] == 0
+        return failed & free, done & free
 
-        ends: failed, terminated, truncated. late: `(N,)` bool, whose time is over. rng: draws who goes
-        on; None lets nobody.
-        """
-        self.reached(distance)
+    def judged(self, ends: Tensor, ref: Tensor, late: Tensor, rng: torch.Generator | None) -> None:
+        apart = root_distance(self._layout.unpacked(ref).pos, self._made_with[0].state.xpos[:, 1:])
+        self.reached(apart)
         if rng is not None:
             failed, terminated, truncated = ends.unbind(0)
             ids = self.survive(failed, rng)
@@ -123,7 +157,7 @@ class RecoveryClock:
             truncated[ids] = late[ids]
 
     def reached(self, distance: Tensor) -> None:
-        """The step led to these distances between the roots, m `(N,)`: who is near settles."""
+        """The step led to these distances between the roots, m `(N,)`: near ones settle."""
         near = (self.grace == 0) & (distance <= self.config.switch)
         left = torch.where(near, self.spare - 1.0, self.config.settle + 1.0)
         self.spare.copy_(torch.where(self.spare > 0, left, 0.0))
@@ -134,20 +168,27 @@ class RecoveryClock:
         ids = failed.nonzero().squeeze(-1)
         u = torch.rand(len(ids), dtype=torch.float64, generator=rng)
         ids = ids[(u < self.config.continues).to(ids.device)]
-        # One step longer than others', since the reference first reaches the frame it makes for.
+        # One step longer than others', since the goal first reaches the frame it makes for.
         self.grace[ids], self.spare[ids] = self.config.grace + 1.0, self.config.settle + 1.0
         self._kind[ids] = (self.kind[ids] | CONTINUED).to(self.table)
         return ids
 
-    def shares(self) -> dict[str, Tensor]:
-        """For the log: who is far and who waits, float32 `(N,)`."""
+    def counted(self) -> Tensor:
+        """Episodes that recover, or have recovered, have not been where their age says."""
+        return self.kind == 0
+
+    def past(self, rows: Tensor) -> Tensor:
+        """Fallen characters have not come to lie with the clip."""
+        return (self.kind[rows] & FALLEN).bool()
+
+    def log(self) -> Mapping[str, Tensor]:
         far = self.before > self.config.switch
-        return {"recovery/far": far.float(), "recovery/waiting": self.held.float()}
+        return {"recovery/far": far.float(), "recovery/waiting": self.held().float()}
 
     # --- persistence --------------------------------------------------------------------------
 
     def state(self) -> dict[str, Tensor]:
-        """What `load_state` takes. The falls are those of a seed, and made again from it."""
+        """The falls are those of a seed, and made again from it."""
         return {"recovery": self.table.clone(), "falls": torch.tensor([self.seed])}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -158,3 +199,18 @@ class RecoveryClock:
         self.table.copy_(state["recovery"])
         if int(state["falls"]) != self.seed:
             self.drop_anew(int(state["falls"]))
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"recovery": self.table}
+
+
+def recovery_of(plugins: tuple[Plugin, ...]) -> RecoveryClock:
+    """The recovery clock among an environment's plug-ins.
+
+    Raises:
+        PoiseError: the task knows no recovery.
+    """
+    for plugin in plugins:
+        if isinstance(plugin, RecoveryClock):
+            return plugin
+    raise PoiseError("this task knows no falls", hint="Set TaskConfig.recovery")

@@ -2,68 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from poise.env.frame import DoneTerm, Frame, LazyPose, ObsTerm, Pose, RewardTerm
+from poise.env.frame import DoneTerm, Frame, Observable, ObsTerm, RewardTerm
+from poise.env.observables import Context
 from poise.env.record import TensorFunction, record
-from poise.spatial import heading_quat
+from poise.sim import Backend
 
 #: From so many worlds on, two threads evaluate a half each.
 MANY = 256
 
 
-class Seen(NamedTuple):
-    """What the terms of N worlds are worked out from: MuJoCo's own arrays (float64) and the rest.
+class Sources(Mapping[str, Tensor]):
+    """The tensors of an environment by name: fields of MuJoCo's state, and what it holds itself.
 
-    actuator, damper: what servos and joint damping exert, `(N, 0)` where no term asks for torques.
-    ref, ahead: packed reference poses now and one control step later, see `Reference`. action
-    `(N, A)`: the last one. age `(N)`: control steps since the episode began. recovery: the table of
-    `RecoveryClock`, `(N, 0)` in a task without.
+    held: tensors `(N, ...)` that stay the same ones.
     """
 
-    qpos: Tensor
-    qvel: Tensor
-    xpos: Tensor
-    xquat: Tensor
-    cvel: Tensor
-    subtree_com: Tensor
-    actuator: Tensor
-    damper: Tensor
-    ref: Tensor
-    ahead: Tensor
-    action: Tensor
-    age: Tensor
-    recovery: Tensor
+    def __init__(self, backend: Backend, held: Mapping[str, Tensor]):
+        self._backend, self._held = backend, dict(held)
+        self._names: list[str] = []
+        self._known: tuple[str, ...] | None = None
 
+    def live(self, goal: Tensor, ahead: Tensor) -> Sources:
+        """All of them, with packed goals `(N, W)` of now and of one control step later."""
+        self._held |= {"goal": goal, "ahead": ahead}
+        return self
 
-def sim_pose(seen: Seen, local: Callable[[Tensor], Tensor], roots: Tensor) -> Pose:
-    """The simulated characters; read it before the next step.
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._names:
+            if name not in self._held and name not in self._backend.state:
+                self._backend.state.bind((name,))
+            self._names.append(name)
+        return self._held[name] if name in self._held else self._backend.state[name]
 
-    local: the turns of hinged bodies of `qpos`. roots: each body's root, as a body of the model.
-    """
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
 
-    def linvel() -> Tensor:
-        # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
-        arm = pose.pos - seen.subtree_com.index_select(1, roots).float()
-        return seen.cvel[:, 1:, 3:].float() + torch.linalg.cross(pose.angvel, arm)
+    def __len__(self) -> int:
+        return len(self._names)
 
-    pose = LazyPose(
-        qpos=lambda: seen.qpos.float(),
-        qvel=lambda: seen.qvel.float(),
-        pos=lambda: seen.xpos[:, 1:].float(),
-        quat=lambda: seen.xquat[:, 1:].float(),
-        linvel=linvel,
-        angvel=lambda: seen.cvel[:, 1:, :3].float(),
-        com=lambda: seen.subtree_com[:, 1].float(),
-        local=lambda: local(pose.qpos),
-        heading=lambda: heading_quat(pose.qpos[:, 3:7]),
-    )
-    return pose
+    def settle(self) -> None:
+        """What was asked for until now is what terms read, and what `of` gives."""
+        self._known = tuple(dict.fromkeys((*self._names, "age")))
+
+    def of(self, goal: Tensor, ahead: Tensor, ids: Tensor | None = None) -> dict[str, Tensor]:
+        """What terms read, of all worlds; or of worlds `ids (n,)`, whose goals are given."""
+        assert self._known is not None
+        self._held |= {"goal": goal, "ahead": ahead}
+        if ids is None:
+            return {name: self[name] for name in self._known}
+        own = ("goal", "ahead")
+        return {name: self[name] if name in own else self[name][ids] for name in self._known}
 
 
 def seen_by(terms: tuple[ObsTerm, ...], frame: Frame) -> Tensor:
@@ -87,10 +82,10 @@ class Terms:
     """The terms of a task: evaluated one by one, or replayed from a recording of just that.
 
     Args:
-        frame: what the terms see, made of `Seen`.
         style: what a motion prior sees, none for none.
-        ends: which episodes failed, are terminated and truncated, by what was seen and what the terms
-            call a failure.
+        observables: what frames know, by name. context: what all frames share.
+        ends: which episodes failed, are terminated and are truncated, by a frame and what the terms call
+            a failure.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.
     """
 
@@ -100,13 +95,14 @@ class Terms:
         rewards: tuple[RewardTerm, ...],
         dones: tuple[DoneTerm, ...],
         style: tuple[ObsTerm, ...],
-        frame: Callable[[Seen], Frame],
-        ends: Callable[[Seen, Tensor], tuple[Tensor, Tensor, Tensor]],
+        observables: Mapping[str, Observable],
+        context: Context,
+        ends: Callable[[Frame, Tensor], tuple[Tensor, Tensor, Tensor]],
         device: torch.device,
         fused: bool = True,
     ):
         self.obs, self.rewards, self.dones, self.style = obs, rewards, dones, style
-        self.frame, self.ends = frame, ends
+        self.observables, self.context, self.ends = observables, context, ends
         self.fused = fused
         # Row 0 weighs the terms for the reward, row 1 for the imitation reward that is reported.
         shares = [[t.weight, t.weight * t.imitation] for t in rewards]
@@ -119,22 +115,27 @@ class Terms:
         self._recorded: dict[str, TensorFunction] = {}
         self._pool: ThreadPoolExecutor | None = None
 
-    def observe(self, seen: Seen) -> Tensor:
-        """The observations `(N, O)`."""
-        return self._run("observe", self._observe, seen)[0]
+    def frame(self, sources: Mapping[str, Tensor]) -> Frame:
+        """What the terms see."""
+        return Frame(sources, self.observables, self.context)
 
-    def judge(self, seen: Seen) -> Evaluation:
+    def observe(self, sources: Mapping[str, Tensor]) -> Tensor:
+        """The observations `(N, O)`."""
+        return self._run("observe", self._observe, sources)[0]
+
+    def judge(self, sources: Mapping[str, Tensor]) -> Evaluation:
         """Observations, rewards and failures."""
-        worlds = len(seen.ref)
+        worlds = len(sources["age"])
         if not self.fused or worlds < MANY:
-            return Evaluation(*(x.clone() for x in self._run("judge", self._judge, seen)))
+            return Evaluation(*(x.clone() for x in self._run("judge", self.evaluated, sources)))
         # A recording runs without Python's lock, so that the second half really runs beside the first.
         # Many worlds are always cut, whatever the machine, since it may move the last digit.
-        first, second = (Seen(*half) for half in zip(*(x.tensor_split(2) for x in seen), strict=True))
+        halves = zip(*(x.tensor_split(2) for x in sources.values()), strict=True)
+        first, second = (dict(zip(sources, half, strict=True)) for half in halves)
         if "judge" not in self._recorded:
-            self._run("judge", self._judge, first)
-        other = self._helper().submit(self._run, "judge", self._judge, second)
-        ours, theirs = self._run("judge", self._judge, first), other.result()
+            self._run("judge", self.evaluated, first)
+        other = self._helper().submit(self._run, "judge", self.evaluated, second)
+        ours, theirs = self._run("judge", self.evaluated, first), other.result()
         obs, scores, ends, style = zip(ours, theirs, strict=True)
         return Evaluation(torch.cat(obs), torch.cat(scores, 1), torch.cat(ends, 1), torch.cat(style))
 
@@ -144,12 +145,12 @@ class Terms:
             self._pool = ThreadPoolExecutor(1, "terms", torch.set_num_threads, (1,))
         return self._pool
 
-    def _observe(self, *seen: Tensor) -> tuple[Tensor, ...]:
-        return (seen_by(self.obs, self.frame(Seen(*seen))),)
+    def _observe(self, sources: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        return (seen_by(self.obs, self.frame(sources)),)
 
-    def _judge(self, *seen: Tensor) -> tuple[Tensor, ...]:
-        all_seen = Seen(*seen)
-        frame = self.frame(all_seen)
+    def evaluated(self, sources: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """All terms one by one, in the order of `Evaluation`."""
+        frame = self.frame(sources)
         rewards = [term.fn(frame, **term.params) for term in self.rewards]
         values = torch.stack(rewards or [frame.phase])[: len(rewards)]
         if frame.point is not None:
@@ -158,12 +159,22 @@ class Terms:
         for term in self.dones:
             failed = failed | term.fn(frame, **term.params)
         scores = torch.cat((self._weights @ values, values))
-        ends = torch.stack(self.ends(all_seen, failed))
+        ends = torch.stack(self.ends(frame, failed))
         return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
 
-    def _run(self, name: str, plain: TensorFunction, seen: Seen) -> tuple[Tensor, ...]:
+    def _run(
+        self,
+        name: str,
+        plain: Callable[[Mapping[str, Tensor]], tuple[Tensor, ...]],
+        sources: Mapping[str, Tensor],
+    ) -> tuple[Tensor, ...]:
         if not self.fused:
-            return plain(*seen)
+            return plain(sources)
         if name not in self._recorded:
-            self._recorded[name] = record(plain, tuple(seen))
-        return self._recorded[name](*seen)
+            names = tuple(sources)
+
+            def flat(*tensors: Tensor) -> tuple[Tensor, ...]:
+                return plain(dict(zip(names, tensors, strict=True)))
+
+            self._recorded[name] = record(flat, tuple(sources.values()))
+        return self._recorded[name](*sources.values())

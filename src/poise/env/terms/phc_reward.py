@@ -22,7 +22,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from poise.env.frame import Frame, RewardTerm, uses_torque
+from poise.env.frame import Frame, RewardTerm
 from poise.spatial import quat_distance
 
 Form = Literal["paper", "code"]
@@ -49,7 +49,6 @@ def body_angular_velocities(frame: Frame, alpha: float = 0.1, form: Form = "code
     return _vectors(frame.sim.angvel - frame.ref.angvel, alpha, form)
 
 
-@uses_torque
 def energy(frame: Frame, form: Form = "code", exempt: int = 3) -> Tensor:
     """A cost: sum over the hinges of |torque * speed|, W ("code"), or of its square ("paper"). `(N,)`.
 

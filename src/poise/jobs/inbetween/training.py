@@ -27,7 +27,7 @@ from poise.errors import PoiseError
 from poise.eval.inbetween import Protocol, TestSet, deviation, evaluate, test_set
 from poise.jobs.inbetween.data import library_bank
 from poise.jobs.library import LibraryConfig
-from poise.kin.feet.contacts import standing_labels
+from poise.kin.feet.contact import standing_labels
 from poise.learn.between import BetweenObjective, BetweenTraining
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.frames import FrameData, Sampler

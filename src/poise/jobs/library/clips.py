@@ -9,20 +9,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-import torch
-
 from poise.body import BodyConfig, BodyTable, generate_table, read_mjcf
 from poise.errors import PoiseError
 from poise.jobs.library.files import MotionFile, check_patterns, matches
 from poise.jobs.library.report import ClipNote
-from poise.kin import retarget
-from poise.kin.coords import clip_to_qpos
+from poise.kin import place_on_body
 from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
 from poise.kin.doctor.clean import clean_clip
-from poise.kin.feet.level import level_feet
-from poise.kin.fk import Kinematics
 from poise.kin.flight import rate_sentence
-from poise.kin.ground import GroundFit, fit_heights
+from poise.kin.place import OnBody
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
 
 _T = TypeVar("_T")
@@ -215,35 +210,39 @@ def place(
     )  # fmt: skip
     keep = matches(config.keep, file.name, file.subject)
     try:
-        if shape_of(clip.skeleton) != shape_of(target.skeleton):
-            clip, report = retarget(clip, target.example or target.skeleton, example=example)
-            note = replace(
-                note, retargeted=True, scale=report.scale, direction_deg=report.direction_deg,
-                slide_mm_s=report.slide_mm_s[1],
-            )  # fmt: skip
+        clip, on = set_down(clip, example, target, config)
     except PoiseError as problem:
         return None, replace(note, rule="not human", reason=str(problem).rstrip("."))
+    if report := on.retargeting:
+        note = replace(
+            note, retargeted=True, scale=report.scale, direction_deg=report.direction_deg,
+            slide_mm_s=report.slide_mm_s[1],
+        )  # fmt: skip
     if note.direction_deg > config.max_unlike_deg and not keep:
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
-    clip, fit = set_down(clip, target, config)
-    note = replace(note, lift_m=fit.lift_m)
+    note = replace(note, lift_m=on.ground.lift_m)
     # The file's own rate is what a doubt is about, at whatever rate the library is.
-    doubt = rate_sentence(fit.flights, taken.fps)
+    doubt = rate_sentence(on.ground.flights, taken.fps)
     if doubt and not keep:
         reason = doubt.partition(";")[0]
         return None, replace(note, rule="rate", reason=reason[0].lower() + reason[1:])
     return _alone(clip, target, note, config, keep)
 
 
-def set_down(clip: Clip, target: Target, config: LibraryConfig) -> tuple[Clip, GroundFit]:
-    """A clip on the target's skeleton, with its feet flat on the floor."""
-    if config.level:
-        clip = level_feet(clip, target.table).onto(clip)
+def set_down(
+    clip: Clip, example: Clip | None, target: Target, config: LibraryConfig
+) -> tuple[Clip, OnBody]:
+    """A clip on the target's skeleton, with its feet flat on the floor, and how it came there.
+
+    example: a clip on the same skeleton that tells how it stands.
+    """
     # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
-    body = Kinematics(target.table)(torch.tensor(clip_to_qpos(clip, target.table)))
-    fit = fit_heights(target.table, body.pos, body.quat, clip.fps)
-    return shifted(clip, (0.0, 0.0, fit.lift_m)), fit
+    onto = target.example or target.skeleton
+    on = place_on_body(
+        clip, target.table, onto, example=example, clean=False, level=config.level, known=False
+    )
+    return shifted(on.clip, (0.0, 0.0, on.ground.lift_m)), on
 
 
 def _alone(

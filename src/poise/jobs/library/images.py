@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from poise.jobs.library.clips import LibraryConfig, Target, set_down
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
-from poise.kin import retarget
 from poise.motion import Clip
 from poise.motion.edits import backwards
 from poise.motion.mirror import mirrored_clip
@@ -29,10 +28,6 @@ def mirror_image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
         PoiseError: no joint's name tells a side.
     """
     seen = mirrored_clip(clip)
-    if seen.skeleton.same_bones(clip.skeleton):
-        seen = seen.replaced(skeleton=clip.skeleton)
-    else:
-        example = None if target.example is None else mirrored_clip(target.example)
-        seen, _ = retarget(seen, target.example or target.skeleton, example=example)
-    seen, _ = set_down(seen, target, config)
+    example = None if target.example is None else mirrored_clip(target.example)
+    seen, _ = set_down(seen, example, target, config)
     return seen.replaced(skeleton=clip.skeleton, name=clip.name + MIRRORED, cyclic=clip.cyclic)

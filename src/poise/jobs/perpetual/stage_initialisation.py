@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
+from poise.env.recovery.clock import RecoveryClock
 from poise.jobs.perpetual.cloning import clone_for
 from poise.jobs.perpetual.demonstrations import odds, practised
 from poise.jobs.perpetual.progress import Stage
@@ -206,9 +207,9 @@ class Owners:
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for raw observations `(N, O)` of the worlds as they stand."""
         actions = self.primitives.all(self.norm.forward(obs))
-        owner, recoveries = self.owner[self.env.clip], self.env.recoveries
-        if recoveries is not None:
-            far = recoveries.before > recoveries.config.switch
+        owner, clock = self.owner[self.env.clip], self.env.plugin(RecoveryClock)
+        if clock is not None:
+            far = clock.before > clock.config.switch
             owner = torch.where(far, self.recovers, owner)
         return actions[torch.arange(len(obs), device=obs.device), owner]
 

@@ -7,16 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from poise.body import Humanoid
-from poise.kin import FitReport, Kinematics, RetargetConfig, RetargetReport, retarget
-from poise.kin.coords import clip_to_qpos
-from poise.kin.doctor.clean import CleanReport, clean_clip
-from poise.kin.feet.level import Levelled, level_feet
-from poise.kin.ground import GroundFit, clip_flights, fit_ground
-from poise.kin.hinges import within_turns
-from poise.motion import Clip, resample
+from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
+from poise.kin.feet.level import Levelled
+from poise.kin.ground import clip_flights
+from poise.motion import Clip
 
 if TYPE_CHECKING:
     from poise.jobs.track.policy import Tracker
@@ -52,18 +48,12 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     """
     humanoid, rate = tracker.humanoid, tracker.config.sim.control_hz
     clip = clip.replaced(cyclic=False)
-    known = clip.skeleton.source.ground_m is not None
-    made, moved = clip, None
-    if not clip.skeleton.same_bones(humanoid.skeleton):
-        made, moved = retarget(clip, tracker.example)
-    mended, found = clean_clip(made)
-    table = humanoid.table
-    level = level_feet(mended, table)
-    qpos = within_turns(clip_to_qpos(resample(level.onto(mended), rate), table), humanoid)
-    qpos, ground = fit_ground(qpos, table, rate, known=known)
-    report = _report(made, qpos, humanoid, rate, found, ground)
-    notes = _notes(qpos, humanoid, moved, tracker.config.widens)
-    return Placed(clip, made, qpos, report, moved, level, notes)
+    on = place_on_body(clip, humanoid.table, tracker.example, rate, near=humanoid)
+    flights = clip_flights(on.moved, humanoid.table)
+    one = ((clip.name,), (clip.fps,), (flights,), (on.cleaned,), (None,), (on.ground,))
+    report = FitReport(*one, (on.joint_error_mm,), (), ())
+    notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
+    return Placed(clip, on.moved, on.qpos, report, on.retargeting, on.level, notes)
 
 
 def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
@@ -88,21 +78,6 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
     frames = min(back.frames, placed.source.frames)
     rot[:frames, own] = placed.source.rot[:frames, own]
     return back.replaced(rot=rot, name=placed.source.name)
-
-
-def _report(
-    clip: Clip, qpos: np.ndarray, humanoid: Humanoid, rate: float, found: CleanReport, ground: GroundFit
-) -> FitReport:
-    table = humanoid.table
-    here = Kinematics(table)(torch.tensor(qpos)).pos.numpy()
-    there = resample(clip, rate).positions()[:, [r.joint for r in table.rows]]
-    # As they lie about the root, since setting the motion on the floor is no error.
-    here, there = here - here[:, :1], there - there[:, :1]
-    error = float(np.linalg.norm(here - there, axis=-1).mean() * 1000)
-    speeds = np.abs(np.diff(qpos[:, 7:], axis=0)).max(0) * rate
-    fastest = (humanoid.hinges[int(speeds.argmax())], float(speeds.max()))
-    one = ((clip.name,), (clip.fps,), (clip_flights(clip, table),), (found,), (None,), (ground,))
-    return FitReport(*one, (error,), (), (), fastest)
 
 
 def _notes(

@@ -58,29 +58,33 @@ def follow(
     points: Keypoints,
     reference: Reference,
     smooth_hz: float | None = None,
-) -> list[str]:
-    """Puts goals from the stream of keypoints into the reference of a keypoint policy.
+) -> tuple[Reference, list[str]]:
+    """The reference of a keypoint policy with goals from the stream of keypoints, and sentences on it.
 
     The character begins as the fitted clip does; places and velocities of its goals are those that the
-    stream gives from what came so far. Returns what is to be said about it.
+    stream gives from what came so far.
 
     smooth_hz: cut-off of the stream's filter, which sees the past alone.
     """
     if tracker.config.goal != "keypoints":
-        return ["The policy follows rotations: it got the clip that was fitted to the keypoints."]
+        what = "The policy follows rotations: it got the clip that was fitted to the keypoints."
+        return reference, [what]
     if placed.source.frames != points.frames:
-        return ["The keypoints have long gaps: the longest stretch without was fitted and tracked."]
+        what = "The keypoints have long gaps: the longest stretch without was fitted and tracked."
+        return reference, [what]
     points = _seen(points)
     # The performer is measured on frames without gaps; the stream itself sees them.
     held = points.replaced(positions=hold_missing(points.positions))
     try:
         body = PointBody.calibrate(held, tracker.example, tracker.humanoid.table)
     except PoiseError as problem:
-        return [f"The keypoints cannot be followed one by one ({problem.what}): they were fitted."]
+        what = f"The keypoints cannot be followed one by one ({problem.what}): they were fitted."
+        return reference, [what]
     config = StreamConfig(smooth_s=1.0 / (2.0 * math.pi * smooth_hz) if smooth_hz else 0.0)
     goals = list(KeypointStream(body, reference.rate_hz, config).follow(points))
     if len(goals) < 2:
-        return ["The keypoints give no goals: the clip that was fitted to them was tracked."]
+        what = "The keypoints give no goals: the clip that was fitted to them was tracked."
+        return reference, [what]
     pose = reference.pose
     times = np.array([g.time_s for g in goals])
     at = np.arange(len(pose.pos)) / reference.rate_hz
@@ -91,15 +95,18 @@ def follow(
         columns = [np.interp(at, times, column) for column in table.T]
         return torch.tensor(np.stack(columns, 1)).reshape(pose.pos.shape).to(pose.pos)
 
-    reference.pose = replace(
-        pose,
-        pos=torch.where(inside, between([g.pos for g in goals]), pose.pos),
-        linvel=torch.where(inside, between([g.linvel for g in goals]), pose.linvel),
+    reference = reference.with_pose(
+        replace(
+            pose,
+            pos=torch.where(inside, between([g.pos for g in goals]), pose.pos),
+            linvel=torch.where(inside, between([g.linvel for g in goals]), pose.linvel),
+        )
     )
     stale = max(g.stale_s for g in goals)
     late = config.lookahead / reference.rate_hz
     lost = f"; the longest gap of a keypoint is {stale:.1f} s" if stale > 0 else ""
-    return [f"Each goal comes from the keypoints up to {late * 1000:.0f} ms after it alone{lost}."]
+    what = f"Each goal comes from the keypoints up to {late * 1000:.0f} ms after it alone{lost}."
+    return reference, [what]
 
 
 def _seen(points: Keypoints) -> Keypoints:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.env import Reference
-from poise.env.recovery.controller import TRACKS, RecoveryController
+from poise.env.goals.led import TRACKS, LedGoal
 from poise.errors import PoiseError
 from poise.jobs.track.placement import Placed
 from poise.jobs.track.policy import Tracker
@@ -60,28 +60,27 @@ def with_returns(
     task = replace(imitation.task, help_by="all")
     env = replace(imitation, task=task).env(1, auto_reset=False, threads=threads, help_scale=0.0)
     zero = torch.zeros(1, dtype=torch.long)
-    obs, controller = (
-        env.reset_to(zero, zero),
-        RecoveryController(env, tracker.policy, tracker.recovery_clips),
-    )
+    env.reset_to(zero, zero)
+    goal = LedGoal(env.goal.clips, tracker.recovery_clips)
+    obs = env.set_goal(goal)
     rate, last = env.reference.rate_hz, int(env.reference.length[0]) - 1
     frames, of, actions = [env.reference.coordinates(zero, zero)[0]], [0], []
     lost: list[float] = []
     back: list[float] = []
     try:
         while True:
-            actions.append(controller.act(obs))
-            now, here = (len(frames) - 1) / rate, int(controller.doing) == TRACKS
-            if len(controller.lost) > len(lost):
+            actions.append(tracker.policy.act(obs))
+            now, here, frame = (len(frames) - 1) / rate, int(goal.doing) == TRACKS, int(goal.frame)
+            if len(goal.lost) > len(lost):
                 lost.append(now)
             if here and len(back) < len(lost):
                 back.append(now)
             if len(lost) > LOSSES or (not here and now > lost[-1] + AWAY_S):
                 break
             obs = env.step(actions[-1]).final_obs
-            frames.append(env.reference.coordinates(env.clip, env.frame)[0])
-            of.append(int(env.frame if here else controller.frame))
-            if here and int(env.frame) >= last:
+            frames.append(goal.aimed())
+            of.append(frame + 1 if here else frame)
+            if here and frame + 1 >= last:
                 break
     finally:
         env.close()

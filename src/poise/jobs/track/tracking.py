@@ -177,7 +177,8 @@ def track(
     imitation = imitation_of(tracker, [placed])
     notes = list(placed.notes)
     if points is not None:
-        notes += follow(tracker, placed, points, imitation.reference, config.smooth_hz)
+        reference, said = follow(tracker, placed, points, imitation.reference, config.smooth_hz)
+        imitation, notes = replace(imitation, reference=reference), [*notes, *said]
     goals = imitation.reference.pose.pos
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
@@ -273,7 +274,7 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     many["pos"] = many["pos"] + shift[:, None]
     many["com"] = many["com"] + shift
     many["qpos"] = made.pose.qpos
-    made.pose = replace(pose, **many)
+    made = made.with_pose(replace(pose, **many))
     report = imitation.report
     each = ("fps", "flights", "clean", "cycles", "ground", "joint_error_mm")
     copies = {name: getattr(report, name) * count for name in each}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,16 +15,17 @@ from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.limits import limit_faults
 from poise.kin.doctor.sides import exchanged_sides
-from poise.kin.doctor.slides import lock_feet, lock_path
+from poise.kin.doctor.slides import mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, slide_faults, support_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
+from poise.kin.feet.contact import NEAR_M
 from poise.kin.flight import likely_rate
-from poise.kin.ground import smooth_hull
+from poise.kin.ground import smooth_lift
 from poise.metrics import floating, foot_slide, jerk, penetration
 from poise.motion import Clip
 
 #: How often feet are locked: a leg that is led back changes what its sole does.
-ROUNDS = 3
+SLIDE_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     # Points deeper than their margin come up to half of it, so that rounding leaves nothing behind.
     depth = np.where(support.depth > 0, support.depth + 0.5 * support.margin, 0.0).max(-1)
     if depth.any():
-        lift += np.maximum(smooth_hull(depth, max(1, round(0.1 * clip.fps)), False), 0.0)
+        lift += smooth_lift(depth, clip.fps, 0.1)
     if not lift.any():
         return clip
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
@@ -110,8 +110,7 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
 
 def _locked(clip: Clip, anatomy: Anatomy) -> Clip:
     """The clip without sliding feet."""
-    steps: list[Callable[[Clip, Support, list[Fault]], Clip]] = [lock_path] + [lock_feet] * ROUNDS
-    for step in steps:
+    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:
@@ -163,7 +162,7 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
         "joint_speed_max_rad_per_s": float(body_steps(clip).max()) * clip.fps,
     }
     if support is not None:
-        slide = foot_slide(support.soles, clip.fps, height=0.04, ground=-support.fit.lift_m)
+        slide = foot_slide(support.soles, clip.fps, height=NEAR_M, ground=-support.fit.lift_m)
         lowest = torch.tensor(support.low.min(-1))
         depth = penetration(lowest)
         gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com), clip.fps)

@@ -1,4 +1,4 @@
-"""The faults that the motion doctor knows: what each one is, in which unit, and who can mend it."""
+"""The faults that the motion doctor knows: what each one is, in which unit, and how it is mended."""
 
 from __future__ import annotations
 

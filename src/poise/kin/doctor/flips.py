@@ -44,13 +44,6 @@ class Flip:
         """How many frames were turned back."""
         return self.stop - self.start + 1
 
-    def sentence(self) -> str:
-        """The repair in words."""
-        return (
-            f"{self.joint}: {self.frames} frames from frame {self.start} on turned back by "
-            f"{self.angle_deg:.0f} degrees"
-        )
-
 
 def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip, ...]]:
     """The clip with flipped feet and hands turned back, and what was turned.

@@ -6,22 +6,20 @@ import math
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from poise.kin.doctor.faults import Fault
 from poise.kin.doctor.support import Support, foot_slips
-from poise.kin.limbs import limb_of, match_positions
-from poise.kin.runs import find_runs
+from poise.kin.feet.contact import Sole
+from poise.kin.feet.hold import FIRM, Standing, hold
 from poise.motion import Clip
 
 #: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
 #: (m/s) that a rolling sole has anyway and that is left.
 COMMON_S, ROLL_SPEED = 0.4, 0.04
-#: Longest time (s) over which a foot gets from its corrected place back to its own, and the time (s) in
-#: which it comes to rest and leaves again.
-RETURN_S, REST_S = 0.25, 0.03
 
 
-def lock_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
+def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     """The clip whose root path is freed of the slip that all standing feet have in common.
 
     The mean slip of the planted sole points, averaged over time, is taken off the root's horizontal
@@ -52,68 +50,30 @@ def lock_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     return clip.replaced(root_pos=path)
 
 
-def lock_feet(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
-    """The clip with every sliding foot held in place while it stands, its leg bent to follow.
+def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
+    """The clip with every sliding foot held in place while it stands, its leg bent to follow (`hold`).
 
-    In a spell the ankle gives back what the standing part of its sole slips; it is moved least on
-    average, and returns to its own path over `RETURN_S` or half of the time to the next spell.
+    In a spell of `faults` the points of the sole that are in contact bear wholly.
     """
-    shifts: dict[int, np.ndarray] = {}
-    skeleton = clip.skeleton
-    for foot, slip, contact in foot_slips(support):
-        mine = [f for f in faults if f.joint == skeleton.names[foot]]
-        if mine:
-            shifts[foot] = _shift(slip, contact, mine, clip.fps)
-    if not shifts:
-        return clip
-    pos = torch.tensor(clip.positions())
-    targets: dict[int | str, torch.Tensor] = {}
-    for foot, shift in shifts.items():
-        targets[foot] = pos[:, foot] + torch.tensor(shift)
+    contact, weights = support.contacts[1], {}
+    for foot in dict.fromkeys(support.feet):
+        mine = [k for k, joint in enumerate(support.feet) if joint == foot]
+        slides = torch.zeros(clip.frames - 1, 1, dtype=torch.bool)
+        for fault in faults:
+            if fault.joint == clip.skeleton.names[foot]:
+                slides[fault.start : fault.stop] = True
+        if bool(slides.any()):
+            weights[foot] = mine, (contact[:, mine] & slides).double() * FIRM
+
+    def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
+        return {
+            foot: Standing(Sole(pos[:, foot], support.soles[:, mine]), weight)
+            for foot, (mine, weight) in weights.items()
+        }
+
     root, rot = clip.tensors()
-    reached, out = match_positions(skeleton, rot, root, targets), rot.clone()
-    for foot, shift in shifts.items():
-        moved = torch.tensor((shift != 0.0).any(-1))
-        for j in limb_of(skeleton, foot):
-            out[moved, j] = reached[moved, j]
+    out = hold(clip.skeleton, root, rot, clip.fps, standing, rounds=1)
     return clip.replaced(rot=out.numpy())
-
-
-def _shift(slip: np.ndarray, contact: np.ndarray, faults: list[Fault], fps: float) -> np.ndarray:
-    """`(T, 3)` m that undoes `slip (T - 1, 2)` m/s in the spells of `faults`, faded out beside them."""
-    frames = len(slip) + 1
-    out = np.zeros((frames, 3))
-    ends = [(f.start, f.stop) for f in faults]
-    for first, last in ends:
-        steps = _held(contact[first:last], fps)[:, None] * slip[first:last] / fps
-        path = np.concatenate((np.zeros((1, 2)), -np.cumsum(steps, axis=0)))
-        out[first : last + 1, :2] = path - path.mean(0)
-    most = max(1, round(RETURN_S * fps))
-    held = np.zeros(frames, dtype=bool)
-    for first, last in ends:
-        held[first : last + 1] = True
-    # Frames in which the foot stands well keep their place as long as there is room for the way back.
-    for first, last in find_runs(~held, 0):
-        length = last - first + 1
-        fade = min(most, length)
-        t = np.linspace(0.0, 1.0, fade + 2)[1:-1]
-        share = (1.0 - t * t * (3.0 - 2.0 * t))[:, None]
-        if first > 0:
-            out[first : first + fade] += share * out[first - 1]
-        if last < frames - 1:
-            out[last - fade + 1 : last + 1] += share[::-1] * out[last + 1]
-    return out
-
-
-def _held(contact: np.ndarray, fps: float) -> np.ndarray:
-    """How firmly `(T)` a foot is held: 1 while it stands, less within `REST_S` of either end."""
-    out = np.zeros(len(contact))
-    for first, last in find_runs(contact, 0):
-        at = np.arange(last - first + 1)
-        ramp = max(1.0, REST_S * fps)
-        rise = np.clip((np.minimum(at, at[::-1]) + 1) / ramp, 0.0, 1.0)
-        out[first : last + 1] = rise * rise * (3.0 - 2.0 * rise)
-    return out
 
 
 def _slips(clip: Clip, support: Support) -> tuple[np.ndarray, np.ndarray]:

@@ -52,13 +52,6 @@ class SpeedRepair:
         """How many frames were changed."""
         return self.stop - self.start + 1
 
-    def sentence(self) -> str:
-        """The repair in words."""
-        return (
-            f"{self.joint}: {self.frames} frames from frame {self.start} on {self.way} "
-            f"({self.before:.0f} rad/s, now {self.after:.0f})"
-        )
-
 
 def speed_limits(clip: Clip, anatomy: Anatomy) -> list[float]:
     """The limit (rad/s) of every joint; joints that are no part of the body have the arm's."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.doctor.faults import Fault, spell_faults
-from poise.kin.feet.lead import Sole
+from poise.kin.feet.contact import NEAR_M, soles_of
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights
 from poise.kin.runs import find_runs
 from poise.kin.solids import centre_of_mass, lowest_height
@@ -27,8 +27,6 @@ SOLE_M = 0.045
 SUNK_M, UNDER_M, UNDER_SHARE = 0.02, 0.005, 0.1
 #: Depth (m) to which joints may be under the floor, and bone tips (toes bend, their tips are guessed).
 JOINT_M, TIP_M = 0.01, 0.03
-#: A sole point is near the floor below this height (m).
-NEAR_M = 0.04
 #: A standing foot slides if it is faster than this on average (m/s), gets this far (m), and for so long
 #: (s); a shorter touch belongs to a foot that swings through.
 SLIDE_SPEED, SLIDE_M, SLIDE_S = 0.15, 0.04, 0.06
@@ -117,23 +115,6 @@ def support_of(clip: Clip, anatomy: Anatomy) -> Support | None:
     except PoiseError:
         return None
     return Support.of(clip, anatomy, table) if anatomy.parts else None
-
-
-def soles_of(table: BodyTable, pos: Tensor, quat: Tensor) -> dict[int, Sole]:
-    """The feet that have a sole (a box), by their row of the table, from the rows' world poses."""
-    out = {}
-    for i, row in enumerate(table.rows):
-        box = next((g for g in row.geoms if g.kind == "box"), None)
-        if row.kind != "foot" or box is None:
-            continue
-        turn, middle = (torch.tensor(x, dtype=pos.dtype) for x in (box.quat, box.pos))
-        ends = []
-        for end in (-1.0, 1.0):
-            corner = torch.tensor([end * box.size[0], 0.0, -box.size[2]], dtype=pos.dtype)
-            local = middle + quat_rotate(turn, corner)
-            ends.append(pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i])))
-        out[i] = Sole(pos[:, i], torch.stack(ends, 1))
-    return out
 
 
 def _low_points(

@@ -1,38 +1,80 @@
-"""Standing feet that stay where they stand, told from the soles of a body.
+"""Feet held in place where they stand: one mechanism for every motion.
 
-A simulated sole creeps, rocks and sinks by millimetres, a captured one slides by centimetres. Where one
-bears is told from its height and speed; `feet.lead` then finds the smallest smooth correction.
+What says that a foot stands differs: the soles of a body (`hold_feet`), a network (`synth`), the faults
+of a recording (`doctor`). All hand in points of the sole and how much they bear (`Standing`); `lead`
+finds the smallest smooth correction that keeps them in place, and `led` bends the legs to it.
+
+A simulated sole creeps, rocks and sinks by millimetres, a captured one slides by centimetres.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from poise.body import BodyTable
-from poise.kin.doctor.support import soles_of
-from poise.kin.feet.lead import Sole, lead, led
-from poise.kin.ground import smooth_hull
-from poise.kin.runs import find_runs
+from poise.kin.feet.contact import Sole, bearing, dragged, soles_of
+from poise.kin.feet.lead import lead, led
+from poise.kin.ground import smooth_lift
 from poise.kin.solids import lowest_height
-from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
-from poise.motion import Clip
+from poise.motion import Clip, Skeleton
+from poise.spatial import forward_kinematics
 
-#: Heights (m) over the floor up to which a sole's end bears wholly, and from which not at all.
-BEARS_M, CLEAR_M = 0.015, 0.03
-#: A foot that gets this far (m) and is this fast (m/s) on average while it bears is dragged on purpose,
-#: or has fallen, and is left alone.
-DRAG_M, DRAG_SPEED = 0.15, 0.3
-#: Time (s) for which a sole that bears before and after may stop doing so.
-GAP_S = 0.07
 #: How often it is done: a leg that is led back moves its foot a little.
-ROUNDS = 2
+HOLD_ROUNDS = 2
+#: How much a foot bears that stands for certain, see `Standing`.
+FIRM = 100.0
 #: Half the time (s) over which a lift out of the floor is spread.
 LIFT_S = 0.05
+
+
+class Standing(NamedTuple):
+    """How a foot stands.
+
+    sole: its points.
+    weight: `(T - 1, 2)`, how much either end of the sole bears between frames; from 0 to 1 it may drift
+        by millimetres per second, larger numbers hold it firmly.
+    lift: `(T)` m, how much higher it must be, None where it stays.
+    """
+
+    sole: Sole
+    weight: Tensor
+    lift: Tensor | None = None
+
+
+def hold(
+    skeleton: Skeleton,
+    root: Tensor,
+    rot: Tensor,
+    fps: float,
+    standing: Callable[[Tensor, Tensor], Mapping[int, Standing]],
+    fixed: Tensor | None = None,
+    vertical: bool = False,
+    rounds: int = HOLD_ROUNDS,
+) -> Tensor:
+    """Rotations `(T, J, 4)` wxyz with the feet held where they stand; all but the legs stays as it is.
+
+    Args:
+        root: `(T, 3)` m. rot: `(T, J, 4)` wxyz, local.
+        standing: tells from world poses `(T, J, 3)` m and `(T, J, 4)` how feet stand, by their joint.
+        fixed: `(T)` bool, frames that stay as they are.
+        vertical: the heights of the soles' ends are held as well.
+    """
+    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
+    pinned = None if fixed is None else fixed.numpy()
+    for _ in range(rounds):
+        leads = {}
+        for foot, one in standing(*forward_kinematics(skeleton.parents, offsets, root, rot)).items():
+            leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical)
+            if one.lift is not None:
+                leads[foot].shift[:, 2] += one.lift
+        rot = led(skeleton, rot, root, leads) if leads else rot
+    return rot
 
 
 @dataclass(frozen=True)
@@ -47,8 +89,8 @@ class Held:
 def hold_feet(clip: Clip, table: BodyTable, ground: float = 0.0) -> tuple[Clip, Held]:
     """The clip with its standing feet held, and what that took; all but the legs stays as it is.
 
-    A foot bears where an end of its sole is near the floor and neither rises nor swings (as in
-    `metrics.foot_contacts`). Soles under the floor are lifted out of it, too.
+    A foot bears where an end of its sole is near the floor and neither rises nor swings (`bearing`).
+    Feet that are dragged on purpose are left alone. Soles under the floor are lifted out of it, too.
 
     Args:
         table: the body whose soles they are; feet without a box have no sole.
@@ -56,64 +98,25 @@ def hold_feet(clip: Clip, table: BodyTable, ground: float = 0.0) -> tuple[Clip, 
     """
     if clip.frames < 3:
         return clip, Held(0.0, 0.0)
-    first, bears = clip, {}
-    for _ in range(ROUNDS):
-        clip, bears = _hold_once(clip, table, ground)
-    moved = np.linalg.norm(clip.positions() - first.positions(), axis=-1) * 1000
+    rows, bears = [r.joint for r in table.rows], {}
+
+    def standing(pos: Tensor, quat: Tensor) -> dict[int, Standing]:
+        pos, quat = pos[:, rows], quat[:, rows]
+        soles, low, out = soles_of(table, pos, quat), lowest_height(table, pos, quat), {}
+        weights = bearing([sole.ends for sole in soles.values()], clip.fps, ground)
+        for (row, sole), weight in zip(soles.items(), weights, strict=True):
+            weight = weight * ~dragged(sole, weight, clip.fps)[:, None]
+            deep = (ground - low[:, row]).clamp_min(0.0).numpy()
+            lift = torch.tensor(smooth_lift(deep, clip.fps, LIFT_S)) if deep.any() else None
+            out[rows[row]] = Standing(sole, weight, lift)
+            steps = (weight.amax(-1) > 0).numpy()
+            bears[rows[row]] = np.append(steps, steps[-1])
+        return out
+
+    root, rot = clip.tensors()
+    out = hold(clip.skeleton, root, rot, clip.fps, standing)
+    held = clip.replaced(rot=out.numpy()) if bears else clip
+    moved = np.linalg.norm(held.positions() - clip.positions(), axis=-1) * 1000
     borne = np.concatenate([moved[when, foot] for foot, when in bears.items()] or [np.zeros(0)])
     most = max((float(moved[:, foot].max()) for foot in bears), default=0.0)
-    return clip, Held(float(borne.mean()) if len(borne) else 0.0, most)
-
-
-def _hold_once(clip: Clip, table: BodyTable, ground: float) -> tuple[Clip, dict[int, np.ndarray]]:
-    """The clip with its feet led once, and when `(T)` each foot joint bears."""
-    pos, quat = (torch.tensor(x)[:, [r.joint for r in table.rows]] for x in clip.world())
-    soles = soles_of(table, pos, quat)
-    low = lowest_height(table, pos, quat)
-    leads, bears = {}, {}
-    weights = _bearing([sole.ends for sole in soles.values()], clip.fps, ground)
-    for (row, sole), weight in zip(soles.items(), weights, strict=True):
-        weight = weight * ~_dragged(sole, weight, clip.fps)[:, None]
-        one = lead(sole, weight.numpy(), clip.fps)
-        deep = (ground - low[:, row]).clamp_min(0.0).numpy()
-        if deep.any():
-            lift = smooth_hull(deep, max(1, round(LIFT_S * clip.fps)), False)
-            one.shift[:, 2] = torch.tensor(np.maximum(lift, 0.0))
-        foot, steps = table.rows[row].joint, (weight.amax(-1) > 0).numpy()
-        leads[foot], bears[foot] = one, np.append(steps, steps[-1])
-    root, rot = clip.tensors()
-    held = clip.replaced(rot=led(clip.skeleton, rot, root, leads).numpy()) if leads else clip
-    return held, bears
-
-
-def _bearing(ends: list[Tensor], fps: float, ground: float) -> list[Tensor]:
-    """How much the ends `(T, 2, 3)` of each sole bear between frames: `(T - 1, 2)` in [0, 1]."""
-    if not ends:
-        return []
-    points = torch.cat(ends, 1)
-    step = torch.diff(points, dim=0) * fps
-    height = torch.maximum(points[1:, :, 2], points[:-1, :, 2]) - ground
-    near = ((CLEAR_M - height) / (CLEAR_M - BEARS_M)).clamp(0.0, 1.0)
-    # The faster a point is, the less it is a standing foot that slips (Tukey's biweight).
-    slow = (1.0 - (step[..., :2].norm(dim=-1) / SWING_SPEED).clamp(max=1.0).square()).square()
-    bears = near * slow * (step[..., 2].abs() <= CONTACT_RISE)
-    # A sole that rocks or bounces for a moment has not left.
-    reach = max(1, round(GAP_S * fps / 2))
-    wide = functional.max_pool1d(bears.T[None], 2 * reach + 1, 1, reach)
-    closed = -functional.max_pool1d(-wide, 2 * reach + 1, 1, reach)[0].T
-    return [*torch.maximum(bears, closed * slow * near).split(2, -1)]
-
-
-def _dragged(sole: Sole, weight: Tensor, fps: float) -> Tensor:
-    """Steps `(T - 1)` of spells in which the foot travels over the floor."""
-    step = torch.diff(sole.ends[..., :2], dim=0)
-    speed = torch.where(weight > 0, step.norm(dim=-1), torch.inf)
-    # The end that rests, if one does.
-    path = step.gather(1, speed.argmin(-1)[:, None, None].expand(-1, 1, 2))[:, 0]
-    out = torch.zeros(len(weight), dtype=torch.bool)
-    for first, last in find_runs(weight.amax(-1).numpy() > 0, 0):
-        way = torch.cumsum(path[first : last + 1], 0)
-        travel = float((way.amax(0) - way.amin(0)).norm())
-        seconds = (last - first + 1) / fps
-        out[first : last + 1] = travel > DRAG_M and travel / seconds > DRAG_SPEED
-    return out
+    return held, Held(float(borne.mean()) if len(borne) else 0.0, most)

@@ -20,7 +20,8 @@ import torch
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
-from poise.kin.limbs import match_positions
+from poise.kin.feet.contact import Sole
+from poise.kin.limbs import limb_of, match_positions
 from poise.motion import Skeleton
 from poise.spatial import axis_angle_to_quat, forward_kinematics, quat_conj, quat_mul
 
@@ -30,13 +31,6 @@ SMOOTH_S, RETURN_PER_S = 0.006, 0.6
 _SOFT = 0.003
 #: Weight of a frame that must stay as it is; what is left of its correction is set to zero.
 _PINNED = 1e8
-
-
-class Sole(NamedTuple):
-    """World points of a foot: its ankle `(T, 3)` and the two ends of its sole `(T, 2, 3)`, m."""
-
-    ankle: Tensor
-    ends: Tensor
 
 
 class Lead(NamedTuple):
@@ -106,7 +100,10 @@ def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]
         tilt = axis_angle_to_quat(one.axis.to(own.dtype), one.tilt)
         about = quat_mul(axis_angle_to_quat(up.expand(len(own), 3), one.turn), tilt)
         out[:, joint] = quat_mul(out[:, joint], quat_mul(quat_conj(own), quat_mul(about, own)))
-    return torch.where(touched[:, None, None], out, rot)
+    kept = torch.ones(rot.shape[:2], dtype=torch.bool)
+    for joint in leads:
+        kept[:, list(limb_of(skeleton, joint))] = ~touched[:, None]
+    return torch.where(kept[..., None], rot, out)
 
 
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]

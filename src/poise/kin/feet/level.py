@@ -9,20 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
+from poise.kin.feet.contact import lowest_and_slow, sole_boxes
 from poise.motion import Clip
 from poise.spatial import quat_conj, quat_mul, quat_rotate, shortest_arc
 
-#: Share of the frames, those in which a foot is lowest, of which the slow ones are taken to stand.
-LOWEST = 0.3
-#: m/s of a foot that stands, and frames of which the mean is to be trusted.
-SLOW, ENOUGH = 0.4, 5
+#: Frames of standing of which the mean is to be trusted.
+ENOUGH_FRAMES = 5
 #: Degrees: less is no fault, and more is no foot that stands.
-LEAST, MOST = 1.0, 35.0
+LEAST_DEG, MOST_DEG = 1.0, 35.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,29 +52,24 @@ class Levelled:
 def level_feet(clip: Clip, table: BodyTable) -> Levelled:
     """The turns with which the table's soles are level on average while the feet of a clip stand.
 
-    A foot stands while it is among the lowest and slow. The turn is the shortest from the sole's normal
-    to the mean of the vertical, both in the foot's frame.
+    A foot stands while it is among the lowest and slow (`lowest_and_slow`). The turn is the shortest
+    from the sole's normal to the mean of the vertical, both in the foot's frame.
     """
     pos, quat = (torch.tensor(x) for x in clip.world())
     up = torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype)
     turns: dict[int, Tensor] = {}
-    for row in table.rows:
-        box = next((g for g in row.geoms if g.kind == "box"), None)
-        if row.kind != "foot" or box is None:
-            continue
+    for _, row, box in sole_boxes(table):
         normal = quat_rotate(torch.tensor(box.quat, dtype=pos.dtype), up)
         place = pos[:, row.joint] + quat_rotate(
             quat[:, row.joint], torch.tensor(box.pos, dtype=pos.dtype).expand(len(pos), 3)
         )
-        speed = np.linalg.norm(np.gradient(place.numpy(), axis=0), axis=1) * clip.fps
-        height = place[:, 2].numpy()
-        stands = (height <= np.quantile(height, LOWEST) + 1e-9) & (speed < SLOW)
-        if stands.sum() < ENOUGH:
+        stands = lowest_and_slow(place, clip.fps)
+        if int(stands.sum()) < ENOUGH_FRAMES:
             continue
-        here = quat[torch.from_numpy(stands), row.joint]
+        here = quat[stands, row.joint]
         mean = quat_rotate(quat_conj(here), up.expand(len(here), 3)).mean(0)
         mean = mean / mean.norm()
         angle = float(torch.rad2deg(torch.acos((normal @ mean).clamp(-1.0, 1.0))))
-        if LEAST < angle < MOST:
+        if LEAST_DEG < angle < MOST_DEG:
             turns[row.joint] = shortest_arc(normal, mean)
     return Levelled(turns)

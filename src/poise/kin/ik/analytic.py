@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from poise.body import Humanoid
 from poise.errors import PoiseError, did_you_mean
@@ -25,9 +26,9 @@ from poise.kin.ik.angles import (
 from poise.kin.ik.body import IkBody
 from poise.kin.ik.config import IkConfig
 from poise.kin.ik.frames import Frames, rest_frames
-from poise.kin.ik.vectors import arc, rotate, unit
+from poise.kin.ik.vectors import arc, rotate
 from poise.motion import Clip
-from poise.spatial import matrix_to_quat, quat_to_matrix, unwrap_quats
+from poise.spatial import euler_to_quat, matrix_to_quat, normalize, quat_to_matrix, unwrap_quats
 
 
 def analytic_ik(
@@ -65,7 +66,7 @@ def clip_ik(clip: Clip, body: Humanoid | IkBody, config: IkConfig | None = None)
 
 def _gather(
     positions: np.ndarray, body: IkBody, names: Sequence[str] | None, rotations: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None]:
+) -> tuple[Tensor, Tensor | None]:
     """Positions `(T, P, 3)` in the body's order (NaN for toes that are not given), rotations alike."""
     rows = len(body.table.rows)
     if positions.ndim != 3 or positions.shape[-1] != 3 or not len(positions):
@@ -89,32 +90,32 @@ def _gather(
         frame = int(np.argwhere(bad)[0][0])
         raise PoiseError(f"a joint position is not finite at frame {frame}")
     if rotations is None:
-        return points, None
+        return torch.tensor(points), None
     turns = torch.tensor(np.asarray(rotations, dtype=np.float64)[:, at[:rows]])
-    return points, quat_to_matrix(turns).numpy()
+    return torch.tensor(points), quat_to_matrix(turns)
 
 
 def _rotations(
-    points: np.ndarray, body: IkBody, config: IkConfig, turns: np.ndarray | None
-) -> dict[int, np.ndarray]:
+    points: Tensor, body: IkBody, config: IkConfig, turns: Tensor | None
+) -> dict[int, Tensor]:
     """World rotations `(T, 3, 3)` of the rows that positions tell something about."""
     frames, rest = Frames(points, body, config), rest_frames(body, config)
     if not config.square:
         return _paper_rotations(frames, rest, body)
-    out: dict[int, np.ndarray] = {}
+    out: dict[int, Tensor] = {}
     for row, frame in frames.frames.items():
         # F = B A with A fixed in the body: B = F F_rest^T B_rest
         fixed = rest.frames[row][0].T @ body.rest_rot[row]
         out[row] = frame @ fixed
         if turns is not None and row not in body.clusters:
             tip = _tip(body, row)
-            bone = body.rest_rot[row].T @ unit(body.rest_pos[tip] - body.rest_pos[row])
-            along = unit(points[:, tip] - points[:, row])
+            bone = body.rest_rot[row].T @ normalize(body.rest_pos[tip] - body.rest_pos[row])
+            along = normalize(points[:, tip] - points[:, row])
             out[row] = arc(rotate(turns[:, row], bone), along) @ turns[:, row]
     return out
 
 
-def _paper_rotations(frames: Frames, rest: Frames, body: IkBody) -> dict[int, np.ndarray]:
+def _paper_rotations(frames: Frames, rest: Frames, body: IkBody) -> dict[int, Tensor]:
     """The same through Eq. 6 from parent to child, whatever it makes of frames that are not square."""
     rows = body.table.rows
     out = {0: frames.frames[0] @ rest.frames[0][0].T @ body.rest_rot[0]}
@@ -125,10 +126,8 @@ def _paper_rotations(frames: Frames, rest: Frames, body: IkBody) -> dict[int, np
         p = rows[row].parent
         while p not in out:
             p = rows[p].parent
-        turn, still = (
-            zyx_matrix(zyx_angles(f.knee_parent.get(row, f.frames[p]), f.frames[row]))
-            for f in (frames, rest)
-        )
+        both = [(f.knee_parent.get(row, f.frames[p]), f.frames[row]) for f in (frames, rest)]
+        turn, still = (torch.tensor(zyx_matrix(zyx_angles(a.numpy(), b.numpy()))) for a, b in both)
         # B_c = B_p A_p M A_c^T, with A_c such that the rest pose comes out at rest.
         fixed[row] = body.rest_rot[row].T @ body.rest_rot[p] @ fixed[p] @ still[0]
         out[row] = out[p] @ fixed[p] @ turn @ fixed[row].T
@@ -146,12 +145,12 @@ def _tip(body: IkBody, row: int) -> int:
 
 
 def _coordinates(
-    points: np.ndarray, wanted: dict[int, np.ndarray], body: IkBody, config: IkConfig
+    points: Tensor, wanted: dict[int, Tensor], body: IkBody, config: IkConfig
 ) -> np.ndarray:
     """qpos from world rotations: three hinges make any rotation, fewer point their bone."""
     rows = body.table.rows
     angles: dict[int, np.ndarray] = {}
-    world: list[np.ndarray] = [wanted[0]]
+    world: list[Tensor] = [wanted[0]]
     free: list[int] = []
     for i, row in enumerate(rows[1:], 1):
         if len(row.order) == 3 and i in wanted:
@@ -160,51 +159,39 @@ def _coordinates(
             continue
         zero = world[row.parent] @ body.links[i]
         tip = _tip(body, i)
-        if not row.order or tip < 0 or np.isnan(points[0, tip, 0]):
+        if not row.order or tip < 0 or bool(points[0, tip, 0].isnan()):
             angles[i] = np.zeros((len(points), len(row.order)))
             world.append(zero)
             continue
-        bone = body.rest_rot[i].T @ unit(body.rest_pos[tip] - body.rest_pos[i])
-        along = unit(points[:, tip] - points[:, i])
+        bone = body.rest_rot[i].T @ normalize(body.rest_pos[tip] - body.rest_pos[i])
+        along = normalize(points[:, tip] - points[:, i])
         if len(row.order) == 3:
             # The bone is seen and its twist is not (necks): the smallest turn from the parent.
             free.append(i)
             world.append(arc(rotate(zero, bone), along) @ zero)
         else:
-            seen = rotate(np.swapaxes(zero, -1, -2), along)
-            angles[i] = pointing_angles(bone, seen, row.order, body.axes[i])
-            world.append(zero @ body.axes[i] @ _chain(angles[i], row.order) @ body.axes[i].T)
-    angles.update(_free_angles(free, np.stack(world, 1), body, config))
+            seen, axes = rotate(zero.mT, along), body.axes[i]
+            angles[i] = pointing_angles(bone.numpy(), seen.numpy(), row.order, axes.numpy())
+            turn = quat_to_matrix(euler_to_quat(torch.tensor(angles[i]), row.order))
+            world.append(zero @ axes @ turn @ axes.T)
+    angles.update(_free_angles(free, torch.stack(world, 1), body, config))
     hinges = np.concatenate([angles[i] for i in sorted(angles)], -1)
     hinges = unwrapped(hinges) if config.on("branches") else hinges
-    root = unwrap_quats(matrix_to_quat(torch.tensor(world[0]))).numpy()
-    return np.concatenate((points[:, 0], root, hinges), -1)
+    root = unwrap_quats(matrix_to_quat(world[0])).numpy()
+    return np.concatenate((points[:, 0].numpy(), root, hinges), -1)
 
 
 def _free_angles(
-    free: list[int], world: np.ndarray, body: IkBody, config: IkConfig
+    free: list[int], world: Tensor, body: IkBody, config: IkConfig
 ) -> dict[int, np.ndarray]:
     """Angles `(T, 3)` of rows with three hinges from all world rotations `(T, R, 3, 3)`."""
     parents = [body.table.rows[i].parent for i in free]
     zero = world[:, parents] @ body.links[free]
     axes = body.axes[free]
     # The chain's rotation (B_parent link)^T B, stated in the hinges' own frame.
-    local = np.swapaxes(axes, -1, -2) @ (np.swapaxes(zero, -1, -2) @ world[:, free]) @ axes
+    local = (axes.mT @ (zero.mT @ world[:, free]) @ axes).numpy()
     out: dict[int, np.ndarray] = {}
     for order, group in by_order([body.table.rows[i].order for i in free]).items():
         found = continuous_euler(local[:, group], order, config.on("branches"))
         out.update({free[g]: found[:, k] for k, g in enumerate(group)})
-    return out
-
-
-def _chain(angles: np.ndarray, order: str) -> np.ndarray:
-    """Rotation `(T, 3, 3)` of one or two hinges about axes of their own frame."""
-    out = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
-    for k, letter in enumerate(order):
-        c, s = np.cos(angles[:, k]), np.sin(angles[:, k])
-        a = "XYZ".index(letter)
-        b, d = (a + 1) % 3, (a + 2) % 3
-        turn = np.zeros((len(angles), 3, 3))
-        turn[:, a, a], turn[:, b, b], turn[:, d, d], turn[:, d, b], turn[:, b, d] = 1.0, c, c, s, -s
-        out = out @ turn
     return out

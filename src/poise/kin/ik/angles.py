@@ -10,7 +10,6 @@ import torch
 
 from poise.kin.branches import best_path, euler_path, wrapped
 from poise.kin.hinges import through_lock
-from poise.kin.ik.vectors import columns
 
 #: lambda of Eq. 7 (rad).
 JUMP = 5.0
@@ -37,7 +36,7 @@ def zyx_matrix(angles: np.ndarray) -> np.ndarray:
     x = np.stack((cz * cy, sz * cy, -sy), -1)
     y = np.stack((cz * sy * sx - sz * cx, sz * sy * sx + cz * cx, cy * sx), -1)
     z = np.stack((cz * sy * cx + sz * sx, sz * sy * cx - cz * sx, cy * cx), -1)
-    return columns(x, y, z)
+    return np.stack((x, y, z), -1)
 
 
 def euler_angles(m: np.ndarray, order: str) -> np.ndarray:

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from poise.kin.branches import best_path, wrapped
-from poise.kin.ik.vectors import across, arc, cross, dot, norm, prefix_product, rotate, square_to, unit
+from poise.kin.ik.vectors import arc, prefix_product, rotate, square_to
+from poise.spatial import across, normalize
 
 
-def bend_normals(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+def bend_normals(upper: Tensor, lower: Tensor) -> Tensor:
     """u x v made unit length: Eqs. 5, 10 and 13 (up to sign), undefined for a straight limb."""
-    return unit(cross(upper, lower))
+    return normalize(torch.linalg.cross(upper, lower))
 
 
 def held_normals(
-    upper: np.ndarray,
-    lower: np.ndarray,
-    parent: np.ndarray,
-    rest_upper: np.ndarray,
-    rest_normal: np.ndarray,
+    upper: Tensor,
+    lower: Tensor,
+    parent: Tensor,
+    rest_upper: Tensor,
+    rest_normal: Tensor,
     straight: float,
     reach: float,
-) -> np.ndarray:
+) -> Tensor:
     """Unit bend axes `(T, L, 3)`, world, that never jump where a limb is straight.
 
     The angle theta of the observed axis about the upper bone is stated against an axis that is carried
@@ -37,39 +40,39 @@ def held_normals(
         straight: rad, the bend at which the frames around count as much as the frame itself.
         reach: frames over which they do.
     """
-    into = np.swapaxes(parent, -1, -2)
+    into = parent.mT
     u, v = rotate(into, upper), rotate(into, lower)
     carried = _carried(u, rest_normal)
-    other = cross(u, carried)
-    normal = cross(u, v)
-    sine = norm(normal)[..., 0]
+    other, normal = torch.linalg.cross(u, carried), torch.linalg.cross(u, v)
+    sine = normal.norm(dim=-1).numpy()
 
-    def angle(n: np.ndarray) -> np.ndarray:
-        return np.arctan2(dot(n, other)[..., 0], dot(n, carried)[..., 0])
+    def angle(n: Tensor) -> np.ndarray:
+        return torch.atan2((n * other).sum(-1), (n * carried).sum(-1)).numpy()
 
     theta = angle(normal)
     weight = sine**4 / (sine**4 + np.sin(straight) ** 4)
     # The way of least turning from the rest pose; it is lost where the bone points the other way.
-    home = rotate(arc(np.broadcast_to(rest_upper, u.shape), u), np.broadcast_to(rest_normal, u.shape))
-    trust = (0.5 + 0.5 * dot(rest_upper, u)[..., 0]) ** 2
+    home = rotate(arc(rest_upper.expand_as(u), u), rest_normal.expand_as(u))
+    trust = ((0.5 + 0.5 * (rest_upper * u).sum(-1)) ** 2).numpy()
     line = 0.5 * np.angle(_mean(theta, weight, angle(home), 1e-4 * trust, reach))
     both = np.stack((line, line + np.pi), -1)  # (T, L, 2)
     # The bend about each of the two axes: negative is to the wrong side.
-    bend = np.arctan2(sine, dot(u, v)[..., 0])[..., None] * np.cos(theta[..., None] - both)
+    bend = np.arctan2(sine, (u * v).sum(-1).numpy())[..., None] * np.cos(theta[..., None] - both)
     step = wrapped(both[1:, :, None, :] - both[:-1, :, :, None])
     astray = wrapped(both - angle(home)[..., None])
     pull = np.square(np.minimum(bend, 0.0)) + 1e-4 * trust[..., None] * astray**2
     pick = best_path(step**2, pull)
-    turn = np.take_along_axis(both, pick[..., None], -1)
-    return rotate(parent, np.cos(turn) * carried + np.sin(turn) * other)
+    turn = torch.tensor(np.take_along_axis(both, pick[..., None], -1))
+    return rotate(parent, turn.cos() * carried + turn.sin() * other)
 
 
-def _carried(u: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _carried(u: Tensor, start: Tensor) -> Tensor:
     """Unit vectors `(T, L, 3)` square to `u (T, L, 3)` that never turn about it from frame to frame."""
-    steps = np.concatenate((np.broadcast_to(np.eye(3), (1, *u.shape[1:], 3)), arc(u[:-1], u[1:])))
+    none = torch.eye(3, dtype=u.dtype).expand(1, *u.shape[1:], 3)
     begin = square_to(start, u[0])
-    begin = np.where(norm(begin) < 0.05, across(u[0]), unit(begin))
-    return unit(square_to(rotate(prefix_product(steps), np.broadcast_to(begin, u.shape)), u))
+    begin = torch.where(begin.norm(dim=-1, keepdim=True) < 0.05, across(u[0]), normalize(begin))
+    turns = prefix_product(torch.cat((none, arc(u[:-1], u[1:]))))
+    return normalize(square_to(rotate(turns, begin.expand_as(u)), u))
 
 
 def _mean(

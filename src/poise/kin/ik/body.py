@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from poise.body import BodyTable, Humanoid, find_anatomy
 from poise.kin.fk import Kinematics
-from poise.kin.ik.vectors import cross, frame_of, rotate, square_to, unit
+from poise.kin.ik.vectors import frame_of, rotate, square_to
 from poise.motion import Skeleton
-from poise.spatial import quat_to_matrix
+from poise.spatial import normalize, quat_to_matrix
 
 #: A rest pose whose elbow or knee is bent less than this (rad) does not tell the plane it bends in.
 REST_BEND = math.radians(10.0)
@@ -52,13 +53,13 @@ class IkBody:
     arms: tuple[Arm, ...]
     toes: Mapping[int, int]
     heads: Mapping[int, int]
-    rest_pos: np.ndarray
-    rest_rot: np.ndarray
-    links: np.ndarray
-    axes: np.ndarray
+    rest_pos: Tensor
+    rest_rot: Tensor
+    links: Tensor
+    axes: Tensor
     clusters: Mapping[int, tuple[int, ...]]
-    normals: np.ndarray
-    trunk: np.ndarray
+    normals: Tensor
+    trunk: Tensor
 
     @property
     def chest(self) -> int:
@@ -77,8 +78,8 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
     zero = torch.zeros(1, 7 + sum(len(r.order) for r in rows), dtype=torch.float64)
     zero[:, 3] = 1.0
     rest = Kinematics(table)(zero)
-    rest_rot = quat_to_matrix(rest.quat[0]).numpy()
-    rest_pos = [*rest.pos[0].numpy()]
+    rest_rot = quat_to_matrix(rest.quat[0])
+    places = [*rest.pos[0]]
     points, toes = [r.name for r in rows], {}
     by_joint = {r.joint: i for i, r in enumerate(rows)}
     for _, joint in find_anatomy(skeleton).toes:
@@ -86,8 +87,8 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
         if foot is not None and np.linalg.norm(skeleton.offsets[joint]) > 1e-4:
             toes[foot] = len(points)
             points.append(skeleton.names[joint])
-            rest_pos.append(rest_pos[foot] + rest_rot[foot] @ skeleton.offsets[joint])
-    rest_pos = np.array(rest_pos)
+            places.append(places[foot] + rest_rot[foot] @ torch.tensor(skeleton.offsets[joint]))
+    rest_pos = torch.stack(places)
     spine = tuple(i for i, r in enumerate(rows) if r.kind == "spine")
     roles = _roles(table, spine, toes)
     children: dict[int, list[int]] = {}
@@ -104,8 +105,8 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
     heads = {i: children[i][0] for i, r in enumerate(rows) if r.kind == "neck" and i in children}
     trunk = _trunk(rest_pos, roles)
     arms = _arms(table)
-    axes = quat_to_matrix(torch.tensor([r.frame for r in rows], dtype=torch.float64)).numpy()
-    normals = np.array([_normal(table, a, rest_pos, rest_rot, axes, trunk) for a in arms])
+    axes = quat_to_matrix(torch.tensor([r.frame for r in rows], dtype=torch.float64))
+    normals = torch.stack([_normal(table, a, rest_pos, rest_rot, axes, trunk) for a in arms])
     return IkBody(
         table=table,
         points=tuple(points),
@@ -116,7 +117,7 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
         heads=heads,
         rest_pos=rest_pos,
         rest_rot=rest_rot,
-        links=quat_to_matrix(torch.tensor([r.quat for r in rows], dtype=torch.float64)).numpy(),
+        links=quat_to_matrix(torch.tensor([r.quat for r in rows], dtype=torch.float64)),
         axes=axes,
         clusters={i: (i, *attached(i)) for i in (0, *spine[-1:])},
         normals=normals,
@@ -160,7 +161,7 @@ def _arms(table: BodyTable) -> tuple[Arm, ...]:
     )
 
 
-def _trunk(rest: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
+def _trunk(rest: Tensor, roles: Mapping[str, int]) -> Tensor:
     """Columns left, up and forward of a body at rest, from its hips and shoulders."""
     hips = rest[roles["lhip"]] + rest[roles["rhip"]]
     up = rest[roles["ls"]] + rest[roles["rs"]] - hips
@@ -168,47 +169,48 @@ def _trunk(rest: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
 
 
 def _normal(
-    table: BodyTable, arm: Arm, rest: np.ndarray, rot: np.ndarray, axes: np.ndarray, trunk: np.ndarray
-) -> np.ndarray:
+    table: BodyTable, arm: Arm, rest: Tensor, rot: Tensor, axes: Tensor, trunk: Tensor
+) -> Tensor:
     """The axis about which an elbow or knee bends, in the rest pose.
 
     The hinge itself where there is one alone; else what the rest pose shows; where it is straight, that
     which lets a forearm bend forward and a shin backward.
     """
-    upper = unit(rest[arm.lower] - rest[arm.upper])
-    lower = unit(rest[arm.end] - rest[arm.lower])
+    upper = normalize(rest[arm.lower] - rest[arm.upper])
+    lower = normalize(rest[arm.end] - rest[arm.lower])
     up, forward = trunk[:, 1], trunk[:, 2]
     towards = -forward if arm.leg else forward
-    usual = cross(upper, towards)
-    if np.linalg.norm(usual) < 0.3:
+    usual = torch.linalg.cross(upper, towards)
+    if float(usual.norm()) < 0.3:
         # The bone points that way itself: a seated thigh bends down, an arm held forward bends up.
-        usual = cross(upper, -up if arm.leg else up)
-    usual = unit(usual)
+        usual = torch.linalg.cross(upper, -up if arm.leg else up)
+    usual = normalize(usual)
     row = table.rows[arm.lower]
     if len(row.order) == 1:
         axis = rot[arm.lower] @ axes[arm.lower][:, "XYZ".index(row.order)]
         low, high = row.ranges[0]
         along = float(axis @ usual)
         # A range that lies on one side tells which way the joint bends; else the usual way does.
-        sign = np.sign(low + high) if abs(low + high) > 0.5 * (high - low) else np.sign(along or 1.0)
-        return unit(square_to(sign * axis, upper))
-    bend = cross(upper, lower)
-    angle = math.atan2(float(np.linalg.norm(bend)), float(upper @ lower))
+        towards_one_side = abs(low + high) > 0.5 * (high - low)
+        sign = math.copysign(1.0, low + high if towards_one_side else along)
+        return normalize(square_to(sign * axis, upper))
+    bend = torch.linalg.cross(upper, lower)
+    angle = math.atan2(float(bend.norm()), float(upper @ lower))
     if angle > REST_BEND:
-        return unit(bend)
+        return normalize(bend)
     if len(row.order) == 3:
         first, middle = (rot[arm.lower] @ axes[arm.lower][:, "XYZ".index(c)] for c in row.order[:2])
         if abs(float(middle @ usual)) > 0.7 and abs(float(first @ upper)) < 0.3:
             # A middle hinge would lock at 90 degrees. The first one bends the limb down, which in a
             # T-pose is what Eqs. 10 and 13 say.
-            usual = first if float(first @ cross(upper, -up)) >= 0 else -first
-    return unit(square_to(usual, upper))
+            usual = first if float(first @ torch.linalg.cross(upper, -up)) >= 0 else -first
+    return normalize(square_to(usual, upper))
 
 
-def body_points(body: IkBody, pos: np.ndarray, rot: np.ndarray) -> np.ndarray:
+def body_points(body: IkBody, pos: Tensor, rot: Tensor) -> Tensor:
     """World positions `(T, P, 3)` of points; bodies at `pos (T, R, 3)` turned by `rot (T, R, 3, 3)`."""
     out = [pos]
     for foot, toe in sorted(body.toes.items(), key=lambda item: item[1]):
         local = body.rest_rot[foot].T @ (body.rest_pos[toe] - body.rest_pos[foot])
         out.append((pos[:, foot] + rotate(rot[:, foot], local))[:, None])
-    return np.concatenate(out, 1)
+    return torch.cat(out, 1)

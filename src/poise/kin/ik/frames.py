@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import numpy as np
 import torch
+from torch import Tensor
 
 from poise.kin.ik.bend import bend_normals, held_normals
 from poise.kin.ik.body import IkBody
 from poise.kin.ik.config import IkConfig
-from poise.kin.ik.vectors import columns, cross, frame_of, norm, square_to, unit
-from poise.spatial import best_rotation
+from poise.kin.ik.vectors import frame_of, square_to
+from poise.spatial import best_rotation, normalize
 
 
 class Frames:
@@ -24,17 +24,17 @@ class Frames:
     knee_parent: rows of shins whose parent's frame the paper states otherwise (Eq. 20).
     """
 
-    def __init__(self, p: np.ndarray, body: IkBody, config: IkConfig, at_rest: bool = False):
+    def __init__(self, p: Tensor, body: IkBody, config: IkConfig, at_rest: bool = False):
         self.p, self.body, self.config, self.at_rest = p, body, config, at_rest
-        self.frames: dict[int, np.ndarray] = {}
-        self.knee_parent: dict[int, np.ndarray] = {}
+        self.frames: dict[int, Tensor] = {}
+        self.knee_parent: dict[int, Tensor] = {}
         self._trunk()
         self._spine()
         self._collarbones()
         self._limbs()
         self._feet()
 
-    def _l(self, a: str, b: str) -> np.ndarray:
+    def _l(self, a: str, b: str) -> Tensor:
         """The vector from joint a to joint b, `(T, 3)` m."""
         return self.p[:, self.body.roles[b]] - self.p[:, self.body.roles[a]]
 
@@ -47,23 +47,22 @@ class Frames:
                 self.frames[row] = self._fitted(row)
             return
         # Eq. 18: x = l_rhip-lhip, y = l_root-rhip x l_root-lhip, z = x x y
-        x, y = bone("rhip", "lhip"), cross(bone("root", "rhip"), bone("root", "lhip"))
+        x, y = bone("rhip", "lhip"), torch.linalg.cross(bone("root", "rhip"), bone("root", "lhip"))
         self.frames[0] = frame_of("x", x=x, y=y)
         if top == 0:
             return
         # Eq. 16: x = l_rcl-lcl, z = l_lowneck-lcl x l_lowneck-rcl, y = z x x
-        x, z = bone("rcl", "lcl"), cross(bone("lowneck", "lcl"), bone("lowneck", "rcl"))
+        x, z = bone("rcl", "lcl"), torch.linalg.cross(bone("lowneck", "lcl"), bone("lowneck", "rcl"))
         self.frames[top] = frame_of("x", x=x, z=z)
 
-    def _fitted(self, row: int) -> np.ndarray:
+    def _fitted(self, row: int) -> Tensor:
         """The trunk's frame carried by the rotation that fits all points rigidly attached to `row`."""
         body = self.body
         at = list(body.clusters[row])
         here = body.rest_pos[at] - body.rest_pos[at[0]]
         there = self.p[:, at] - self.p[:, at[:1]]
         # M = sum there here^T
-        turn, _ = best_rotation(torch.tensor(np.einsum("tki,kj->tij", there, here)))
-        return turn.numpy() @ body.trunk
+        return best_rotation(torch.einsum("tki,kj->tij", there, here))[0] @ body.trunk
 
     def _spine(self) -> None:
         """Eqs. 17 and 18: the rows between the pelvis and the lower neck."""
@@ -73,7 +72,7 @@ class Frames:
         for i in range(1, len(chain) - 1):
             along = p[:, chain[i + 1]] - p[:, chain[i]]
             below = p[:, chain[i - 1]] - p[:, chain[i]]
-            y = unit(np.where(norm(along) < 1e-6, low[..., 1], along))
+            y = normalize(torch.where(along.norm(dim=-1, keepdim=True) < 1e-6, low[..., 1], along))
             if self.config.on("spine_twist"):
                 # The twist goes evenly from the pelvis' x to the shoulders'.
                 share = i / (len(chain) - 1)
@@ -82,7 +81,7 @@ class Frames:
                 )
             else:
                 # Eq. 17: y = l_th-lowneck, x = y x l_th-mspine, z = x x y
-                x = unit(cross(y, below))
+                x = normalize(torch.linalg.cross(y, below))
                 self.frames[chain[i]] = frame_of("y", x=x, y=y)
 
     def _collarbones(self) -> None:
@@ -92,22 +91,22 @@ class Frames:
             row = roles[f"{side}cl"]
             if row != roles[f"{side}s"] and self.body.table.rows[row].order:
                 # Eq. 12: x_c = l_lcl-ls, z_c = l_lcl-mspine x x_c, y_c = z_c x x_c
-                x = unit(self._l(a, b))
-                z = cross(self._l(f"{side}cl", "mspine"), x)
+                x = normalize(self._l(a, b))
+                z = torch.linalg.cross(self._l(f"{side}cl", "mspine"), x)
                 self.frames[row] = frame_of("x", x=x, z=z)
 
     def _limbs(self) -> None:
         """Eqs. 10, 11, 13, 14 (arms) and 19, 20, 22, 23 (legs)."""
         p, body, config = self.p, self.body, self.config
-        upper = unit(np.stack([p[:, a.lower] - p[:, a.upper] for a in body.arms], 1))
-        lower = unit(np.stack([p[:, a.end] - p[:, a.lower] for a in body.arms], 1))
+        upper = normalize(torch.stack([p[:, a.lower] - p[:, a.upper] for a in body.arms], 1))
+        lower = normalize(torch.stack([p[:, a.end] - p[:, a.lower] for a in body.arms], 1))
         normals = self._normals(upper, lower)
         arms = [k for k, a in enumerate(body.arms) if not a.leg]
         legs = [k for k, a in enumerate(body.arms) if a.leg]
-        both, twice = np.concatenate((upper, lower), 1), np.concatenate((normals, normals), 1)
+        both, twice = torch.cat((upper, lower), 1), torch.cat((normals, normals), 1)
         # Eq. 10: x = l_ls-le and l_le-lw, z = -l_ls-le x l_le-lw. Eq. 13: x = l_re-rs and l_rw-re,
         # z = l_re-rw x l_re-rs. So x points outward on the left and inward on the right.
-        way = np.array([[1.0] if body.arms[k].left else [-1.0] for k in arms * 2])
+        way = p.new_tensor([[1.0] if body.arms[k].left else [-1.0] for k in arms * 2])
         at = arms + [k + len(body.arms) for k in arms]
         self._put(arms, frame_of("x", x=way * both[:, at], z=-way * twice[:, at]))
         if config.on("thigh_twist"):
@@ -121,30 +120,31 @@ class Frames:
                 arm.upper, arm.lower, arm.left, upper[:, k], lower[:, k], normals[:, k]
             )
 
-    def _put(self, arms: list[int], frames: np.ndarray) -> None:
+    def _put(self, arms: list[int], frames: Tensor) -> None:
         """Gives `frames (T, 2 n, 3, 3)` to the upper bones of n limbs, then to their lower bones."""
         rows = [self.body.arms[k].upper for k in arms] + [self.body.arms[k].lower for k in arms]
         self.frames.update({row: frames[:, i] for i, row in enumerate(rows)})
 
     def _leg_of_hip_line(
-        self, thigh: int, shin: int, left: bool, u: np.ndarray, v: np.ndarray, n: np.ndarray
+        self, thigh: int, shin: int, left: bool, u: Tensor, v: Tensor, n: Tensor
     ) -> None:
         """Eqs. 19 and 20 (left), 22 and 23 (right): the thigh's twist from the line of the hips."""
         y_p, y_c = -u, -v
         # Eq. 19: z = l_lhip-rhip x -y. Eq. 22: z = -y x l_rhip-lhip. Both point forward.
         hips = self._l("lhip", "rhip")
-        z = unit(cross(hips, -y_p))
-        self.frames[thigh] = columns(cross(y_p, z), y_p, z)
+        z = normalize(torch.linalg.cross(hips, -y_p))
+        self.frames[thigh] = torch.stack((torch.linalg.cross(y_p, z), y_p, z), -1)
         # Eq. 20: x_c = -y_c x l_lk-lhip, z_c = x_c x y_c
         x = square_to(n, y_c) if self.config.on("hold_bend") or self.at_rest else n
-        x = unit(x)
-        z_c = cross(x, y_c)
-        self.frames[shin] = columns(x, y_c, z_c)
+        x = normalize(x)
+        z_c = torch.linalg.cross(x, y_c)
+        self.frames[shin] = torch.stack((x, y_c, z_c), -1)
         if left and not self.config.on("knee_subscripts"):
             # Eq. 20 as printed builds the parent from the child's y_c and z_c.
-            self.knee_parent[shin] = columns(unit(cross(y_c, z_c)), y_p, unit(cross(hips, -y_c)))
+            x, z = torch.linalg.cross(y_c, z_c), torch.linalg.cross(hips, -y_c)
+            self.knee_parent[shin] = torch.stack((normalize(x), y_p, normalize(z)), -1)
 
-    def _normals(self, upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    def _normals(self, upper: Tensor, lower: Tensor) -> Tensor:
         """Unit bend axes `(T, 4, 3)` of the limbs."""
         body, config = self.body, self.config
         if self.at_rest:
@@ -159,12 +159,12 @@ class Frames:
                 j = rows[j].parent
             # The parent's rotation from rest, F F_rest^T, carries vectors of the rest pose along.
             parents.append(self.frames[j] @ rest[j][0].T)
-        bones = [unit(body.rest_pos[a.lower] - body.rest_pos[a.upper]) for a in body.arms]
+        bones = [normalize(body.rest_pos[a.lower] - body.rest_pos[a.upper]) for a in body.arms]
         return held_normals(
             upper,
             lower,
-            np.stack(parents, 1),
-            np.array(bones),
+            torch.stack(parents, 1),
+            torch.stack(bones),
             body.normals,
             config.straight,
             config.hold_frames,
@@ -183,14 +183,14 @@ class Frames:
             ankle = roles[f"{side}an"]
             shin = self.frames[roles[f"{side}k"]]
             # Eq. 21: y_c = l_lan-lk, z_c = l_lan-lf
-            y, z = unit(self._l(f"{side}an", f"{side}k")), unit(self._l(f"{side}an", f"{side}f"))
+            y, z = (normalize(self._l(f"{side}an", f"{side}{to}")) for to in "kf")
             if self.config.on("square_ankle"):
                 # z_c holds and y_c = z_c x x_c, with x_c the knee's axis made square to z_c: the same as
                 # y_c x z_c for a foot that is bent or turned out, and still defined for one on pointe.
                 self.frames[ankle] = frame_of("z", x=shin[..., 0], z=z)
             else:
                 # x_c = y_c x z_c, with a shin y_c that is not square to z_c.
-                self.frames[ankle] = columns(unit(cross(y, z)), y, z)
+                self.frames[ankle] = torch.stack((normalize(torch.linalg.cross(y, z)), y, z), -1)
 
 
 @lru_cache(maxsize=32)

@@ -69,10 +69,10 @@ def paper_humanoid(
 
 def _offset(body: IkBody, point: int, parent: int) -> np.ndarray:
     """Place of a point in its parent, T-pose, as (left, up, forward) m."""
-    bone = body.rest_pos[point] - body.rest_pos[parent]
+    bone = (body.rest_pos[point] - body.rest_pos[parent]).numpy()
     if parent in body.clusters:
         # Pelvis and chest keep the shape that they have.
-        return body.trunk.T @ bone
+        return body.trunk.numpy().T @ bone
     along = np.array(_ALONG[body.table.rows[parent].kind])
     if body.table.rows[parent].side == "right":
         along[0] = -along[0]

@@ -1,94 +1,51 @@
-"""Vectors and frames in NumPy for inverse kinematics: small batches, so few and plain operations."""
+"""Frames of two directions and what else inverse kinematics needs beside `spatial`; float64 tensors."""
 
 from __future__ import annotations
 
-import numpy as np
+import torch
+from torch import Tensor
 
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b `(..., 3)`."""
-    return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
+from poise.spatial import across, normalize, quat_to_matrix, rejected, shortest_arc
 
 
-def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a . b `(..., 1)`."""
-    return np.einsum("...i,...i->...", a, b)[..., None]
-
-
-def norm(a: np.ndarray) -> np.ndarray:
-    """|a| `(..., 1)`."""
-    return np.sqrt(np.einsum("...i,...i->...", a, a))[..., None]
-
-
-def unit(a: np.ndarray) -> np.ndarray:
-    """a / |a| `(..., 3)`; zero stays zero."""
-    return a / np.maximum(norm(a), 1e-300)
-
-
-def across(a: np.ndarray) -> np.ndarray:
-    """Some unit vector `(..., 3)` square to `a`."""
-    least = np.abs(a).argmin(-1)
-    return unit(cross(a, np.eye(3)[least]))
-
-
-def square_to(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def square_to(a: Tensor, b: Tensor) -> Tensor:
     """The part of `a (..., 3)` square to unit `b`; some vector across b where nothing remains."""
-    rest = a - dot(a, b) * b
-    lost = norm(rest) < 1e-9 * (norm(a) + 1e-300)
-    return np.where(lost, across(b), rest) if lost.any() else rest
-
-
-def columns(*axes: np.ndarray) -> np.ndarray:
-    """Matrices `(..., 3, 3)` whose columns are `axes`."""
-    return np.stack(axes, -1)
+    rest = rejected(a, b)
+    lost = rest.norm(dim=-1, keepdim=True) < 1e-9 * (a.norm(dim=-1, keepdim=True) + 1e-300)
+    return torch.where(lost, across(b), rest)
 
 
 def frame_of(
-    hold: str,
-    x: np.ndarray | None = None,
-    y: np.ndarray | None = None,
-    z: np.ndarray | None = None,
-) -> np.ndarray:
+    hold: str, x: Tensor | None = None, y: Tensor | None = None, z: Tensor | None = None
+) -> Tensor:
     """Orthonormal `(..., 3, 3)` of two directions; axis `hold` is kept, the other made square to it."""
     given = {"x": x, "y": y, "z": z}
     kept = given.pop(hold)
     name, other = next((k, v) for k, v in given.items() if v is not None)
     assert kept is not None
-    kept = unit(kept)
-    axes = {hold: kept, name: unit(square_to(other, kept))}
+    kept = normalize(kept)
+    axes = {hold: kept, name: normalize(square_to(other, kept))}
     # The third axis closes the cycle x, y, z.
     last = next(k for k in "xyz" if k not in axes)
-    after = "yzx"["xyz".index(last)]
-    axes[last] = cross(axes[after], axes["xyz"[("xyz".index(last) + 2) % 3]])
-    return columns(axes["x"], axes["y"], axes["z"])
+    at = "xyz".index(last)
+    axes[last] = torch.linalg.cross(axes["xyz"[(at + 1) % 3]], axes["xyz"[(at + 2) % 3]])
+    return torch.stack((axes["x"], axes["y"], axes["z"]), -1)
 
 
-def rotate(m: np.ndarray, v: np.ndarray) -> np.ndarray:
+def rotate(m: Tensor, v: Tensor) -> Tensor:
     """m v `(..., 3)`."""
-    return (m @ v[..., None])[..., 0]
+    return (m @ v.unsqueeze(-1)).squeeze(-1)
 
 
-def arc(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Matrices `(..., 3, 3)` of the smallest turn that brings unit `a (..., 3)` onto unit `b`."""
-    v, c = cross(a, b), dot(a, b)[..., None]
-    # R = I + [v] + [v]^2 / (1 + a . b); half a turn about an axis across where a = -b
-    k = np.zeros((*v.shape[:-1], 3, 3))
-    k[..., 2, 1], k[..., 0, 2], k[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    k -= np.swapaxes(k, -1, -2)
-    opposite = c < -1.0 + 1e-12
-    out = np.eye(3) + k + k @ k / np.where(opposite, 1.0, 1.0 + c)
-    if opposite.any():
-        n = across(a)
-        out = np.where(opposite, 2.0 * n[..., :, None] * n[..., None, :] - np.eye(3), out)
-    return out
+def arc(a: Tensor, b: Tensor) -> Tensor:
+    """Matrices `(..., 3, 3)` of the smallest turn that brings `a (..., 3)` onto `b`."""
+    return quat_to_matrix(shortest_arc(a, b))
 
 
-def prefix_product(m: np.ndarray) -> np.ndarray:
+def prefix_product(m: Tensor) -> Tensor:
     """m_t ... m_1 m_0 for every t `(T, ..., 3, 3)` in log2(T) passes (Hillis and Steele 1986)."""
-    out, reach = m.copy(), 1
+    out, reach = m.clone(), 1
     while reach < len(out):
-        out = np.concatenate((out[:reach], out[reach:] @ out[:-reach]))
+        out = torch.cat((out[:reach], out[reach:] @ out[:-reach]))
         reach *= 2
     return out

@@ -32,7 +32,7 @@ from poise.motion.points.solve import Solver, hold_lengths
 from poise.spatial import forward_kinematics
 
 #: Rounds in which bones get their length; the error halves about every third.
-ROUNDS = 12
+LENGTH_ROUNDS = 12
 #: A rate at which the twist of a limb is not carried over from the frames around.
 _NO_MEMORY_FPS = 1e-3
 
@@ -212,7 +212,7 @@ class PointBody:
         """The measured skeleton in every frame."""
         seen = {p: torch.tensor(places[:, k]) for k, p in enumerate(self.places)}
         tracks, _ = trunk_tracks(seen, [], self.share)
-        tracks = hold_lengths(tracks, self.bones, ROUNDS)
+        tracks = hold_lengths(tracks, self.bones, LENGTH_ROUNDS)
         root, rot = Solver(self.rest, tracks, _NO_MEMORY_FPS).run()
         names = list(self.rest.parents)
         parents = tuple(-1 if up is None else names.index(up) for up in self.rest.parents.values())

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.feet.contacts import contact_labels
-from poise.kin.ground import smooth_hull
+from poise.kin.feet.contact import TOUCH_M, contact_labels, rest_height
+from poise.kin.ground import smooth_lift
 from poise.kin.limbs import Limb, match_positions
 from poise.kin.retarget.common_pose import CommonPose, hanging
 from poise.kin.retarget.standing import World
@@ -23,9 +23,6 @@ from poise.spatial import forward_kinematics, quat_rotate
 BLEND_S = 0.25
 #: Half the time (s) over which a lift is spread.
 LIFT_S = 0.05
-#: Height (m) over the ground under which a slow toe or wrist touches, and what is slow (m/s).
-_LOW = {"foot": 0.05, "hand": 0.1}
-_SLOW = 0.35
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class Scale:
             treads.append(
                 pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3))
             )
-        ground = tread_height(torch.stack(treads, 1), fps)
+        ground = rest_height(torch.stack(treads, 1), fps)
         hips = [pos[0, joints.source.joint(f"{s}_thigh") or 0] for s in SIDES]
         middle = (hips[0] + hips[1]) / 2
         return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground)
@@ -64,22 +61,6 @@ class Scale:
         centre = torch.tensor(self.centre, dtype=x.dtype)
         # Written so that a factor of 1 changes no digit.
         return x + (self.factor - 1.0) * (x - centre)
-
-
-def tread_height(points: Tensor, fps: float) -> float:
-    """The height (m) of the ground under points of the feet `(T, F, 3)`: the median of those at rest.
-
-    At rest is the lower point of a frame while it moves slower than 0.35 m/s; without any, the tenth
-    percentile of the lowest points counts.
-    """
-    low, which = points[..., 2].min(-1)
-    step = torch.diff(points, dim=0).norm(dim=-1) * fps
-    speed = torch.cat((step, step[-1:])).gather(1, which[:, None])[:, 0]
-    slow = low[speed < _SLOW]
-    if len(slow) < 5:
-        return float(low.quantile(0.1))
-    # A foot may rest in the air too; the lower half of the moments of rest is on the floor.
-    return float(slow[slow <= slow.median() + 0.02].median())
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +113,8 @@ def source_contacts(world: World, fps: float, feet: tuple[Foot, ...], ground: fl
     out = []
     for foot in feet:
         tread = foot.points(*world, target=False)[:, None]
-        low = _LOW[foot.name.split()[1]]
-        out.append(contact_labels(tread, fps, low, _SLOW, ground)[:, 0])
+        low = TOUCH_M[foot.name.split()[1]]
+        out.append(contact_labels(tread, fps, low, ground=ground)[:, 0])
     return torch.stack(out, 1)
 
 
@@ -166,9 +147,7 @@ def plant(
         excess = floor_depth(joints.target, poses[1], pos, quat, scale.ground, parts) - depth
         if float(excess.max()) < 1e-6:
             return torch.zeros(len(pos), dtype=pos.dtype)
-        reach = max(1, round(LIFT_S * clip.fps))
-        hull = smooth_hull(excess.clamp_min(0.0).numpy(), reach, clip.cyclic)
-        return torch.tensor(np.maximum(hull, 0.0))
+        return torch.tensor(smooth_lift(excess.clamp_min(0.0).numpy(), clip.fps, LIFT_S, clip.cyclic))
 
     if clear:
         ends = {j for foot in feet for j in hanging(skeleton, foot.target)}

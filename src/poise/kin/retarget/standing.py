@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.kin.feet.contacts import contact_labels
+from poise.kin.feet.contact import contact_labels
 from poise.motion import Clip, Roles
 from poise.motion.info import sampled
 from poise.motion.roles import SIDES
@@ -179,7 +179,7 @@ class Stances:
             points = torch.stack((pos, pos + line), 1)
             low = points[..., 2].quantile(0.1, dim=0)
             stands = [
-                contact_labels(points[:, [k]], fps, 0.03, 0.35, float(low[k]))[:, 0] for k in (0, 1)
+                contact_labels(points[:, [k]], fps, 0.03, ground=float(low[k]))[:, 0] for k in (0, 1)
             ]
             flat = stands[0] & stands[1]
             x, y, z = line[flat].unbind(-1)

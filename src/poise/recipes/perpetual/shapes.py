@@ -26,10 +26,9 @@ from poise.body.table import BodyRow, Geom
 from poise.env import Reference, TaskConfig
 from poise.env.terms import phc_obs
 from poise.errors import PoiseError
-from poise.kin import clean_clip, clip_to_qpos, fit_ground, retarget
+from poise.kin import clean_clip, place_on_body
 from poise.kin.fit import widen
-from poise.kin.hinges import within_turns
-from poise.motion import Clip, ClipLibrary, Skeleton, resample
+from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.recipes.imitation import Imitation
 
 #: Kinds of parts that are scaled together.
@@ -206,10 +205,8 @@ def _on_body(
     example, there: one clip on the library's skeleton, and on that of the body.
     """
     clean = clean_clip(clip.replaced(cyclic=False))[0]
-    moved = retarget(clean, there, example=example)[0]
-    qpos = within_turns(clip_to_qpos(resample(moved, rate), table), base)
-    known = clip.skeleton.source.ground_m is not None
-    return moved, fit_ground(qpos, table, rate, known=known)[0]
+    on = place_on_body(clean, table, there, rate, example=example, clean=False, level=False, near=base)
+    return on.clip, on.qpos
 
 
 def _widened(

@@ -35,7 +35,7 @@ from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskCo
 from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_recovery import recovery_terms
 from poise.kin import fit_humanoid
-from poise.kin.own_body import on_own_body
+from poise.kin.place import on_own_body
 from poise.recipes.imitation import Clips, Imitation, as_library
 from poise.recipes.perpetual.config import Perpetual, Recovers, RecoveryPlan
 from poise.recipes.perpetual.recovery import known_recovery_clips
@@ -75,7 +75,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         # As many of the last rewards as a character that goes on would earn: g + g^2 + ...
         completion_bonus=gamma / max(1.0 - gamma, 1.0 / config.horizon),
         first=config.first,
-        hard=config.adaptive_sampling,
+        adaptive=config.adaptive_sampling,
         adaptive_over=config.adaptive_over,
         style=phc_obs.style_terms(humanoid) if config.style else (),
         recovery=recovery,
@@ -128,9 +128,9 @@ def build(library: Clips, config: Perpetual | None = None, table: BodyTable | No
     table: the body of a policy that goes on to learn, see `fit_humanoid`; by default one is made.
     """
     config = config or Perpetual()
-    library = as_library(library)
-    library, _ = on_own_body(library, config.body)
+    library, own = on_own_body(as_library(library), config.body)
     widens = table is None or config.widens
+    table = table or own
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)

@@ -1,0 +1,186 @@
+"""What N characters are to do, told as it goes.
+
+A control policy cannot tell which goal it follows: a clip, a stream of frames that arrive one by one, a
+generator that makes the next frames from the past, a goal that is displaced, or one that leads back.
+
+An environment asks for the frame that the characters are to be in `now` and for those `ahead`. What lies
+beyond the frames that are known is extrapolated by `extrapolated`, for all goals alike.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.env.bins import Outcomes
+from poise.env.frame import Layout
+from poise.env.plugins import Start
+from poise.errors import PoiseError
+from poise.sim import displaced
+
+if TYPE_CHECKING:
+    from poise.env.goals.clip import ClipGoal
+
+#: s in which an extrapolated motion comes to rest: its velocity falls by e in each.
+FADE_S = 0.1
+
+Group = Literal["all", "clip", "bin"]
+
+
+class Goal(ABC):
+    """What N characters are to do.
+
+    Attributes:
+        humanoid: the body whose coordinates the goal is in; the first of `bodies`.
+        bodies: all bodies, of the same joints and hinges.
+        rate_hz: control steps a second.
+        layout: where the numbers of packed poses `(N, W)` stand, see `Layout`.
+        num_envs: N.
+        device: where its tensors are.
+        rng: of all draws that starts make, on the CPU.
+        notes: sentences on what went wrong, in order; a stream that stalls, for instance.
+    """
+
+    humanoid: Humanoid
+    bodies: tuple[Humanoid, ...]
+    rate_hz: float
+    layout: Layout
+    num_envs: int
+    device: torch.device
+    rng: torch.Generator
+    notes: list[str]
+    #: Whether the goal is known before the first episode, so that characters can be set down on it.
+    begins: bool = False
+
+    @abstractmethod
+    def local(self, qpos: Tensor) -> Tensor:
+        """`(N, J, 4)` wxyz local turns of the hinged bodies of `qpos (N, 7 + n)`, on `device`."""
+
+    # --- episodes -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def draw(self, ids: Tensor) -> None:
+        """Chooses what the worlds `ids (n,)` are to do in their next episodes."""
+
+    def seek(self, clip: Tensor, frame: Tensor) -> None:
+        """World i goes on at `frame[i]` of `clip[i]`, both `(N,)`, wherever its character stands.
+
+        Raises:
+            PoiseError: the goal follows no clips.
+        """
+        self.clips.seek(clip, frame)
+
+    @abstractmethod
+    def start(self, ids: Tensor | None) -> Start:
+        """Coordinates in which episodes of worlds `ids`, all for None, begin on the goal."""
+
+    @abstractmethod
+    def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
+        """Looks up what comes next in worlds `ids`, all for None, after they have been set down.
+
+        held: `(N,)` bool, worlds whose goals wait in the next step; None: no goal waits.
+        """
+
+    def body(self, ids: Tensor | None) -> Tensor:
+        """`(n,)` which of `bodies` the characters of worlds `ids` need."""
+        count = self.num_envs if ids is None else len(ids)
+        return torch.zeros(count, dtype=torch.long, device=self.device)
+
+    # --- frames -------------------------------------------------------------------------------
+
+    @abstractmethod
+    def now(self, ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, W)` that the characters are to be in now."""
+
+    @abstractmethod
+    def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, W)` of k control steps later; extrapolated where they are not known."""
+
+    @abstractmethod
+    def targets(self) -> tuple[Tensor, Tensor]:
+        """Hinge angles of `ahead(1)`, rad float64, as a table `(R, n)` and its rows `(N,)`."""
+
+    @abstractmethod
+    def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
+        """One control step has been made; `now()` and `ahead(1)` of all worlds.
+
+        waited, held: `(N,)` bool, worlds whose goals waited in this step, and wait in the next.
+        """
+
+    def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
+        """Looks where the characters are, before a policy acts; True if goals changed by that.
+
+        qpos `(N, 7 + n)`; pos `(N, B, 3)` m and linvel `(N, B, 3)` m/s of their bodies.
+        """
+        return False
+
+    # --- what is counted ----------------------------------------------------------------------
+
+    def groups(self, by: Group) -> int:
+        """How many groups of outcomes there are, see `HelpBudget`."""
+        return 1
+
+    def group(self, by: Group) -> Tensor:
+        """`(N,)` the group of each world in the present step."""
+        return torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    def row(self) -> Tensor:
+        """`(N,)` where in the goal's own table the worlds are, for `outcomes`."""
+        return torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
+        """What a step that led to `row (N,)` says of motion bins, see `MotionBins.outcomes`."""
+        raise PoiseError("this goal has no motion bins", hint="Take help_by='all' and adaptive=0")
+
+    @property
+    def clips(self) -> ClipGoal:
+        """The clips that the goal is made of.
+
+        Raises:
+            PoiseError: it is made of none.
+        """
+        raise PoiseError(f"a {type(self).__name__} follows no clips")
+
+    def where(self, env: int) -> str:
+        """Which part of the goal world `env` is at, for messages."""
+        return type(self).__name__
+
+    # --- persistence --------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a bit-exact continuation needs."""
+        return {**{f"goal/{k}": v.clone() for k, v in self.rows().items()}, "rng": self.rng.get_state()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from `state()`."""
+        for name, value in self.rows().items():
+            value.copy_(state[f"goal/{name}"])
+        self.rng.set_state(state["rng"])
+
+    @abstractmethod
+    def rows(self) -> dict[str, Tensor]:
+        """What it knows of each world, `(N, ...)` by name: tensors that a snapshot copies in place."""
+
+    def shared(self) -> dict[str, Tensor]:
+        """What `rows` points into, by name: never changed in place, so that a snapshot holds it."""
+        return {}
+
+    def load_shared(self, shared: Mapping[str, Tensor]) -> None:  # noqa: B027 - most share nothing
+        """Takes what another goal of the kind has as `shared()`, for all worlds."""
+
+
+def extrapolated(qpos: Tensor, qvel: Tensor, steps: Tensor, rate_hz: float) -> Start:
+    """Where a motion goes on that is known up to `qpos (n, 7 + n)` with `qvel (n, 6 + n)`.
+
+    Its velocity fades, q = q_0 + v_0 tau (1 - e^(-t / tau)), v = v_0 e^(-t / tau) with tau = `FADE_S`,
+    so that a character whose goals stop arriving comes to rest where it was heading.
+
+    steps: `(n,)` control steps beyond the last known frame.
+    """
+    left = torch.exp(-steps.to(qpos) / (rate_hz * FADE_S)).unsqueeze(-1)
+    return displaced(qpos, qvel * (FADE_S * (1.0 - left))), qvel * left

@@ -1,0 +1,126 @@
+"""The observables that every environment has: what terms see, each one function of the `Frame`.
+
+A new observable is one more function here, and every term can ask for it by its name:
+
+    def contact_torque(frame: Frame) -> Tensor:
+        \"""`(N, n)` N m that contacts and limits exert on each hinge.\"""
+        return frame.source("qfrc_constraint")[:, 6:].float()
+
+A field of MuJoCo's state that a `source` names is fetched for tasks that ask for it alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.control import Residual
+from poise.env.frame import Frame, Layout, LazyPose, Place, PointGoal, Pose
+from poise.spatial import heading_quat
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What all frames of one environment share.
+
+    layout: where the numbers of packed poses stand.
+    local: the turns of the hinged bodies `(N, J, 4)` of coordinates `(N, 7 + n)`.
+    roots: `(B,)` each body's root, as a body of the model.
+    hinges: how many there are; the rest of an action is the residual's.
+    residual: the kind of residual force, None without.
+    """
+
+    layout: Layout
+    local: Callable[[Tensor], Tensor]
+    roots: Tensor
+    hinges: int
+    residual: Residual | None
+
+
+def sim(frame: Frame) -> Pose:
+    """The simulated characters; read it before the next step."""
+
+    def linvel() -> Tensor:
+        # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
+        arm = pose.pos - frame.source("subtree_com").index_select(1, frame.context.roots).float()
+        return frame.source("cvel")[:, 1:, 3:].float() + torch.linalg.cross(pose.angvel, arm)
+
+    pose = LazyPose(
+        qpos=lambda: frame.source("qpos").float(),
+        qvel=lambda: frame.source("qvel").float(),
+        pos=lambda: frame.source("xpos")[:, 1:].float(),
+        quat=lambda: frame.source("xquat")[:, 1:].float(),
+        linvel=linvel,
+        angvel=lambda: frame.source("cvel")[:, 1:, :3].float(),
+        com=lambda: frame.source("subtree_com")[:, 1].float(),
+        local=lambda: frame.context.local(pose.qpos),
+        heading=lambda: heading_quat(pose.qpos[:, 3:7]),
+    )
+    return pose
+
+
+def ref(frame: Frame) -> Pose:
+    """What the goal asks for now."""
+    return frame.context.layout.unpacked(frame.source("goal"))
+
+
+def ahead(frame: Frame) -> Pose | None:
+    """What the goal asks for one control step later."""
+    return frame.context.layout.unpacked(frame.source("ahead"))
+
+
+def place(frame: Frame) -> Place:
+    """Where in its clip the goal is."""
+    return frame.context.layout.place(frame.source("goal"))
+
+
+def phase(frame: Frame) -> Tensor:
+    """Place in the clip, 0 to 1 `(N,)`."""
+    return frame.place.phase
+
+
+def min_height(frame: Frame) -> Tensor:
+    """The clip's lowest root height, m `(N,)`."""
+    return frame.place.low
+
+
+def residual(frame: Frame) -> Tensor:
+    """The last step's residual action, unscaled `(N, k)`."""
+    return frame.source("action")[:, frame.context.hinges :]
+
+
+def reg(frame: Frame) -> Tensor:
+    """The regularizer of the residual `(N,)`, 1 without help."""
+    kind: Residual | None = frame.context.residual
+    return torch.ones_like(frame.phase) if kind is None else kind.regularizer(frame.residual)
+
+
+def age(frame: Frame) -> Tensor | None:
+    """Control steps since the episode began `(N,)`."""
+    return frame.source("age")
+
+
+def torque(frame: Frame) -> Tensor | None:
+    """What servos and damping exert on each hinge at the end of the step, N m `(N, n)`."""
+    # The hinges' part of the generalized forces, after the root's six.
+    return (frame.source("qfrc_actuator") + frame.source("qfrc_damper"))[:, 6:].float()
+
+
+def point(frame: Frame) -> PointGoal | None:
+    """Where the reference's root is; the recovery plug-in says it."""
+    return None
+
+
+def sizes(frame: Frame) -> Tensor | None:
+    """Sizes of each character's body; the body assignment says them."""
+    return None
+
+
+#: All of the above by name.
+STANDARD = {
+    fn.__name__: fn
+    for fn in (sim, ref, ahead, place, phase, min_height, residual, reg, age, torque, point, sizes)
+}

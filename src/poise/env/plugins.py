@@ -1,0 +1,127 @@
+"""Plug-ins: parts of an environment that change where episodes begin, how they end, what is seen.
+
+An environment holds a tuple of them and names none. A plug-in overrides the hooks that it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from poise.env.bins import Outcomes
+from poise.env.frame import Frame, Observable
+
+if TYPE_CHECKING:
+    from poise.env.goals import Goal
+
+#: Coordinates of episodes' starts: qpos `(n, nq)` and qvel `(n, nv)`, float64.
+Start = tuple[Tensor, Tensor]
+
+
+@dataclass(eq=False)
+class Ended:
+    """What became of the episodes in one control step.
+
+    ids: `(n,)` worlds whose episodes end.
+    failed, terminated: `(N,)` bool.
+    counted: `(N,)` bool, worlds whose outcomes say something of where they are in their clips; None:
+    all.
+    """
+
+    ids: Tensor
+    failed: Tensor
+    terminated: Tensor
+    age: Tensor
+    goal: Goal
+    rows: Tensor
+    counted: Tensor | None
+
+    @cached_property
+    def bins(self) -> Outcomes:
+        """What the step says of the clips' motion bins."""
+        done = self.terminated & ~self.failed
+        seen = self.goal.outcomes(self.rows, self.age, self.failed, done)
+        return seen if self.counted is None else seen.of(self.counted)
+
+
+class Plugin:
+    """A part of an environment of N worlds; every hook may be left as it is."""
+
+    @property
+    def observables(self) -> Mapping[str, Observable]:
+        """Observables by name; they come before those of `env.observables`."""
+        return {}
+
+    def sources(self) -> Mapping[str, Tensor]:
+        """Tensors `(N, ...)` by name, for `Frame.source`; the same ones at every step."""
+        return {}
+
+    def assign(self, rows: Tensor | None, body: Tensor) -> None:
+        """Worlds `rows (n,)`, all for None, take the bodies `body (n,)`, before they are set down."""
+
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        """Changes where episodes begin in worlds `ids (n,)`, all for None.
+
+        kind: `(n,)`, what kind of episodes, in numbers of the plug-in; None begins ordinary ones.
+        """
+        return start
+
+    def kinds(self, count: int, rng: torch.Generator) -> Tensor | None:
+        """`(count,)` kinds of new episodes, or None where there are no kinds."""
+        return None
+
+    def held(self) -> Tensor | None:
+        """`(N,)` bool, worlds whose goals wait in the next step; None: no goal waits."""
+        return None
+
+    def targets(self, hinges: Tensor) -> Tensor:
+        """What additive actions add to, rad `(N, n)`, made of the goal's `hinges (N, n)`."""
+        return hinges
+
+    def tick(self) -> None:
+        """One control step has been made."""
+
+    def ends(self, frame: Frame, failed: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
+        """Which episodes failed and which did their clips to the end, both `(N,)` bool; recorded."""
+        return failed, done
+
+    def judged(self, ends: Tensor, ref: Tensor, late: Tensor, rng: torch.Generator | None) -> None:
+        """Notes, or takes back in place, what became of the episodes.
+
+        ends: `(3, N)` bool: failed, terminated, truncated.
+        ref: packed goals `(N, W)` of the step. late: `(N,)` bool, episodes whose time is over.
+        rng: draws which go on; None where none may.
+        """
+
+    def counted(self) -> Tensor | None:
+        """`(N,)` bool, worlds whose outcomes count for help and adaptive sampling; None: all."""
+        return None
+
+    def count(self, ended: Ended) -> None:
+        """Notes the outcomes of one control step, where episodes begin anew."""
+
+    def past(self, rows: Tensor) -> Tensor | None:
+        """`(n,)` bool of worlds `rows (n,)` that have no past in their clips; None: all have one."""
+        return None
+
+    def log(self) -> Mapping[str, Tensor]:
+        """For the log: `(N,)` float32 by name."""
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        """What `load_state` takes, by names that no other plug-in has."""
+        return {}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from `state()`, or as at first where it is not in there."""
+
+    def rows(self) -> dict[str, Tensor]:
+        """What it knows of each world, `(N, ...)` by name: tensors that a snapshot copies in place."""
+        return {}

@@ -1,0 +1,100 @@
+"""A guide leads whoever has lost the reference back to it, and lets alone who has not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_demonstrations import PLAIN, lively
+from torch import Tensor
+
+from poise.env import ImitationEnv
+from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
+from poise.jobs.perpetual.evaluation import bare_env
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import build
+from toy_library import tiny
+
+
+class Still:
+    """A policy that asks for nothing."""
+
+    def __init__(self, env: ImitationEnv):
+        self.env = env
+
+    def act(self, obs: Tensor) -> Tensor:
+        return torch.zeros(self.env.num_envs, self.env.num_actions)
+
+
+@pytest.fixture(scope="module")
+def made() -> Imitation:
+    return build(lively(), tiny(recovery=True, **PLAIN))
+
+
+class Puppets:
+    """Physics that put every character that does not fall where its goal is: a perfect tracker."""
+
+    def __init__(self, env: ImitationEnv, goal: LedGoal):
+        self.env, self.goal = env, goal
+        self.aside: torch.Tensor | None = None
+        env.backend.step = self.step  # type: ignore[method-assign]
+
+    def step(self, nstep: int = 1) -> None:
+        s, falls = self.env.backend.state, (self.goal.doing == FALLS).unsqueeze(-1)
+        qpos = torch.where(falls, s.qpos.double(), self.goal._coordinates(1))
+        if self.aside is not None:
+            qpos[:, :2] += self.aside
+            self.aside = None
+        self.env.backend.write(None, qpos, torch.zeros_like(s.qvel.double()))
+
+
+def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) -> None:
+    env, own = bare_env(made, 2, 0.0, 1, "cpu"), made.reference
+    clip = torch.tensor([own.names.index("walk")] * 2)
+    env.reset_to(clip, torch.zeros_like(clip))
+    assert made.recovery_clips is not None
+    goal = LedGoal(env.goal.clips, made.recovery_clips)
+    env.set_goal(goal)
+    world, seen, frames = Puppets(env, goal), [], []
+    for step in range(400):
+        seen.append(goal.doing.tolist())
+        frames.append(goal.frame.tolist())
+        if step > 4 and seen[-1][0] == TRACKS and frames[-1][0] > frames[5][0] + 5:
+            break
+        world.aside = torch.tensor([[2.0, 1.0], [0.0, 0.0]]) if step == 4 else None
+        env.step(torch.zeros(2, env.num_actions))
+    kinds = [k for (k, _), (before, _) in zip(seen[1:], seen, strict=False) if k != before]
+    assert kinds == [FALLS, RETURNS, TRACKS] and goal.lost == [(0, 5)]
+    # The other one is not touched: it goes on frame by frame, and stands where its clip ends.
+    assert all(k == TRACKS for _, k in seen)
+    assert [f for _, f in frames] == list(range(len(frames)))
+    # The clip waited all the while, and went on with its own next frame.
+    waited = [f for (f, _), (k, _) in zip(frames, seen, strict=True) if k == RETURNS]
+    assert len(set(waited)) == 1 and waited[0] >= 5
+    assert frames[-1][0] > waited[0] and torch.equal(env.clip, clip)
+    assert torch.equal(env.goal_pose().pos, own.gather(clip, goal.frame).pos)
+    env.close()
+
+
+def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imitation) -> None:
+    env = bare_env(made, 1, 0.0, 1, "cpu")
+    zero = torch.zeros(1, dtype=torch.long)
+    env.reset_to(zero, zero)
+    assert made.recovery_clips is not None
+    goal = LedGoal(env.goal.clips, made.recovery_clips)
+    qpos = env.backend.state.qpos.clone()
+    qpos[:, 0] += 3.0
+    env.backend.write(None, qpos, env.backend.state.qvel.clone())
+    goal.lead(zero, env.backend.state.qpos)
+    env.set_goal(goal)
+    assert goal.doing.tolist() == [RETURNS] and not goal.lost
+    world, doing = Puppets(env, goal), []
+    # Pushed off the motion, it waits for rest and begins another from where it is.
+    world.aside = torch.tensor([[0.0, 2.0]])
+    first = int(goal._first)
+    for _ in range(4):
+        env.step(torch.zeros(1, env.num_actions))
+        doing.append(int(goal.doing))
+    assert doing[:2] == [FALLS, RETURNS] and not goal.lost
+    # The table holds the new motion alone.
+    assert first == 0 and len(goal._packed) == int(goal._length) + int(goal._first)
+    env.close()
