@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from poise.jobs.perpetual.evaluation import ClipResults
+from poise.eval import ClipResults
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation

@@ -12,7 +12,8 @@ from poise.control import ExplicitResidual, ImplicitResidual, SuccessHelp
 from poise.env.terms import reward
 from poise.errors import PoiseError
 from poise.eval import run_episodes, start_frames
-from poise.jobs.runs import begin, reopen
+from poise.jobs.open import open_run
+from poise.jobs.runs import begin
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import config_of, most_help, paper, schedule
@@ -72,7 +73,7 @@ def test_a_run_folder_rebuilds_the_task(tmp_path):
     config = ResidualForce(num_envs=2, seed=5, body=BodyConfig(overrides=(("thigh.torque", 150.0),)))
     library = ClipLibrary((swing(speed=1.0, cyclic=True, name="walk"), swing(0.5, name="short")))
     first = begin(tmp_path, library, config)
-    again = reopen(tmp_path)
+    again = open_run(tmp_path).task
     assert again.config == config and again.library.names == ("walk", "short")
     assert again.humanoid.identity == first.humanoid.identity
     assert torch.equal(again.reference.qpos, first.reference.qpos)
@@ -82,8 +83,8 @@ def test_a_run_folder_rebuilds_the_task(tmp_path):
         begin(tmp_path, library, replace(config, seed=6))
     with pytest.raises(PoiseError, match=r"holds a run of other clips \(walk, short\)"):
         begin(tmp_path, ClipLibrary((swing(),)), config)
-    with pytest.raises(PoiseError, match="is no run folder"):
-        reopen(tmp_path / "nowhere")
+    with pytest.raises(PoiseError, match="there is no such file or folder"):
+        _ = open_run(tmp_path / "nowhere").task
 
 
 class Nothing:

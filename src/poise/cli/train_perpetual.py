@@ -47,11 +47,11 @@ def run(
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
     tracker = None
     if primitives.going_on is not None:
+        from poise.jobs.open import open_run
         from poise.jobs.perpetual.run import going_on
-        from poise.jobs.track.policy import open_tracker
 
         check_going_on(primitives, body, library)
-        tracker = open_tracker(primitives.going_on)
+        tracker = open_run(primitives.going_on).tracker
         # Whether --max-primitives has a say is known by the policy alone.
         returns = tracker.recovery_clips is not None
         check_going_on(primitives, body, library, returns)

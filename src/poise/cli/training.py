@@ -43,7 +43,7 @@ class Job:
 
     def start(self, comm: Comm) -> Imitation:
         """The task on every process: rank 0 begins the run, the others open its folder."""
-        from poise.jobs.runs import reopen
+        from poise.jobs.open import open_run
         from poise.learn.parallel import share_of, together
 
         with together(comm):
@@ -52,7 +52,7 @@ class Job:
                 share_of(self.training.config(self.body).num_envs, comm)
             imitation = self.begin() if comm.rank == 0 else None
         with together(comm):
-            return imitation or reopen(self.run)
+            return imitation or open_run(self.run).task
 
     def begin(self) -> Imitation:
         """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""

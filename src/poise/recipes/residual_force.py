@@ -38,9 +38,8 @@ from poise.env.terms import done, obs, reward
 from poise.kin import fit_humanoid
 from poise.kin.place import on_own_body
 from poise.learn import PPOConfig
-from poise.motion import Clip, ClipLibrary
-from poise.recipes.imitation import Imitation
-from poise.settings import Migration, from_data
+from poise.recipes.imitation import Clips, Imitation, as_library
+from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
 
@@ -84,6 +83,9 @@ class ResidualForce:
     body: BodyConfig = BodyConfig()
     sim: SimConfig = SimConfig()
     ppo: PPOConfig = PPOConfig(std=0.055, policy_lr=3e-4)
+
+    def __post_init__(self) -> None:
+        validate(self)
 
 
 def most_help(config: ResidualForce) -> float:
@@ -171,11 +173,10 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
     )
 
 
-def build(clips: Clip | ClipLibrary, config: ResidualForce | None = None) -> Imitation:
-    """Body, reference and task for a clip or a library; train with `.trainer()`."""
+def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
+    """Body, reference and task for a clip, a motion file or a library; train with `.trainer()`."""
     config = config or ResidualForce()
-    library = ClipLibrary.of(clips) if isinstance(clips, Clip) else clips
-    library, own = on_own_body(library, config.body)
+    library, own = on_own_body(as_library(clips), config.body)
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, own)
     config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)

@@ -42,7 +42,7 @@ from poise.motion.windows import FrameBank, step_contacts
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
-from poise.settings import from_data, to_data
+from poise.settings import from_data, to_data, validate
 from poise.spatial import normalize
 
 Contacts = Literal["harvey", "two-stage", "floor"]
@@ -82,6 +82,9 @@ class Inbetween:
     between_training: BetweenTraining = field(default_factory=BetweenTraining)
     rtn: RTNConfig = field(default_factory=RTNConfig)
     rtn_training: RTNTraining = field(default_factory=RTNTraining)
+
+    def __post_init__(self) -> None:
+        validate(self)
 
     @property
     def protocol(self) -> Protocol:

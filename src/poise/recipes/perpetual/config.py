@@ -12,7 +12,7 @@ from poise.errors import PoiseError
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
 from poise.plan import TrajOptConfig
 from poise.recipes.perpetual.shapes import BodyShapes
-from poise.settings import Migration, from_data
+from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped where who lies must be told from who leans.
@@ -50,6 +50,7 @@ class RecoveryPlan:
     enough: float = 0.98
 
     def __post_init__(self) -> None:
+        validate(self)
         if not 0 < self.share < 1 or not 0 < self.enough <= 1:
             what = f"share must lie in (0, 1) and enough in (0, 1], got {self.share} and {self.enough}"
             raise PoiseError(what, "RecoveryPlan")
@@ -160,6 +161,7 @@ class Perpetual:
     )
 
     def __post_init__(self) -> None:
+        validate(self)
         if self.max_primitives < 1:
             raise PoiseError(f"there must be at least 1 primitive, got {self.max_primitives}")
         first, last = self.shares
