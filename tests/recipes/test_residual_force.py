@@ -16,7 +16,7 @@ from poise.jobs.open import open_run
 from poise.jobs.runs import begin
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
-from poise.recipes.residual_force import config_of, most_help, paper, schedule
+from poise.recipes.residual_force import config_of, most_help, schedule
 from toy_human import swing
 
 
@@ -58,7 +58,7 @@ def test_methods_and_the_papers_own_setting():
     assert explicit.task.residual.limit_nm == 40.0 and explicit.task.residual.bodies[0] == 0
     plain = build(swing(), ResidualForce(method="deepmimic"))
     assert plain.task.residual is None and "residual" not in names(plain.task.rewards)
-    config = paper(ResidualForce())
+    config = ResidualForce.paper()
     assert (config.observation, config.action, config.done) == ("phase", "absolute", "height")
     faithful = build(swing(), config)
     assert names(faithful.task.dones) == ["root_too_low"] and faithful.task.pd.mode == "absolute"

@@ -87,7 +87,7 @@ def _rewards(config: Perpetual, recovers: bool) -> tuple[RewardTerm, ...]:
     rewards = phc_reward.imitation_terms(config.faithful)
     if config.energy:
         halved = config.style.task_weight if config.style else 1.0
-        rewards += (phc_reward.energy_term(halved, weight=config.energy),)
+        rewards += (phc_reward.energy_term(halved, config.energy_form, config.energy),)
     if config.help_start:
         rewards += (RewardTerm("residual", reward.residual, 0.1, imitation=False),)
     return recovery_terms(rewards, config.faithful) if recovers else rewards
