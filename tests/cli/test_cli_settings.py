@@ -23,11 +23,11 @@ KINDS: dict[str, Any] = {"residual-force": ResidualForce, "perpetual": Perpetual
 
 
 def imitates(*argv: str) -> ResidualForce:
-    return imitate.config_of(parse(imitate.Options, dotted(["a.bvh", "-o", "o", *argv]), "poise"))
+    return imitate.config_of(parse(imitate.Options, ["a.bvh", "-o", "o", *argv], "poise"))
 
 
 def trains(*argv: str) -> Any:
-    return train.config_of(parse(train.Options, dotted([*argv, "-o", "o"]), "poise train"))
+    return train.config_of(parse(train.Options, [*argv, "-o", "o"], "poise train"))
 
 
 @pytest.mark.parametrize("recipe", SOURCES)

@@ -108,10 +108,8 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         raise PoiseError(f"there is no command '{verb}'. {did_you_mean(verb, list(VERBS))}")
     from poise.cli.console import notes, say, tell
     from poise.cli.parse import parse
-    from poise.cli.settings import dotted
 
     module = import_module(f"poise.cli.{verb}")
-    rest = dotted(rest)
     # Who asks for the settings alone need name no files.
     blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
     options = parse(module.Options, rest, f"poise {verb}", blank)

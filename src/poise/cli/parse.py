@@ -16,6 +16,7 @@ from typing import Any, NoReturn, TypeVar
 
 import tyro
 
+from poise.cli.settings import dotted
 from poise.errors import PoiseError, did_you_mean
 
 T = TypeVar("T")
@@ -39,7 +40,7 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
 
     try:
         with _told(refuse), contextlib.redirect_stderr(io.StringIO()):
-            made = tyro.cli(options, prog=prog, args=list(argv), config=_CONFIG, default=default)
+            made = tyro.cli(options, prog=prog, args=dotted(argv), config=_CONFIG, default=default)
         assert made is not None
         return made
     except SystemExit as stop:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -166,7 +166,7 @@ def _preset_of(recipe: str, preset: str) -> Any:
     return preset_of(recipe, preset)
 
 
-def dotted(argv: list[str]) -> list[str]:
+def dotted(argv: Sequence[str]) -> list[str]:
     """A command line in which --ppo.policy-lr 1e-4 stands as --set ppo.policy-lr=1e-4."""
     out: list[str] = []
     rest: Iterator[str] = iter(argv)
