@@ -20,7 +20,7 @@ from poise.recipes.perpetual import build as build_perpetual
 from poise.recipes.perpetual.shapes import BodyShapes
 from poise.recipes.perpetual.task import stage_task
 from toy_human import swing
-from toy_library import library, rises, tiny
+from toy_library import PLAIN, library, lively, tiny
 
 STEPS = 50
 CLIPS = (swing(0.7, name="calm"), swing(0.6, speed=2.0, name="quick"))
@@ -131,7 +131,7 @@ def test_a_body_goes_with_its_world() -> None:
 
 
 def test_what_leads_back_and_what_displaces_are_copied_too() -> None:
-    made = build_perpetual(rises(), tiny(recovery=True, style=None, action="additive"))
+    made = build_perpetual(lively(), tiny(recovery=True, **PLAIN))
     assert made.recovery_clips is not None
     env = made.bare().env(3, auto_reset=False, threads=1, help_scale=0.0, guard=False)
     env.reset_to(torch.zeros(3, dtype=torch.long), torch.zeros(3, dtype=torch.long))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_demonstrations import PLAIN, lively
 from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
-from toy_library import tiny
+from toy_library import PLAIN, lively, tiny
 
 
 class Still:
