@@ -150,19 +150,10 @@ def base_of(recipe: str, default: T, preset: str | None, config: Path | None, ve
         raise PoiseError("--preset and --config both state all settings", hint="Leave one out")
     if config is not None:
         return from_toml(type(default), config, verb)
-    return default if preset is None else _preset_of(recipe, preset)
+    if preset is None:
+        return default
+    from poise.jobs.presets import preset_of
 
-
-def _preset_of(recipe: str, preset: str) -> Any:
-    try:
-        from poise.recipes import preset_of  # type: ignore[attr-defined]
-    except ImportError:
-        from poise.recipes.residual_force import ResidualForce, paper
-
-        if (recipe, preset) != ("residual-force", "paper"):
-            hint = "Known: paper, of residual-force"
-            raise PoiseError(f"the recipe {recipe} has no preset '{preset}'", hint=hint) from None
-        return paper(ResidualForce())
     return preset_of(recipe, preset)
 
 
