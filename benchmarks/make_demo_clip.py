@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from poise.jobs.deliver import simulated_clip
-from poise.jobs.runs import evaluate, reopen, trained_policy
+from poise.jobs.open import open_run
+from poise.jobs.runs import evaluate, trained_policy
 from poise.motion import Clip, Skeleton, resample
 from poise.motion.io import write_clip
 from poise.spatial import quat_conj, quat_mul, quat_rotate_inv
@@ -83,7 +84,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=Path("src/poise/data/walk.bvh"))
     args = parser.parse_args()
-    imitation = reopen(args.run)
+    imitation = open_run(args.run).task
     policy, meta = trained_policy(args.run, imitation)
     evaluation = evaluate(imitation, policy, meta)
     motion = resample(simulated_clip(imitation, evaluation), 30.0)

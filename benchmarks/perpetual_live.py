@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.eval.field_table import field_table
 from poise.jobs.library.files import motion_files_of
 from poise.jobs.track import TrackConfig, side_by_side, track
-from poise.jobs.track.crowd import crowd_env
+from poise.jobs.track.crowd import Crowd
 from poise.jobs.track.noise import robustness
 from poise.jobs.track.points import points_of
 from poise.motion import ClipLibrary
@@ -76,7 +76,8 @@ def crowd(run: Run, steps: int, count: int, threads: int) -> dict[str, Any]:
     if count > 1:
         task = side_by_side(task, count)
     before = torch.get_num_threads()
-    env = crowd_env(task, count)
+    backend = Crowd(task.humanoid, task.config.sim, count)
+    env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=backend)
     torch.set_num_threads(threads)
     clip, zero = torch.arange(count), torch.zeros(count, dtype=torch.long)
     last, spent, worked = int(task.reference.length[0]) - 1, [], 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
 from poise.errors import PoiseError
+from poise.eval import ClipResults
 from poise.eval.episodes import run_episodes
 from poise.eval.field_card import FieldTable
 from poise.eval.field_table import field_table
@@ -24,8 +25,8 @@ from poise.eval.rolloutset import RolloutSet
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.jobs.library.folder import library_of
-from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.perpetual.evaluation import ClipResults, bare_env, evaluate_clips
+from poise.jobs.open import open_run
+from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.runs import RUN_FILE
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
@@ -36,7 +37,6 @@ from poise.motion import Clip, ClipLibrary
 from poise.nets import Composer
 from poise.recipes.imitation import Imitation
 from poise.settings import to_data
-from poise.sim import make_backend
 
 Tell = Callable[[str], None]
 #: Frames of all episodes that are recorded at once, which bounds the memory of a table.
@@ -65,7 +65,7 @@ class Run:
             folder = folder / "run"
         if not (folder / RUN_FILE).exists():
             raise PoiseError(f"is no run folder: there is no {RUN_FILE} in it", folder)
-        imitation = perpetual_run.reopen(folder)
+        imitation = open_run(folder).task
         owner = None
         if (folder / LATEST).exists():
             owner = load_checkpoint(folder / LATEST)[0].get("ledger/owner")
@@ -209,7 +209,7 @@ def table(
 
     def make(worlds: int) -> ImitationEnv:
         # A world that goes bad after its character was lost is no reason to stop.
-        return bare_env(task, worlds, 0.0, threads, "cpu")
+        return task.bare().env(worlds, None, False, threads, help_scale=0.0, guard=False)
 
     return field_table(rollouts(), method=method, data=data)
 
@@ -245,10 +245,8 @@ def recovery(run: Run, kind: str, trials: int, threads: int) -> dict[str, Any]:
     task = trial_task(run.imitation.task, falls=trials, guided=recovery_clips is not None)
 
     def make(worlds: int) -> ImitationEnv:
-        backend = make_backend(humanoid.model, worlds, threads=threads)
-        env = ImitationEnv(reference, backend, task, config.sim.substeps, int(config.seed))
-        env.help.set(0.0)
-        return env
+        tried = replace(run.imitation, reference=reference, task=task)
+        return tried.env(worlds, None, False, threads, help_scale=0.0, guard=False)
 
     card = recovery_card(
         make, run.policy, trials, method=run.name, kinds=(kind,), recovery_clips=recovery_clips

@@ -14,7 +14,7 @@ from poise.env import Acts, ImitationEnv
 from poise.eval.episodes import run_episodes
 from poise.eval.field_table import field_table
 from poise.eval.rolloutset import RolloutSet
-from poise.jobs.perpetual.evaluation import bare_env, evaluate_clips
+from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.searching import replay, search
 from poise.plan import SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
@@ -42,7 +42,7 @@ def searched(
         tell(f"{name}: {f.reached} of {len(f.actions)} steps in {rows[-1]['seconds']:.0f} s")
 
     def make(worlds: int) -> ImitationEnv:
-        return bare_env(task, worlds, 0.0, 1, "cpu")
+        return task.bare().env(worlds, None, False, 1, help_scale=0.0, guard=False)
 
     def rollouts() -> Iterator[RolloutSet]:
         for c in clips:

@@ -14,18 +14,18 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from poise.body import BodyConfig
 from poise.jobs.runs import evaluate
 from poise.jobs.warm_start import clone_expert, finetuning
 from poise.learn import Trainer
 from poise.motion.io import read_clip
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, build, paper
+from poise.recipes.residual_force import ResidualForce, build
 from poise.sim import SimConfig
 from poise.view import line_plot
 
@@ -36,7 +36,10 @@ CLIP = ("cmu_amc/rfc/90_02.amc", "cmu_amc/rfc/08.asf")
 def settings(kind: str, seed: int) -> ResidualForce:
     """The compared settings; the paper's on the same physics."""
     ours = ResidualForce(help_limit=100.0, help_start=None, seed=seed, expert=kind == "expert")
-    return replace(paper(ours), sim=SimConfig(), done="bodies") if kind == "paper" else ours
+    if kind != "paper":
+        return ours
+    same = {"sim": SimConfig(), "body": BodyConfig(), "done": "bodies", "horizon": 300}
+    return ResidualForce.paper(seed=seed, residual_std=0.3, **same)
 
 
 def trainer_of(task: Imitation, threads: int) -> Trainer:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from poise.jobs.perpetual.evaluation import ClipResults
+from poise.eval import ClipResults
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, PolicyBundle, PPOConfig
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
@@ -31,6 +31,15 @@ def library() -> ClipLibrary:
         swing(0.8, speed=2.0, bend=1.0, name="turn"),
     ]
     return ClipLibrary.of(clips)
+
+
+#: Settings of a task that tracks alone, for `tiny`.
+PLAIN = {"style": None, "help_start": 0.0, "expert": False}
+
+
+def lively() -> ClipLibrary:
+    """A library with clips that walk and one that gets up."""
+    return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
 
 
 def tiny(**changes: object) -> Perpetual:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -84,8 +83,7 @@ def bench_gpu(
 
     def make() -> tuple[ImitationEnv, WarpBackend]:
         backend = WarpBackend(imitation.humanoid.model, num_envs, device)
-        task = replace(imitation.task, auto_reset=True)
-        return ImitationEnv(imitation.reference, backend, task, sim.substeps), backend
+        return imitation.env(seed=0, guard=False, backend=backend), backend
 
     env, backend = make()
     learner, _ = make()

@@ -5,15 +5,12 @@ from __future__ import annotations
 import statistics
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any
 
 import torch
 
-from poise.env import ImitationEnv
 from poise.learn import Policy
 from poise.recipes.imitation import Imitation
-from poise.sim import CpuBackend
 from speed.machine import Clock
 
 
@@ -27,10 +24,8 @@ def bench_latency(
     policy: None takes an untrained one of the recipe's size, which costs the same. helped: with
     residual forces; without, as a character runs that was trained to need none.
     """
-    task = replace(imitation.task, rewards=(), dones=(), auto_reset=False)
-    backend = CpuBackend(imitation.humanoid.model, 1, 1)
-    env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
-    env.help.set(1.0 if helped else 0.0)
+    task = imitation.bare(groups=True)
+    env = task.env(1, 0, False, 1, help_scale=1.0 if helped else 0.0, guard=False)
     if policy is None:
         trainer = imitation.trainer(threads=1)
         policy = trainer.policy()

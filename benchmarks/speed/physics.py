@@ -11,7 +11,8 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.eval import run_episodes, score_rollouts
-from poise.jobs.runs import help_left, reopen, trained_policy
+from poise.jobs.open import open_run
+from poise.jobs.runs import help_left, trained_policy
 from poise.jobs.warm_start import some_starts
 from poise.learn import PolicyBundle
 from poise.recipes.imitation import Imitation
@@ -33,7 +34,7 @@ def bench_physics(
     position servos, the third, with `stable_pd`, 450 Hz Euler with the paper's explicit stable PD
     (`control.stable_pd_torque`), which takes a linear solve per physics step.
     """
-    own = reopen(folder)
+    own = open_run(folder).task
     policy, meta = trained_policy(folder, own)
     limit, scale = help_left(own, meta)
     clip, frame = some_starts(own, starts)
@@ -57,13 +58,9 @@ def _servos(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]
 
 
 def _stable(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]:
-    task = replace(imitation.task, auto_reset=False)
-
     def make(n: int) -> ImitationEnv:
         backend = StablePDBackend(imitation.humanoid.model, n)
-        env = ImitationEnv(imitation.reference, backend, task, imitation.config.sim.substeps)
-        env.help.set(scale)
-        return env
+        return imitation.env(None, 0, False, help_scale=scale, guard=False, backend=backend)
 
     return make
 

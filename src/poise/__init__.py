@@ -1,3 +1,87 @@
-"""Poise gives any human motion a body: a clip in, the same motion physically simulated out."""
+"""Poise gives any human motion a body: a clip in, the same motion physically simulated out.
 
-__version__ = "0.1.0"
+    import poise
+
+    made = poise.imitate("walk.bvh", minutes=3)     # a policy is trained on the clip
+    tracked = poise.track("kick.bvh")               # by the policy that comes with Poise
+    filled = poise.inbetween("dance.bvh", (0, 30, 60))
+    made.card, made.clip, made.notes, made.save("out")
+    poise.open_run("out").evaluate(help_limit=0.0)
+
+What is heavy is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from poise.errors import PoiseError
+from poise.version import __version__
+
+if TYPE_CHECKING:
+    from poise.jobs.imitate import Imitated, imitate
+    from poise.jobs.inbetween import Inbetween
+    from poise.jobs.inbetween.fill import Inbetweened, inbetween
+    from poise.jobs.open import Run, open_run
+    from poise.jobs.track import TrackConfig, Tracked
+    from poise.jobs.track.clips import track_clip as track
+    from poise.motion import Clip, ClipLibrary
+    from poise.motion import read_clip as read
+    from poise.motion import write_clip as write
+    from poise.recipes import ResidualForce
+    from poise.recipes.perpetual import Perpetual
+
+#: Where each name of the face is; it has the same name there unless another one follows.
+_PLACES = {
+    "Clip": "poise.motion",
+    "ClipLibrary": "poise.motion",
+    "Imitated": "poise.jobs.imitate",
+    "Inbetween": "poise.jobs.inbetween",
+    "Inbetweened": "poise.jobs.inbetween.fill",
+    "Perpetual": "poise.recipes.perpetual",
+    "ResidualForce": "poise.recipes",
+    "Run": "poise.jobs.open",
+    "TrackConfig": "poise.jobs.track",
+    "Tracked": "poise.jobs.track",
+    "imitate": "poise.jobs.imitate",
+    "inbetween": "poise.jobs.inbetween.fill",
+    "open_run": "poise.jobs.open",
+    "read": "poise.motion:read_clip",
+    "track": "poise.jobs.track.clips:track_clip",
+    "write": "poise.motion:write_clip",
+}
+
+__all__ = [
+    "Clip",
+    "ClipLibrary",
+    "Imitated",
+    "Inbetween",
+    "Inbetweened",
+    "Perpetual",
+    "PoiseError",
+    "ResidualForce",
+    "Run",
+    "TrackConfig",
+    "Tracked",
+    "__version__",
+    "imitate",
+    "inbetween",
+    "open_run",
+    "read",
+    "track",
+    "write",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'poise' has no attribute '{name}'")
+    module, _, there = _PLACES[name].partition(":")
+    found = getattr(import_module(module), there or name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from poise.errors import PoiseError, did_you_mean
 
@@ -75,6 +75,70 @@ def from_data(kind: type[T], data: Any, where: Path | str | None = None) -> T:
     return _made(kind, data, "", where)
 
 
+def validate(config: Any) -> None:
+    """Refuses a settings object with a value that its fields cannot have; for `__post_init__`.
+
+    A `Literal` field must have one of its values, and a `seed` must fit the random generators.
+
+    Raises:
+        PoiseError: another value, with the nearest one that there is.
+    """
+    name = type(config).__name__
+    for f in fields(config):
+        value, known = getattr(config, f.name), _choices(_types(type(config))[f.name])
+        if known and value not in known:
+            texts = [str(k) for k in known]
+            raise PoiseError(
+                f"{f.name} cannot be {_short(value)}", name, did_you_mean(str(value)[:40], texts)
+            )
+        if f.name == "seed" and not (isinstance(value, int) and 0 <= value < 2**63):
+            raise PoiseError(f"seed must be a whole number from 0 to 2**63 - 1, got {value!r}", name)
+
+
+def changed(config: T, settings: Mapping[str, Any]) -> T:
+    """The settings with some of them changed.
+
+    Raises:
+        PoiseError: a setting that there is not, or a value that it cannot have.
+    """
+    known = [f.name for f in fields(config) if f.init]  # type: ignore[arg-type]
+    for name in settings:
+        if name not in known:
+            what = f"there is no setting '{name}'"
+            raise PoiseError(what, type(config).__name__, did_you_mean(name, known))
+    return dataclasses.replace(config, **settings)  # type: ignore[type-var]
+
+
+def _choices(kind: Any) -> tuple[Any, ...]:
+    """The values of a `Literal`, or of one that may be None; () where anything goes."""
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return args
+    if origin in (Union, UnionType):
+        own = [_choices(a) if a is not NoneType else (None,) for a in args]
+        return () if () in own else tuple(v for part in own for v in part)
+    return ()
+
+
+def check_data(kind: type, data: Any, where: Path | str | None = None, name: str = "") -> None:
+    """Refuses JSON data that is not as a `TypedDict` says; keys that it does not name are left alone.
+
+    Raises:
+        PoiseError: a key is missing, or a value is of another type.
+    """
+    if not isinstance(data, Mapping):
+        what = name or "what it says of itself"
+        raise PoiseError(f"{what} must be a table, got {_short(data)}", where)
+    inside = f" in {name}" if name else ""
+    missing = sorted(k for k in getattr(kind, "__required_keys__", ()) if k not in data)
+    if missing:
+        hint = "The file is damaged, or of another kind"
+        raise PoiseError(f"'{missing[0]}' is missing{inside}", where, hint)
+    for key, one in _types(kind).items():
+        if key in data:
+            _value(one, data[key], f"{name}.{key}" if name else key, where)
+
+
 def to_toml(config: Any) -> str:
     """The settings as TOML text, one table a part."""
     import tomli_w
@@ -105,7 +169,8 @@ def _types(kind: type) -> dict[str, Any]:
 
 def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:
     if not isinstance(data, Mapping):
-        raise PoiseError(f"{name or 'the settings'} must be a table of settings, got {data!r}", where)
+        what = name or "the settings"
+        raise PoiseError(f"{what} must be a table of settings, got {_short(data)}", where)
     types = {f.name: _types(kind)[f.name] for f in fields(kind) if f.init}
     unknown = [k for k in data if k not in types]
     if unknown:
@@ -113,7 +178,11 @@ def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:
         whole = f"{name}.{unknown[0]}" if name else str(unknown[0])
         raise PoiseError(f"there is no setting '{whole}' in this version of Poise", where, near)
     values = {k: _value(types[k], v, f"{name}.{k}" if name else k, where) for k, v in data.items()}
-    return kind(**values)
+    try:
+        return kind(**values)
+    except PoiseError as problem:
+        # What the settings refuse by themselves is told with the file.
+        raise PoiseError(problem.what, problem.where if where is None else where, problem.hint) from None
 
 
 def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
@@ -136,6 +205,11 @@ def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
         return value
     if is_dataclass(kind):
         return _made(kind, value, name, where)
+    if is_typeddict(kind):
+        check_data(kind, value, where, name)
+        return value
+    if origin is list and isinstance(value, list):
+        return [_value(args[0], v, f"{name}[{i}]", where) for i, v in enumerate(value)]
     if origin is tuple and isinstance(value, list | tuple):
         kinds = args[:1] * len(value) if len(args) == 2 and args[1] is ... else args
         if len(kinds) != len(value):
@@ -146,14 +220,22 @@ def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
         return value
     plain = origin or kind
     if not isinstance(value, plain) or (isinstance(value, bool) and plain is not bool):
-        raise PoiseError(f"{name} must be {_words(kind)}, got {value!r}", where)
+        raise PoiseError(f"{name} must be {_words(kind)}, got {_short(value)}", where)
     return value
+
+
+def _short(value: Any) -> str:
+    """A value of a file, of which not all is to be printed."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:56]} ..."
 
 
 def _words(kind: Any) -> str:
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
-    if get_origin(kind) is tuple:
+    if get_origin(kind) in (tuple, list):
         return "a list"
+    if get_origin(kind) is dict:
+        return "a table"
     return names.get(kind, f"a {getattr(kind, '__name__', kind)}")
 
 

@@ -10,7 +10,7 @@ import pytest
 from tiny_clips import deepmimic, put
 
 from poise.cli.main import main
-from poise.jobs.perpetual.run import reopen
+from poise.jobs.open import open_run
 from poise.learn import CloneConfig, PPOConfig
 from poise.recipes import perpetual
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
@@ -55,13 +55,13 @@ def test_a_run_goes_on_from_another_ones_policy(
     assert main(go_on) == 0
     before, after = (json.loads((x / "result.json").read_text()) for x in (first, then))
     assert after["samples"] > 0 and before["clips"] == after["clips"]
-    config = reopen(then).config
+    config = open_run(then).task.config
     assert config.seed == 3 and not config.multiplicative and not config.expert
     assert main([*go_on, "--resume"]) == 0
     capsys.readouterr()
     go_on[go_on.index(str(first))], go_on[go_on.index(str(then))] = "nothing", str(tmp_path / "none")
     assert main(go_on) == 2
-    assert "no such policy" in capsys.readouterr().err
+    assert "no such file or folder" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
@@ -139,7 +139,7 @@ def test_the_switches_reach_the_run(folder: Path, tmp_path: Path, capsys) -> Non
     assert main(command(folder, out, *more)) == 0
     said, told = capsys.readouterr()
     assert "Recovery, 2 trials each: fallen " in said and "single with recovery begins" in told
-    config = reopen(out).config
+    config = open_run(out).task.config
     assert (config.goal, config.multiplicative, config.termination) == ("keypoints", False, "all")
     assert config.method == "perpetual-plain" and config.recovery
     assert config.action == "absolute" and config.style is None
@@ -147,12 +147,12 @@ def test_the_switches_reach_the_run(folder: Path, tmp_path: Path, capsys) -> Non
     assert main(command(folder, out, *more, "--library-fps", "bend=15", "--resume")) == 2
     assert "a run on the library" in capsys.readouterr().err
     # Half as many frames a second last twice as long.
-    assert reopen(out).library.clips[1].seconds == pytest.approx(15 / 15)
+    assert open_run(out).task.library.clips[1].seconds == pytest.approx(15 / 15)
 
 
 def test_additive_actions_come_with_their_settings(folder: Path, tmp_path: Path) -> None:
     assert main(command(folder, tmp_path / "run", "--action", "additive", "--no-recovery")) == 0
-    config = reopen(tmp_path / "run").config
+    config = open_run(tmp_path / "run").task.config
     assert config.action == "additive" and config.convergence.patience == 12 and not config.recovery
 
 

@@ -12,6 +12,7 @@ from tiny_clips import deepmimic, put
 
 from poise.cli.answer import LOST
 from poise.cli.main import main
+from poise.jobs.open import open_run
 from poise.motion import read_clip, trim, write_clip
 from toy_policy import WALK, toy_run
 
@@ -60,8 +61,6 @@ def test_motion_score_and_report(
 def test_a_motion_that_is_lost_is_learned(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from poise.jobs.track.policy import open_tracker
-
     out = tmp_path / "made.bvh"
     argv = ["track", str(short), "--policy", str(file), "-o", str(out), "--threads", "1", "--learn"]
     before = file.read_bytes()
@@ -72,13 +71,13 @@ def test_a_motion_that_is_lost_is_learned(
     assert out.exists() and (tmp_path / "made/learned/policy.safetensors").exists()
     assert file.read_bytes() == before
     score = json.loads((tmp_path / "made/score.json").read_text())
-    about = open_tracker(tmp_path / "made/learned").about
-    assert score["samples"] == about["samples"] > open_tracker(file).about["samples"]
+    about = open_run(tmp_path / "made/learned").tracker.about
+    assert score["samples"] == about["samples"] > open_run(file).tracker.about["samples"]
     # A tiny network does not learn it in a second; more minutes go on.
     assert "--learn 0.04" in said.out
     # The results are those of its own run.
     assert main([*argv, "0.04"]) == LOST
-    assert open_tracker(tmp_path / "made/learned").about["samples"] > about["samples"]
+    assert open_run(tmp_path / "made/learned").tracker.about["samples"] > about["samples"]
 
 
 def test_a_motion_that_is_lost_is_looked_for(
@@ -151,7 +150,9 @@ def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.Capture
 def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, refused) -> None:
     out = str(tmp_path / "out")
     given = ("--policy", file, "-o", out)
-    refused("track", short, "--policy", tmp_path / "absent", "-o", out, words=("no such policy",))
+    refused(
+        "track", short, "--policy", tmp_path / "absent", "-o", out, words=("no such file or folder",)
+    )
     weights = run / "policy.safetensors"
     refused("track", short, "--policy", weights, "-o", out, words=("without the body", str(run)))
     refused("track", short, *given, "--noise", "jiter:1", words=("no noise 'jiter'", "'jitter'"))

@@ -12,7 +12,7 @@ import torch
 from poise.control import ExplicitResidual
 from poise.env import Reference
 from poise.errors import PoiseError
-from poise.eval import run_episodes, run_in_batches, score_rollouts, start_frames
+from poise.eval import run_episodes, run_in_batches, score_rollouts, simulate, start_frames
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
@@ -139,3 +139,26 @@ def test_batches_give_the_same_score_and_hold_few_frames():
     assert [c["clip"] for c in b.per_clip] == ["a", "b", "c"] and b.episodes == 4
     only = list(run_in_batches(make, policy, ref, clip, start))
     assert len(only) == 1 and torch.equal(only[0].pos, whole.pos) and torch.equal(only[0].clip, clip)
+
+
+def test_observers_watch_one_simulation_until_all_have_seen_enough():
+    class Watch:
+        def __init__(self, enough: int | None):
+            self.enough, self.seen = enough, []
+
+        def see(self, env, step):
+            self.seen.append((step, env.frame.tolist()))
+            return self.enough is not None and step >= self.enough
+
+    imitation = build(swing(speed=1.0), ResidualForce(method="deepmimic"))
+    env = imitation.env(2, auto_reset=False, threads=1)
+    policy = Always(torch.zeros(env.num_actions))
+    clip, start = torch.tensor([0, 0]), torch.tensor([0, 5])
+    one, two = Watch(2), Watch(4)
+    simulate(env, policy, env.reset_to(clip, start), 9, one, two)
+    # Before the first action, and after each step; the first one does not end the other.
+    assert one.seen == two.seen == [(t, [t, 5 + t]) for t in range(5)]
+    ever = Watch(None)
+    simulate(env, policy, env.reset_to(clip, start), 3, one, ever)
+    assert len(ever.seen) == 4
+    env.close()

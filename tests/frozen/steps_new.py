@@ -21,6 +21,7 @@ from poise.env.adaptive_sampling import AdaptiveSampling
 from poise.env.recovery.clock import RecoveryClock
 from poise.eval import read_score
 from poise.jobs.deliver import deliver
+from poise.jobs.open import open_run
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.demonstrations import odds, practised
 from poise.jobs.perpetual.progress import Stage
@@ -29,7 +30,6 @@ from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_poli
 from poise.jobs.track import TrackConfig, Tracked, imitation_of, track, write
 from poise.jobs.track.noise import noise_of
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import open_tracker
 from poise.learn import (
     AmpConfig,
     CloneConfig,
@@ -143,7 +143,7 @@ def environment(name: str) -> ImitationEnv:
     if name == "perpetual_style":
         return _env(build_perpetual(three(), tiny(style=STYLE, termination="code", energy=0.0005)))
     if name == "shipped":
-        tracker = open_tracker()
+        tracker = open_run().tracker
         made = imitation_of(tracker, [place(walk(), tracker)])
         return _env(made, cases.WORLDS)
     raise ValueError(name)
@@ -256,25 +256,25 @@ def aside(metres: float) -> Clip:
 
 
 def job_track(folder: Path) -> dict[str, np.ndarray]:
-    return _tracked(track(open_tracker(), walk()), folder)
+    return _tracked(track(open_run().tracker, walk()), folder)
 
 
 def job_track_search(folder: Path) -> dict[str, np.ndarray]:
     search = SamplingConfig(characters=64, retries=2, rounds=2)
-    done = track(open_tracker(), aside(0.6), TrackConfig(search=search, search_threads=1))
+    done = track(open_run().tracker, aside(0.6), TrackConfig(search=search, search_threads=1))
     assert done.found is not None and done.found.whole
     return _tracked(done, folder)
 
 
 def job_track_recover(folder: Path) -> dict[str, np.ndarray]:
-    done = track(open_tracker(), aside(2.0), TrackConfig(recover=True))
+    done = track(open_run().tracker, aside(2.0), TrackConfig(recover=True))
     assert done.losses is not None
     return _tracked(done, folder)
 
 
 def job_track_noise_crowd(folder: Path) -> dict[str, np.ndarray]:
     config = TrackConfig(noise=noise_of(("jitter:0.5",)), count=2, reset_on_fail=True)
-    done = track(open_tracker(), trim(walk(), 0, 50), config)
+    done = track(open_run().tracker, trim(walk(), 0, 50), config)
     return _tracked(done, folder)
 
 
@@ -332,7 +332,7 @@ def job_perpetual_run(folder: Path) -> dict[str, np.ndarray]:
 def job_perpetual_ways_run(folder: Path) -> dict[str, np.ndarray]:
     how = {"help_start": 0.0, "expert": False, "action": "additive", "recovery": True, "num_envs": 8}
     out = _perpetual(folder, lively(), tiny(**how), 10)
-    return out | _tracked(track(open_tracker(folder / "run"), walk(0, 40)), folder)
+    return out | _tracked(track(open_run(folder / "run").tracker, walk(0, 40)), folder)
 
 
 def job_verbs(folder: Path) -> dict[str, np.ndarray]:

@@ -9,29 +9,23 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.jobs.open import open_run
 from poise.jobs.perpetual.demonstrations import demonstrations, odds, practised
 from poise.jobs.perpetual.progress import Progress, Stage
 from poise.jobs.perpetual.recovery import try_recovery
-from poise.jobs.perpetual.run import Earlier, begin, going_on, reopen, resume, train
+from poise.jobs.perpetual.run import Earlier, begin, going_on, resume, train
 from poise.jobs.perpetual.stage_initialisation import Owners, staged
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
-from poise.jobs.track.policy import Tracker, load_tracker, policy_of_run, save_tracker
+from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
-from poise.motion import ClipLibrary
 from poise.nets import Composer
 from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.config import WIDE
 from toy_human import swing
-from toy_library import Scripted, library, rises, tiny
+from toy_library import PLAIN, Scripted, library, lively, tiny
 
-PLAIN = {"style": None, "help_start": 0.0, "expert": False}
 RECOVERY, COMPOSER = Stage("recovery", 2), Stage("composer", 3, mixed=True)
-
-
-def lively() -> ClipLibrary:
-    """A library of somebody who walks and somebody who gets up."""
-    return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
 
 
 def test_ways_are_clips_of_the_stages_that_recover() -> None:
@@ -74,7 +68,7 @@ def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     folder = tmp_path_factory.mktemp("first")
     config = tiny(single=True, action="additive", **PLAIN)
     train(begin(folder, lively(), config), folder, Until(iterations=2), None, 1, False)
-    return policy_of_run(folder)
+    return open_run(folder).tracker
 
 
 def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tmp_path: Path) -> None:
@@ -126,14 +120,14 @@ def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
     assert set(told) == {"single with recovery"} and done.recovery is not None
     assert {r.kind for r in done.recovery.rows} == {"fallen", "far", "fallen and far"}
     # What it knows of coming back goes with it.
-    learned = policy_of_run(run)
+    learned = open_run(run).tracker
     save_tracker(learned, tmp_path / "p.safetensors")
     kept = load_tracker(tmp_path / "p.safetensors").recovery_clips
     assert learned.recovery_clips is not None and kept is not None
     for name, value in learned.recovery_clips.state().items():
         assert torch.allclose(kept.state()[name], value, atol=1e-6)
-    again = try_recovery(reopen(run), learned.policy, 2, 1)
-    assert again.rows == try_recovery(reopen(run), learned.policy, 2, 1).rows
+    again = try_recovery(open_run(run).task, learned.policy, 2, 1)
+    assert again.rows == try_recovery(open_run(run).task, learned.policy, 2, 1).rows
 
 
 def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
@@ -185,15 +179,15 @@ def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
 def test_a_policy_that_fails_nothing_is_done(
     tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("judge", "result"):
-        path = f"poise.recipes.perpetual.{module}.evaluate_clips"
+    for module in ("stage_evaluation", "result"):
+        path = f"poise.jobs.perpetual.{module}.evaluate_clips"
         monkeypatch.setattr(path, Scripted(lambda *_: True))
     config = going_on(tracker.config, tiny(recovery=True), returns=True)
     went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
     own = begin(tmp_path, lively(), config, earlier=went)
     done = train(own, tmp_path, Until(iterations=8), None, 1, False, trained=tracker.policy)
     assert done.solved and done.last is None and done.recovery is not None
-    assert policy_of_run(tmp_path).recovery_clips is not None
+    assert open_run(tmp_path).tracker.recovery_clips is not None
 
 
 def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:

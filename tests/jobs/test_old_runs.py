@@ -18,13 +18,14 @@ import pytest
 import torch
 
 from poise.eval import ScoreCard
+from poise.jobs.open import open_run
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.recovery import try_recovery
-from poise.jobs.runs import evaluate, reopen, train, trained_policy
+from poise.jobs.runs import evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker, open_tracker
+from poise.jobs.track.policy import Tracker
 from poise.jobs.track.searching import replay, search
 from poise.learn import Until, load_checkpoint
 from poise.motion import read_clip, trim
@@ -43,18 +44,18 @@ Results = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 def imitation_results(name: str) -> Results:
     """The score card of a run from 8 of its start frames, and its first episode."""
-    task = reopen(OLD / name)
+    task = open_run(OLD / name).task
     done = evaluate(task, *trained_policy(OLD / name, task), most=8)
     return _figures(done.card), {"qpos": done.recordings[0].qpos}
 
 
 def perpetual_results(name: str) -> Results:
     """Every clip with the run's policy, recovery trials, and a motion tracked by it."""
-    task = perpetual_run.reopen(OLD / name)
+    task = open_run(OLD / name).task
     policy, _ = trained_policy(OLD / name, task)
     r = evaluate_clips(task, policy, threads=1)
     card = try_recovery(task, policy, 2, threads=1)
-    tracked = track(open_tracker(OLD / name), trim(read_clip(OLD / "walk.bvh"), 0, 40))
+    tracked = track(open_run(OLD / name).tracker, trim(read_clip(OLD / "walk.bvh"), 0, 40))
     found = {
         "succeeded": r.succeeded.tolist(),
         "tracked": r.tracked.tolist(),
@@ -68,13 +69,13 @@ def perpetual_results(name: str) -> Results:
 
 def tracker_results() -> Results:
     """The embedded walk with the shipped policy."""
-    done = track(open_tracker(TRACKER), read_clip(OLD / "walk.bvh"))
+    done = track(open_run(TRACKER).tracker, read_clip(OLD / "walk.bvh"))
     return _figures(done.evaluation.card), {"qpos": done.evaluation.recordings[0].qpos}
 
 
 def search_results() -> Results:
     """A walk that the shipped policy loses, looked for by 64 characters."""
-    done = _searched(open_tracker(TRACKER))
+    done = _searched(open_run(TRACKER).tracker)
     figures = {"whole": done.whole, "reached": done.reached, "tries": done.tries}
     return figures, {"actions": done.actions.numpy()}
 
@@ -146,7 +147,7 @@ def test_the_shipped_policy_does_the_walk_as_it_did(
 def test_a_motion_that_was_found_is_found_again_and_replays(
     expected: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> None:
-    tracker = open_tracker(TRACKER)
+    tracker = open_run(TRACKER).tracker
     clip = read_clip(OLD / "aside.bvh")
     assert track(tracker, clip, TrackConfig()).failures
     task = imitation_of(tracker, [place(clip, tracker)])
@@ -170,7 +171,7 @@ def replayed(tracker: Tracker, task: Any, actions: torch.Tensor) -> Any:
 @pytest.mark.parametrize("name", ["imitate", "explicit"])
 def test_an_imitation_run_goes_on(name: str, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(OLD / name, tmp_path / "run"))
-    result = train(reopen(folder), folder, Until(iterations=5), threads=1, tensorboard=False)
+    result = train(open_run(folder).task, folder, Until(iterations=5), threads=1, tensorboard=False)
     assert result.last is not None and result.last.iteration == 5
     assert math.isfinite(result.last.reward)
 

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv
-from poise.eval import run_episodes, score_rollouts
-from poise.jobs.perpetual import evaluation as perpetual_eval
-from poise.jobs.perpetual.evaluation import ClipResults, History, evaluate_clips
+from poise.eval import ClipResults, clip_results, run_episodes, score_rollouts
+from poise.jobs.perpetual.evaluation import History, evaluate_clips
 from poise.jobs.perpetual.stage_initialisation import Owners
 from poise.learn import PolicyBundle, compose, first_column, next_column
 from poise.learn.progressive import primitive
@@ -84,7 +83,7 @@ def test_a_world_that_goes_bad_has_failed_and_stops_nobody(
         # Clips are simulated in the order of their lengths, so this is the first one.
         return far.index_fill(0, torch.tensor([0]), torch.nan) if steps[0] >= 3 else far
 
-    monkeypatch.setattr(perpetual_eval, "mpjpe_global", without_one)
+    monkeypatch.setattr(clip_results, "mpjpe_global", without_one)
     bad = evaluate_clips(task, idle(task), None, 0.0, 1)
     assert not bool(bad.succeeded[0]) and int(bad.tracked[0]) == 3
     assert bool(bad.global_mm.isfinite().all()) and torch.equal(bad.global_mm[1:], whole.global_mm[1:])

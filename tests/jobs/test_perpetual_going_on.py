@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import Earlier, begin, going_on, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.track.policy import Tracker, export_policy, load_tracker, policy_of_run
+from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.spatial import quat_mul
@@ -27,7 +28,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file with the policy of a short run."""
     folder = tmp_path_factory.mktemp("first")
     train(begin(folder / "run", library(), ONE), folder / "run", Until(iterations=2), None, 1, False)
-    export_policy(folder / "run", folder / "policy.safetensors")
+    save_tracker(open_run(folder / "run").tracker, folder / "policy.safetensors")
     return folder / "policy.safetensors"
 
 
@@ -48,7 +49,7 @@ def test_it_begins_with_the_policys_weights_and_counts_its_cost(policy: Path, tm
     stages.iterate()
     stages.save()
     stages.close()
-    again = policy_of_run(tmp_path)
+    again = open_run(tmp_path).tracker
     assert again.about["samples"] == tracker.about["samples"] + stages.trainer.samples
     assert again.about["seconds"] > tracker.about["seconds"]
 
@@ -73,7 +74,7 @@ def test_a_larger_library_keeps_the_policys_body(policy: Path, tmp_path: Path) -
     rows = [replace(r, ranges=()) for r in wide]
     assert rows == [replace(r, ranges=()) for r in tracker.humanoid.table.rows]
     train(imitation, tmp_path, Until(iterations=1), None, 1, False, trained=tracker.policy)
-    again = policy_of_run(tmp_path)
+    again = open_run(tmp_path).tracker
     assert again.humanoid.identity == imitation.humanoid.identity
     assert again.about["samples"] > tracker.about["samples"]
 

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from poise.control import SuccessHelp
+from poise.eval import ClipResults
 from poise.jobs.perpetual import result, stage_evaluation
-from poise.jobs.perpetual.evaluation import ClipResults, evaluate_clips
+from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.run import begin
 from poise.jobs.perpetual.stage_record import StageRecord, mean_help
 from poise.jobs.perpetual.stage_trainer import StageTrainer

@@ -13,12 +13,13 @@ import torch
 from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import FALLEN, FAR
 from poise.errors import PoiseError
+from poise.eval import ClipResults
 from poise.jobs.library.folder import library_of
+from poise.jobs.open import open_run
 from poise.jobs.perpetual import recovery as perpetual_recovery
-from poise.jobs.perpetual.evaluation import ClipResults
 from poise.jobs.perpetual.progress import Progress, Stage
 from poise.jobs.perpetual.recovery import back, check_falls, try_recovery
-from poise.jobs.perpetual.run import begin, config_of, reopen, to_data, train
+from poise.jobs.perpetual.run import begin, config_of, to_data, train
 from poise.jobs.perpetual.stage_initialisation import Owners, staged
 from poise.jobs.perpetual.stage_record import RECOVERY_WORTH, StageRecord
 from poise.jobs.runs import FINAL, RUN_FILE
@@ -195,7 +196,7 @@ def test_a_policy_that_has_not_come_to_recovery_sees_no_point_goals(tmp_path: Pa
     config = tiny(recovery=True, expert=False, composer_clone=False)
     begun = begin(tmp_path, library(), config)
     train(begun, tmp_path, Until(iterations=20), lambda p: False, 1, False)
-    seen = reopen(tmp_path)
+    seen = open_run(tmp_path).task
     assert seen.task.recovery is None and not seen.config.recovery
     # Going on with the run is going on with recovery.
     assert begin(tmp_path, library(), config).task.recovery is not None

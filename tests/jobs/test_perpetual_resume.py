@@ -163,7 +163,7 @@ def test_settings_for_additive_actions() -> None:
 def test_settings_survive_json() -> None:
     for config in (tiny(), tiny(style=None, lateral=True, start="random"), Perpetual()):
         assert config_of(to_data(config)) == config
-    with pytest.raises(PoiseError, match="another version"):
+    with pytest.raises(PoiseError, match="there is no setting 'colour'"):
         config_of(to_data(Perpetual()) | {"colour": 3})
 
 

@@ -10,17 +10,18 @@ import pytest
 from poise.env import Reference
 from poise.eval.recovery import KINDS
 from poise.jobs.library.files import subject_of
+from poise.jobs.open import open_run
 from poise.jobs.perpetual.recovery import try_recovery
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import SHIPPED, Tracker, open_tracker
+from poise.jobs.track.policy import SHIPPED, Tracker
 from poise.motion import read_clip
 from toy_policy import WALK
 
 
 @pytest.fixture(scope="module")
 def tracker() -> Tracker:
-    return open_tracker()
+    return open_run().tracker
 
 
 def test_it_is_small_and_says_what_it_learned(tracker: Tracker) -> None:

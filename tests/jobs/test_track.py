@@ -14,11 +14,12 @@ import torch
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
 from poise.eval import Recording, run_episodes, score_rollouts
+from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
 from poise.jobs.track import Keeper, TrackConfig, check_fits, imitation_of, track, write
 from poise.jobs.track.placement import home, place
 from poise.jobs.track.points import points_of
-from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.jobs.track.policy import Tracker
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, read_clip
 from poise.motion.io.raw import ReadOptions as Options
@@ -32,12 +33,12 @@ from toy_policy import toy_run, walk
 
 @pytest.fixture(scope="module")
 def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+    return open_run(toy_run(tmp_path_factory.mktemp("run"))).tracker
 
 
 @pytest.fixture(scope="module")
 def pointed(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("points"), "keypoints"))
+    return open_run(toy_run(tmp_path_factory.mktemp("points"), "keypoints")).tracker
 
 
 def points(clip: Clip) -> Keypoints:
@@ -128,8 +129,7 @@ def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
     placed = [place(walk(0, 40), tracker), place(walk(20, 60), tracker)]
     imitation = imitation_of(tracker, placed)
     env = imitation.env(2, auto_reset=False, threads=1, help_scale=0.0)
-    keeper = Keeper(tracker.policy, True)
-    keeper.env = env
+    keeper = Keeper(env, tracker.policy, True)
     try:
         obs = env.reset_to(torch.tensor([0, 1]), torch.zeros(2, dtype=torch.long))
         for _ in range(3):

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track, write
 from poise.jobs.track.crowd import APART_M, Crowd, crowd_model, places
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.jobs.track.policy import Tracker
 from poise.motion import read_clip
 from poise.sim import CpuBackend
 from toy_human import swing
@@ -21,7 +22,7 @@ from toy_policy import toy_run, walk
 
 @pytest.fixture(scope="module")
 def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+    return open_run(toy_run(tmp_path_factory.mktemp("run"))).tracker
 
 
 def test_places() -> None:

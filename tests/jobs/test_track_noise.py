@@ -9,16 +9,17 @@ from pathlib import Path
 import pytest
 
 from poise.errors import PoiseError
+from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.noise import KINDS, Robustness, Rung, noise_of, robustness, write_robustness
-from poise.jobs.track.policy import Tracker, policy_of_run
+from poise.jobs.track.policy import Tracker
 from poise.motion.noise import VIDEO, Drift, FrameLoss, Jitter, Level, robustness_levels
 from toy_policy import toy_run, walk
 
 
 @pytest.fixture(scope="module")
 def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+    return open_run(toy_run(tmp_path_factory.mktemp("run"))).tracker
 
 
 def test_noise_by_name() -> None:

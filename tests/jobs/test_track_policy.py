@@ -13,14 +13,13 @@ import torch
 
 from poise.errors import PoiseError
 from poise.jobs import runs
+from poise.jobs.open import open_run
 from poise.jobs.track import policy as track_policy
 from poise.jobs.track.policy import (
     KIND,
     Tracker,
-    export_policy,
     load_tracker,
-    open_tracker,
-    policy_of_run,
+    save_tracker,
 )
 from poise.learn import load_checkpoint, save_checkpoint
 from poise.recipes import ResidualForce
@@ -34,18 +33,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def tracker(run: Path) -> Tracker:
-    return policy_of_run(run)
+    return open_run(run).tracker
 
 
 @pytest.fixture(scope="module")
 def file(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("file") / "policy.safetensors"
-    export_policy(run, path)
+    save_tracker(open_run(run).tracker, path)
     return path
 
 
 def test_the_body_comes_back_exactly_and_actions_to_half_precision(tracker: Tracker, file: Path) -> None:
-    back = open_tracker(file)
+    back = open_run(file).tracker
     assert back.humanoid.table == tracker.humanoid.table
     assert back.humanoid.identity == tracker.humanoid.identity and back.config == tracker.config
     assert back.about == json.loads(json.dumps(dict(tracker.about)))
@@ -78,13 +77,13 @@ def test_the_policy_that_comes_with_poise_is_sought_among_its_data() -> None:
 
 def test_files_of_another_kind(run: Path, file: Path, tmp_path: Path) -> None:
     for path, words in (
-        (tmp_path / "absent", "there is no such policy"),
+        (tmp_path / "absent", "there is no such file or folder"),
         (tmp_path, "is no run folder"),
         (run / "policy.safetensors", "weights without the body .* Give the folder"),
-        (run / "run.safetensors", "a run's clips and settings"),
+        (run / "run.safetensors", "a run's clips and settings alone"),
     ):
         with pytest.raises(PoiseError, match=words):
-            open_tracker(path)
+            _ = open_run(path).tracker
     data = bytearray(file.read_bytes())
     data[-3] ^= 1
     (tmp_path / "damaged").write_bytes(data)
@@ -99,15 +98,15 @@ def test_other_versions_and_other_bodies(file: Path, tmp_path: Path) -> None:
     tensors, meta = load_checkpoint(file)
     path = tmp_path / "other.safetensors"
     config = meta["config"]
-    for change in (
-        {"tracker": 99},
-        {"config": {**config, "unheard_of": 1}},
-        {"policy": {**meta["policy"], "kind": "unheard of"}},
-        {"num_obs": 7},
-        {"table": {**meta["table"], "unheard_of": 1}},
+    for change, words in (
+        ({"tracker": 99}, "does not fit this version"),
+        ({"config": {**config, "unheard_of": 1}}, "there is no setting 'unheard_of'"),
+        ({"policy": {**meta["policy"], "kind": "unheard of"}}, "the kind 'unheard of' is unknown"),
+        ({"num_obs": 7}, "in the saved state where"),
+        ({"table": {**meta["table"], "unheard_of": 1}}, "does not fit this version"),
     ):
         save_checkpoint(path, tensors, {**meta, **change})
-        with pytest.raises(PoiseError, match="does not fit this version") as problem:
+        with pytest.raises(PoiseError, match=words) as problem:
             load_tracker(path)
         assert "\n" not in str(problem.value)
     save_checkpoint(path, tensors, {**meta, "character": "0123"})
@@ -122,7 +121,7 @@ def test_a_run_that_knows_one_clip_only(tmp_path: Path) -> None:
     # The folder of a result leads to its run.
     for folder in (tmp_path, tmp_path / "run"):
         with pytest.raises(PoiseError, match="only the clips that it was trained on"):
-            open_tracker(folder)
+            _ = open_run(folder).tracker
 
 
 def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
@@ -132,14 +131,14 @@ def test_an_untrained_run(tracker: Tracker, tmp_path: Path) -> None:
     config = replace(tracker.config, seed=3)
     perpetual_run.begin(tmp_path, ClipLibrary.of([walk(0, 20), walk(20, 40, "b")]), config)
     with pytest.raises(PoiseError, match="nothing has been trained"):
-        open_tracker(tmp_path)
+        _ = open_run(tmp_path).tracker
 
 
 def test_a_program_that_only_tracks_starts_without_heavy_packages(file: Path) -> None:
     """They would take longer to import than the policy takes to open."""
     code = (
         "import sys; from pathlib import Path; import poise.jobs.track; "
-        "from poise.jobs.track.policy import open_tracker; open_tracker(Path(sys.argv[1])); "
+        "from poise.jobs.open import open_run; _ = open_run(Path(sys.argv[1])).tracker; "
         "print([m for m in ('sympy', 'scipy.optimize', 'scipy.spatial') if m in sys.modules])"
     )
     command = [sys.executable, "-c", code, str(file)]

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker, load_tracker, open_tracker, policy_of_run, save_tracker
+from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
 from poise.jobs.track.searching import replay, search
 from poise.motion import read_clip
 from poise.plan import SamplingConfig
@@ -24,7 +25,7 @@ FEW = SamplingConfig(characters=32, retries=1)
 @pytest.fixture(scope="module")
 def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     """A policy that hardly stands."""
-    return policy_of_run(toy_run(tmp_path_factory.mktemp("run")))
+    return open_run(toy_run(tmp_path_factory.mktemp("run"))).tracker
 
 
 def test_what_is_found_is_one_simulation(tracker: Tracker) -> None:
@@ -103,13 +104,13 @@ def test_bad_settings_are_refused() -> None:
 
 
 def test_a_motion_that_is_not_lost_is_not_searched() -> None:
-    tracked = track(open_tracker(), walk(), TrackConfig(search=FEW))
+    tracked = track(open_run().tracker, walk(), TrackConfig(search=FEW))
     assert tracked.found is None and not tracked.failures
 
 
 def test_a_kick_that_the_policy_loses_is_found(data_dir: Path) -> None:
     clip = read_clip(data_dir / "deepmimic_txt/humanoid3d_spinkick.txt")
-    tracked = track(open_tracker(), clip, TrackConfig(search=SamplingConfig()))
+    tracked = track(open_run().tracker, clip, TrackConfig(search=SamplingConfig()))
     assert tracked.found is not None and tracked.found.whole
     card = tracked.evaluation.card
     assert not tracked.failures and card.succ == 1.0 and card.help.limit_n == 0.0

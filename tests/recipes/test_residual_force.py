@@ -12,10 +12,11 @@ from poise.control import ExplicitResidual, ImplicitResidual, SuccessHelp
 from poise.env.terms import reward
 from poise.errors import PoiseError
 from poise.eval import run_episodes, start_frames
-from poise.jobs.runs import begin, reopen
+from poise.jobs.open import open_run
+from poise.jobs.runs import begin
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
-from poise.recipes.residual_force import config_of, most_help, paper, schedule
+from poise.recipes.residual_force import config_of, most_help, schedule
 from toy_human import swing
 
 
@@ -57,7 +58,7 @@ def test_methods_and_the_papers_own_setting():
     assert explicit.task.residual.limit_nm == 40.0 and explicit.task.residual.bodies[0] == 0
     plain = build(swing(), ResidualForce(method="deepmimic"))
     assert plain.task.residual is None and "residual" not in names(plain.task.rewards)
-    config = paper(ResidualForce())
+    config = ResidualForce.paper()
     assert (config.observation, config.action, config.done) == ("phase", "absolute", "height")
     faithful = build(swing(), config)
     assert names(faithful.task.dones) == ["root_too_low"] and faithful.task.pd.mode == "absolute"
@@ -72,7 +73,7 @@ def test_a_run_folder_rebuilds_the_task(tmp_path):
     config = ResidualForce(num_envs=2, seed=5, body=BodyConfig(overrides=(("thigh.torque", 150.0),)))
     library = ClipLibrary((swing(speed=1.0, cyclic=True, name="walk"), swing(0.5, name="short")))
     first = begin(tmp_path, library, config)
-    again = reopen(tmp_path)
+    again = open_run(tmp_path).task
     assert again.config == config and again.library.names == ("walk", "short")
     assert again.humanoid.identity == first.humanoid.identity
     assert torch.equal(again.reference.qpos, first.reference.qpos)
@@ -82,8 +83,8 @@ def test_a_run_folder_rebuilds_the_task(tmp_path):
         begin(tmp_path, library, replace(config, seed=6))
     with pytest.raises(PoiseError, match=r"holds a run of other clips \(walk, short\)"):
         begin(tmp_path, ClipLibrary((swing(),)), config)
-    with pytest.raises(PoiseError, match="is no run folder"):
-        reopen(tmp_path / "nowhere")
+    with pytest.raises(PoiseError, match="there is no such file or folder"):
+        _ = open_run(tmp_path / "nowhere").task
 
 
 class Nothing:

@@ -36,12 +36,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
     check_device(options.device)
     folder = run_folder(options.run)
-    from poise.jobs.runs import reopen, score, trained_policy
+    from poise.jobs.open import open_run
 
     with working("simulating every start frame"):
-        imitation = reopen(folder)
-        policy, meta = trained_policy(folder, imitation)
         o = options
-        card = score(imitation, policy, meta, o.rule, o.help_limit, o.device)
+        card = open_run(folder).score(o.rule, o.help_limit, o.device)
     print_card(card)
     return Answer(card.to_dict())

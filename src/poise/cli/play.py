@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -17,8 +17,6 @@ from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
 
 if TYPE_CHECKING:
-    from poise.jobs.runs import Evaluation
-    from poise.learn import Policy
     from poise.recipes.imitation import Imitation
 
 
@@ -48,19 +46,17 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if options.out is not None:
         may_write(options.out, options.force)
     from poise.jobs.deliver import make_report
-    from poise.jobs.runs import learning_curve, reopen, trained_policy
+    from poise.jobs.open import open_run
     from poise.view import write_report
 
     with working("simulating"):
-        imitation = reopen(folder)
-        clip, frame = _place(imitation, options.clip, options.start)
-        policy, meta = trained_policy(folder, imitation)
-        episode = _episode(imitation, policy, meta, clip, frame)
+        run = open_run(folder)
+        clip, frame = _place(run.task, options.clip, options.start)
         page = options.out or folder / "play.html"
-        write_report(make_report(imitation, episode, learning_curve(folder)), page)
+        write_report(make_report(run.task, run.episode(clip, frame), run.curve), page)
     if options.open and not webbrowser.open(page.absolute().as_uri()):
         raise PoiseError("no browser could be opened", page, "Open the page by hand")
-    clip_name = imitation.library.names[clip]
+    clip_name = run.task.library.names[clip]
     return Answer({"clip": clip_name, "start": options.start}, {"page": page})
 
 
@@ -79,27 +75,3 @@ def _place(imitation: Imitation, name: str | None, start: int) -> tuple[int, int
     # needs at least one step.
     frame = round(start / clip.fps * imitation.reference.rate_hz)
     return index, min(frame, int(imitation.reference.length[index]) - 2)
-
-
-def _episode(
-    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], clip: int, frame: int
-) -> Evaluation:
-    """One episode as an evaluation of its own."""
-    import torch
-
-    from poise.eval import run_episodes, score_rollouts
-    from poise.jobs.runs import Evaluation, help_left
-
-    config = imitation.config
-    limit, scale = help_left(imitation, meta)
-    rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False, help_scale=scale),
-        policy,
-        torch.tensor([clip]),
-        torch.tensor([frame]),
-        limit,
-        limit,
-    )
-    trained = {"seconds": float(meta.get("seconds", 0.0)), "samples": int(meta.get("samples", 0))}
-    card = score_rollouts(rollouts, method=config.method, seed=config.seed, **trained)
-    return Evaluation(card, rollouts, recordings)

@@ -84,11 +84,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         return track_one(o)
     if o.save_policy is not None:
         raise PoiseError("--save-policy is for one motion", hint="Leave it out")
-    from poise.jobs.track.policy import open_tracker
+    from poise.jobs.open import open_run
 
     with claimed(o.out):
         with working("opening the policy"):
-            tracker = open_tracker(o.policy)
+            tracker = open_run(o.policy).tracker
 
         def one(path: Path, name: str) -> Answer:
             return track_one(replace(o, clip=path, out=o.out / name), tracker, o.out / name)
@@ -128,15 +128,16 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         may_write(o.save_policy, o.force)
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
+    from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, track, write
     from poise.jobs.track.noise import noise_of
-    from poise.jobs.track.policy import open_tracker, save_tracker
+    from poise.jobs.track.policy import save_tracker
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
     if tracker is None:
         with working("opening the policy"):
-            tracker = open_tracker(o.policy)
+            tracker = open_run(o.policy).tracker
     config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
     config = replace(config, search=searches(o), search_threads=o.threads)
     with claimed(out):

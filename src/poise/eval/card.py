@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from poise import __version__
 from poise.errors import PoiseError
+from poise.version import __version__
 
 NAN = float("nan")
 Weighting = Literal["frame", "episode"]

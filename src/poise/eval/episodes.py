@@ -1,9 +1,14 @@
-"""Runs a policy from given start frames and records what the score card needs."""
+"""Runs a policy from given start frames: one loop, and observers that keep what an evaluation needs.
+
+obs = env.reset_to(clip, start)
+simulate(env, policy, obs, steps, Recorder(env, clip, start), ...)
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,6 +21,32 @@ from poise.kin.solids import shapes_of
 
 #: Frames of a part of rollouts: 110 MB of 20 bodies.
 PADDED = 100_000
+
+
+class Observer(Protocol):
+    """Watches episodes that are simulated side by side."""
+
+    def see(self, env: ImitationEnv, step: int) -> bool | None:
+        """The worlds after control step `step`, 0 before the first action; True: it has seen enough."""
+        ...
+
+
+def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observers: Observer) -> None:
+    """Lets a policy act in all worlds from where they stand, for `steps` control steps or until every
+    observer has seen enough.
+
+    Args:
+        env: without automatic reset; whoever made it closes it.
+        policy: acts on raw observations, deterministically.
+        obs: `(N, O)` of the worlds as they stand, from `env.reset_to`.
+    """
+    for observer in observers:
+        observer.see(env, 0)
+    for t in range(1, steps + 1):
+        obs = env.step(policy.act(obs)).final_obs
+        # Every one of them is asked, whatever the others say.
+        if all([observer.see(env, t) for observer in observers]):
+            return
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +75,13 @@ def start_frames(reference: Reference, most_frames: int = 40_000) -> tuple[Tenso
     return torch.cat(clips), torch.cat(frames)
 
 
+def frames_from(reference: Reference, clip: Tensor, start: Tensor, cycles: int = 2) -> Tensor:
+    """`(E,)` frames of each episode to the end of its clip, the start included; cyclic clips are done
+    `cycles` times."""
+    rounds = torch.where(reference.cyclic.cpu()[clip], cycles, 1)
+    return (reference.length.cpu()[clip] - 1) * rounds - start + 1
+
+
 def run_episodes(
     make_env: Callable[[int], ImitationEnv],
     policy: Acts,
@@ -64,61 +102,29 @@ def run_episodes(
         the padded rollouts (frame 0 is the start itself, before any action) and, for each clip's
         earliest start, the generalized coordinates.
     """
-    if clip.shape != start.shape or clip.ndim != 1 or not len(clip):
-        raise PoiseError(
-            f"an evaluation needs clip and start of one length, got {tuple(clip.shape)} and "
-            f"{tuple(start.shape)}"
-        )
+    _check_starts(clip, start)
     env = make_env(len(clip))
-    # The score card works on the CPU, wherever the worlds are.
-    ref = env.reference.to(torch.device("cpu"))
-    rounds = torch.where(ref.cyclic[clip], cycles, 1)
-    lengths = (ref.length[clip] - 1) * rounds - start + 1
-    total = int(lengths.max())
+    try:
+        return record(env, policy, clip, start, limit_n, limit_nm, cycles)
+    finally:
+        env.close()
+
+
+def record(
+    env: ImitationEnv,
+    policy: Acts,
+    clip: Tensor,
+    start: Tensor,
+    limit_n: float = 0.0,
+    limit_nm: float = 0.0,
+    cycles: int = 2,
+) -> tuple[RolloutSet, list[Recording]]:
+    """`run_episodes` in an environment of as many worlds as there are episodes, which stays open."""
+    _check_starts(clip, start)
     obs = env.reset_to(clip, start)
-    first = {int(c): int((clip == c).nonzero()[start[clip == c].argmin()]) for c in clip.unique()}
-    kept: list[Tensor] = []
-    store = _Store(env, len(clip), total)
-    store.add(0, env)
-    kept.append(env.backend.state.qpos[list(first.values())].clone())
-    for t in range(1, total):
-        step = env.step(policy.act(obs))
-        obs = step.final_obs
-        store.add(t, env)
-        kept.append(env.backend.state.qpos[list(first.values())].clone())
-    qpos = torch.stack(kept, 1).double().cpu().numpy()
-    recordings = [
-        Recording(c, int(start[row]), qpos[k, : int(lengths[row])], row)
-        for k, (c, row) in enumerate(first.items())
-    ]
-    alive = torch.arange(total) < lengths[:, None]
-    humanoid = ref.humanoid
-    rollouts = RolloutSet(
-        pos=store.tensors["pos"],
-        quat=store.tensors["quat"],
-        ref_pos=store.tensors["ref_pos"],
-        ref_quat=store.tensors["ref_quat"],
-        force=store.tensors["force"],
-        torque=store.tensors["torque"],
-        point_vel=store.tensors["point_vel"],
-        ang_vel=store.tensors["ang_vel"],
-        alive=alive,
-        lengths=lengths,
-        reached_end=torch.ones(len(clip), dtype=torch.bool),
-        reward=store.reward,
-        clip=clip,
-        start=start,
-        clip_names=ref.names,
-        fps=ref.rate_hz,
-        mass=humanoid.mass,
-        feet=humanoid.feet,
-        shapes=shapes_of(humanoid.table, torch.float32),
-        limit_n=limit_n,
-        limit_nm=limit_nm,
-        ref_min_height=ref.min_height[clip],
-    )
-    env.close()
-    return rollouts, recordings
+    recorder = Recorder(env, clip, start, cycles)
+    simulate(env, policy, obs, recorder.total - 1, recorder)
+    return recorder.rollouts(limit_n, limit_nm), recorder.recordings()
 
 
 def run_in_batches(
@@ -141,8 +147,7 @@ def run_in_batches(
         reference: the clips, as the environments have them.
         most: frames of a part, with the padding.
     """
-    rounds = torch.where(reference.cyclic.cpu()[clip], cycles, 1)
-    length = (reference.length.cpu()[clip] - 1) * rounds - start + 1
+    length = frames_from(reference, clip, start, cycles)
     order = torch.arange(len(clip))
     if len(clip) * int(length.max()) > most:
         order = length.argsort(stable=True)
@@ -153,28 +158,44 @@ def run_in_batches(
         yield run_episodes(make_env, policy, clip[rows], start[rows], limit_n, limit_nm, cycles)[0]
 
 
-class _Store:
-    """Preallocated float32 recordings of E episodes over T frames."""
+class Recorder:
+    """Records E episodes over T frames on the CPU, float32: what the score card needs.
 
-    def __init__(self, env: ImitationEnv, episodes: int, total: int):
-        bodies = len(env.reference.humanoid.bodies)
+    total: T, the frames of the longest episode. tensors: by the names of `RolloutSet`.
+    """
+
+    def __init__(self, env: ImitationEnv, clip: Tensor, start: Tensor, cycles: int = 2):
+        # The score card works on the CPU, wherever the worlds are.
+        self.reference = ref = env.reference.to(torch.device("cpu"))
+        self.clip, self.start = clip, start
+        self.lengths = frames_from(ref, clip, start, cycles)
+        self.total = int(self.lengths.max())
+        bodies = len(ref.humanoid.bodies)
         helped = getattr(env.task.residual, "bodies", (0,))
         sizes = {
             **{k: (bodies, 3) for k in ("pos", "ref_pos")},
             **{k: (bodies, 4) for k in ("quat", "ref_quat")},
             **{k: (len(helped), 3) for k in ("force", "torque", "point_vel", "ang_vel")},
         }
-        self.tensors = {k: torch.zeros(episodes, total, *size) for k, size in sizes.items()}
-        names = [t.name for t in env.task.rewards] + ["total"]
-        self.reward = {name: torch.zeros(episodes, total) for name in names}
+        many = len(clip), self.total
+        self.tensors = {k: torch.zeros(*many, *size) for k, size in sizes.items()}
+        self.reward = {n: torch.zeros(many) for n in [*(t.name for t in env.task.rewards), "total"]}
+        # The earliest episode of each clip is kept whole.
+        self._first = {
+            int(c): int((clip == c).nonzero()[start[clip == c].argmin()]) for c in clip.unique()
+        }
+        self._qpos: list[Tensor] = []
 
-    def add(self, t: int, env: ImitationEnv) -> None:
+    def see(self, env: ImitationEnv, step: int) -> bool:
+        """Keeps the frame `step` of all episodes."""
+        t = step
+        self._qpos.append(env.backend.state.qpos[list(self._first.values())].clone())
         sim, ref = env.pose(), env.reference.gather(env.clip, env.frame)
         out = self.tensors
         out["pos"][:, t], out["quat"][:, t] = sim.pos, sim.quat
         out["ref_pos"][:, t], out["ref_quat"][:, t] = ref.pos, ref.quat
         if t == 0:
-            return
+            return self.total <= 1
         for name, value in {**env.terms, "total": env.imitation}.items():
             self.reward[name][:, t] = value
             if t == 1:
@@ -190,3 +211,48 @@ class _Store:
             ang, vel = sim.angvel[:, bodies].cpu(), sim.linvel[:, bodies].cpu()
             out["point_vel"][:, t] = vel + torch.linalg.cross(ang, arm)
             out["ang_vel"][:, t] = ang
+        return t + 1 >= self.total
+
+    def rollouts(self, limit_n: float = 0.0, limit_nm: float = 0.0) -> RolloutSet:
+        """All episodes, padded. limit_n, limit_nm: the help budget that they had."""
+        ref, humanoid, kept = self.reference, self.reference.humanoid, self.tensors
+        return RolloutSet(
+            pos=kept["pos"],
+            quat=kept["quat"],
+            ref_pos=kept["ref_pos"],
+            ref_quat=kept["ref_quat"],
+            force=kept["force"],
+            torque=kept["torque"],
+            point_vel=kept["point_vel"],
+            ang_vel=kept["ang_vel"],
+            alive=torch.arange(self.total) < self.lengths[:, None],
+            lengths=self.lengths,
+            reached_end=torch.ones(len(self.clip), dtype=torch.bool),
+            reward=self.reward,
+            clip=self.clip,
+            start=self.start,
+            clip_names=ref.names,
+            fps=ref.rate_hz,
+            mass=humanoid.mass,
+            feet=humanoid.feet,
+            shapes=shapes_of(humanoid.table, torch.float32),
+            limit_n=limit_n,
+            limit_nm=limit_nm,
+            ref_min_height=ref.min_height[self.clip],
+        )
+
+    def recordings(self) -> list[Recording]:
+        """Of each clip the earliest episode."""
+        qpos = torch.stack(self._qpos, 1).double().cpu().numpy()
+        return [
+            Recording(c, int(self.start[row]), qpos[k, : int(self.lengths[row])], row)
+            for k, (c, row) in enumerate(self._first.items())
+        ]
+
+
+def _check_starts(clip: Tensor, start: Tensor) -> None:
+    if clip.shape != start.shape or clip.ndim != 1 or not len(clip):
+        raise PoiseError(
+            f"an evaluation needs clip and start of one length, got {tuple(clip.shape)} and "
+            f"{tuple(start.shape)}"
+        )

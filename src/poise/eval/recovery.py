@@ -17,12 +17,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from poise.env import Acts, ImitationEnv, Recovery, TaskConfig
+from poise.env import Acts, ImitationEnv, Recovery, Reference, TaskConfig
 from poise.env.goals.led import LedGoal
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import FALLEN, FAR
 from poise.errors import PoiseError
+from poise.eval.episodes import simulate
 from poise.eval.field_paper import PHC_RECOVERY
 
 #: The fail-states by name.
@@ -135,9 +136,8 @@ def recovery_card(
             before the trials goes on standing on its last frame. It waits for the fallen as in training.
         near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
         at_once: trials that are simulated side by side.
-        ways: leads the policy back by them (`env.recovery.controller`), where the task is for that; by
-        default it is
-            told a point.
+        recovery_clips: what the policy is led back by (`env.goals.led`), where the task is for that; by
+            default it is told a point.
 
     Raises:
         PoiseError: a kind that there is not, a clip that there is not, or a task without recovery.
@@ -186,6 +186,22 @@ def back_after(near: Tensor, stay: int) -> Tensor:
     return torch.where(runs.any(1), first.double(), math.inf)
 
 
+class _Apart:
+    """Observes how far the bodies are from their reference on average, m, after each step."""
+
+    def __init__(self, reference: Reference, clip: Tensor, led: LedGoal | None):
+        self.reference, self.clip, self.led = reference, clip, led
+        self.apart: list[Tensor] = []
+        self._at: Tensor | None = None
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        if step:
+            ref = self.reference.gather(self.clip, env.frame if self._at is None else self._at)
+            self.apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
+        # Where somebody is led, the frame that was told before the step.
+        self._at = None if self.led is None else self.led.frame.clone()
+
+
 def _trial(
     env: ImitationEnv,
     policy: Acts,
@@ -203,13 +219,9 @@ def _trial(
         led = LedGoal(env.goal.clips, recovery_clips)
         led.lead(torch.arange(env.num_envs), env.backend.state.qpos)
         obs = env.set_goal(led)
-    apart = []
-    for _ in range(steps):
-        at = None if led is None else led.frame.clone()
-        obs = env.step(policy.act(obs)).final_obs
-        ref = reference.gather(clip * many, env.frame if at is None else at)
-        apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
-    return torch.stack(apart, 1)
+    seen = _Apart(reference, clip * many, led)
+    simulate(env, policy, obs, steps, seen)
+    return torch.stack(seen.apart, 1)
 
 
 def _row(kind: str, back: Tensor, seconds: Sequence[float]) -> Recovered:

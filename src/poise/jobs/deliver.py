@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from poise import __version__
 from poise.eval import ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
 from poise.kin import hold_feet, lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
+from poise.version import __version__
 from poise.view import Report, Shape, Track, write_report
 
 
@@ -44,6 +44,35 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
     # The source may end between two control steps; its last moment holds the last simulated pose.
     tail = np.minimum(np.arange(source.frames), out.frames - 1)
     return out.replaced(root_pos=out.root_pos[tail], rot=out.rot[tail])
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """What an evaluation gives a user, before anything is written.
+
+    clips: the simulated motions by the names of their files, on the skeletons that came in. card: the
+    score card with what holding the feet did. notes: the same in sentences.
+    """
+
+    clips: dict[str, Clip]
+    card: ScoreCard
+    notes: tuple[str, ...]
+
+
+def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) -> Finished:
+    """The simulated motion of every clip, its standing feet held to the spot; see `deliver`."""
+    clips: dict[str, Clip] = {}
+    figures, notes = [], []
+    for k, recording in enumerate(evaluation.recordings):
+        single = len(evaluation.recordings) == 1
+        name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
+        clip = simulated_clip(imitation, evaluation, k)
+        if hold:
+            clip, found = _held(imitation, evaluation, recording.clip, clip)
+            figures.append(found)
+            notes += _sentences(found)
+        clips[name] = clip
+    return Finished(clips, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +111,16 @@ def deliver(
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
-    figures, notes = [], []
-    for k, recording in enumerate(evaluation.recordings):
-        single = len(evaluation.recordings) == 1
-        name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
-        clip = simulated_clip(imitation, evaluation, k)
-        if hold:
-            clip, found = _held(imitation, evaluation, recording.clip, clip)
-            figures.append(found)
-            notes += _sentences(found)
+    done = finished(imitation, evaluation, hold)
+    for name, clip in done.clips.items():
+        single = len(done.clips) == 1
         paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"
         write_clip(clip, paths[name])
-    card = replace(evaluation.card, delivered=tuple(figures))
-    paths["score"] = write_score(card, out / "score.json")
+    paths["score"] = write_score(done.card, out / "score.json")
     paths["report"] = out / "report.html"
-    report = make_report(imitation, replace(evaluation, card=card), curve, source)
-    write_report(replace(report, notes=(*said, *report.notes, *notes)), paths["report"])
-    return Delivery(paths, card, tuple(notes))
+    report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
+    write_report(replace(report, notes=(*said, *report.notes, *done.notes)), paths["report"])
+    return Delivery(paths, done.card, done.notes)
 
 
 def _held(

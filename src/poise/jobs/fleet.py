@@ -20,10 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from poise import __version__
 from poise.errors import PoiseError
 from poise.jobs.workers import Ended, Workers, describe
 from poise.learn.checkpoint import write_atomic
+from poise.version import __version__
 
 FLEET_FILE = "fleet.json"
 FORMAT = 1

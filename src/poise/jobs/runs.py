@@ -1,22 +1,17 @@
-"""From clips to results: a run folder that can be resumed, evaluated, played and delivered.
-
-run/
-    run.safetensors         the clips and the recipe's settings, all a run needs to be rebuilt
-    checkpoint.safetensors  the trainer's whole state (learn.run)
-    progress.csv            the learning curve (learn.run)
-"""
+"""A run of the residual force recipe: begun, trained; and how a run of any recipe is evaluated."""
 
 from __future__ import annotations
 
-import csv
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
+from poise.body import Humanoid
 from poise.env.help import scale_in
 from poise.errors import PoiseError
 from poise.eval import (
@@ -28,9 +23,18 @@ from poise.eval import (
     score_rollouts,
     start_frames,
 )
+from poise.jobs.run_file import (
+    FINAL,
+    RUN_FILE,
+    RunFile,
+    body_facts,
+    latest_policy,
+    learning_curve,
+    read_run,
+    write_run,
+)
 from poise.jobs.warm_start import TrainingCallbacks, some_starts, start_training
 from poise.learn import (
-    LATEST,
     IterationStats,
     Policy,
     PolicyBundle,
@@ -39,19 +43,28 @@ from poise.learn import (
     load_checkpoint,
     load_policy,
     run,
-    save_checkpoint,
 )
 from poise.learn.parallel import ALONE, Comm
 from poise.motion import ClipLibrary
-from poise.motion.pack import pack_clips, unpack_clips
+from poise.motion.pack import pack_clips
 from poise.recipes.imitation import Imitation
-from poise.recipes.residual_force import ResidualForce, build, config_of, most_help
+from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
 from poise.settings import to_data
 
-#: The file that says what a run is.
-RUN_FILE = "run.safetensors"
-#: The policy of a run that comes to an end by itself; it needs no help.
-FINAL = "policy.safetensors"
+__all__ = [
+    "FINAL",
+    "RUN_FILE",
+    "Evaluation",
+    "begin",
+    "episode",
+    "evaluate",
+    "help_left",
+    "learning_curve",
+    "reopen",
+    "score",
+    "train",
+    "trained_policy",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,49 +81,32 @@ def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str
     more characters than fit into the memory of the `device` that will train it."""
     imitation = build(library, config)
     imitation.check_memory(config.num_envs, device)
-    path = folder / RUN_FILE
-    tensors, notes = pack_clips(library.clips)
-    meta = {"kind": "run", "recipe": "residual-force", "config": to_data(config), "clips": notes}
-    meta["character"] = imitation.humanoid.identity
-    if path.exists():
-        _, found = load_checkpoint(path)
-        if json.dumps(found.get("config")) != json.dumps(meta["config"]):
-            raise PoiseError(
-                "the folder holds a run with other settings",
-                folder,
-                "Resume it as it is or choose another",
-            )
-        if found.get("character") != meta["character"] or found.get("clips") != json.loads(
-            json.dumps(notes)
-        ):
-            names = ", ".join(c["name"] for c in found["clips"])
-            raise PoiseError(
-                f"the folder holds a run of other clips ({names})",
-                folder,
-                "Choose another folder",
-            )
+    if not (folder / RUN_FILE).exists():
+        meta = {"recipe": RECIPE["name"], "config": to_data(config)}
+        write_run(folder, library, meta | body_facts(imitation.humanoid, imitation.library.names))
         return imitation
-    folder.mkdir(parents=True, exist_ok=True)
-    save_checkpoint(path, tensors, meta)
+    found = read_run(folder)
+    # As this version reads it, so that a run of an older one is compared in what it knew, too.
+    if found.recipe != RECIPE["name"] or config_of(found.meta["config"], found.path) != config:
+        raise PoiseError(
+            "the folder holds a run with other settings",
+            folder,
+            "Resume it as it is or choose another folder",
+        )
+    notes = json.loads(json.dumps(pack_clips(library.clips)[1]))
+    if found.meta.get("character") != imitation.humanoid.identity or found.meta["clips"] != notes:
+        names = ", ".join(c["name"] for c in found.meta["clips"])
+        raise PoiseError(
+            f"the folder holds a run of other clips ({names})",
+            folder,
+            "Choose another folder",
+        )
     return imitation
 
 
-def reopen(folder: Path) -> Imitation:
-    """The task of an existing run, rebuilt from its folder alone."""
-    path = folder / RUN_FILE
-    if not path.exists():
-        raise PoiseError(
-            f"is no run folder: there is no {RUN_FILE} in it",
-            folder,
-            "Give the 'run' folder of a result",
-        )
-    tensors, meta = load_checkpoint(path)
-    if meta.get("recipe") == "perpetual":
-        from poise.jobs.perpetual import run as perpetual_run
-
-        return perpetual_run.reopen(folder)
-    config = config_of(meta["config"], path)
-    return build(ClipLibrary(tuple(unpack_clips(tensors, meta["clips"]))), config)
+def reopen(file: RunFile) -> Imitation:
+    """The task of an existing run, rebuilt from its file alone."""
+    return build(file.library(), config_of(file.meta["config"], file.path))
 
 
 def train(
@@ -137,13 +133,18 @@ def train(
 
 def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, dict[str, Any]]:
     """The run's latest policy, or that of a finished run, and its checkpoint's metadata."""
-    path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
-    if not path.exists():
-        raise PoiseError("nothing has been trained in it yet", folder, "Train it with --resume first")
-    policy = load_policy(path, character=imitation.humanoid.identity)
+    return policy_for(folder, imitation.humanoid, most_help(imitation.config))
+
+
+def policy_for(folder: Path, humanoid: Humanoid, most: float) -> tuple[PolicyBundle, dict[str, Any]]:
+    """`trained_policy` for a body. most: N, the highest limit of the help at any time."""
+    path = latest_policy(folder)
+    policy = load_policy(path, character=humanoid.identity)
     if path.name == FINAL:
-        return policy, policy.meta | policy.meta["metadata"] | {"help_limit": 0.0}
-    left = scale_in(load_checkpoint(path)[0]) * most_help(imitation.config)
+        return policy, policy.meta | policy.meta.get("metadata", {}) | {"help_limit": 0.0}
+    left = scale_in(load_checkpoint(path)[0]) * most
+    if not math.isfinite(left):
+        raise PoiseError("the help that is left in it is no number", path)
     return policy, {**policy.meta, "help_limit": left}
 
 
@@ -196,6 +197,18 @@ def evaluate(
     return Evaluation(card, rollouts, recordings)
 
 
+def episode(
+    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], clip: int = 0, frame: int = 0
+) -> Evaluation:
+    """One episode of a clip from one of its control frames as an evaluation of its own."""
+    limit, scale = help_left(imitation, meta)
+    rollouts, recordings = run_episodes(
+        lambda n: imitation.env(n, auto_reset=False, help_scale=scale),
+        policy, torch.tensor([clip]), torch.tensor([frame]), limit, limit,
+    )  # fmt: skip
+    return Evaluation(_score(rollouts, imitation, meta, "phc"), rollouts, recordings)
+
+
 def score(
     imitation: Imitation,
     policy: Policy,
@@ -227,14 +240,3 @@ def _score(
         samples=int(meta.get("samples", 0)),
         seed=imitation.config.seed,
     )
-
-
-def learning_curve(folder: Path) -> dict[str, np.ndarray]:
-    """Columns of the run's CSV by name; empty where nothing was trained."""
-    path = next(iter(sorted(folder.glob("*.csv"))), None)
-    if path is None:
-        return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    names = rows[0].keys() if rows else ()
-    return {name: np.array([float(r[name] or "nan") for r in rows]) for name in names}

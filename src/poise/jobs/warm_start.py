@@ -14,8 +14,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv
-from poise.eval import ScoreCard, run_episodes, score_rollouts, start_frames
+from poise.eval import ScoreCard, record, score_rollouts, start_frames
 from poise.learn import (
     LATEST,
     CloneConfig,
@@ -29,6 +28,7 @@ from poise.learn import (
     load_checkpoint,
 )
 from poise.learn.parallel import ALONE, Comm, any_of, together
+from poise.learn.schema import PolicyMeta
 from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
 from poise.recipes.imitation import Imitation
 from poise.sim import UnstableError
@@ -71,7 +71,9 @@ def start_training(
     tell = tell or TrainingCallbacks()
     make = partial(_trainer, imitation, threads, folder / "dumps", comm, device)
     if (folder / LATEST).exists():
-        warm = load_checkpoint(folder / LATEST)[1].get("metadata", {}).get("start") == "expert"
+        warm = (
+            load_checkpoint(folder / LATEST, PolicyMeta)[1].get("metadata", {}).get("start") == "expert"
+        )
         return make(None, warm)
     if not imitation.config.expert:
         return make(None, False)
@@ -131,11 +133,14 @@ def clone_expert(
 
 def score_expert(imitation: Imitation, plan: Plan | None = None) -> ScoreCard:
     """The expert's own score card over `FIRST_STARTS` start frames."""
-    config, acts = imitation.config, _Acts(imitation, plan)
     clip, frame = some_starts(imitation)
     limit = imitation.task.residual.limit_n if imitation.task.residual else 0.0
-    rollouts, _ = run_episodes(acts.env, acts, clip, frame, limit, limit)
-    return score_rollouts(rollouts, method="expert", seed=config.seed)
+    env = imitation.env(len(clip), auto_reset=False)
+    try:
+        rollouts, _ = record(env, Expert(env, plan=plan), clip, frame, limit, limit)
+    finally:
+        env.close()
+    return score_rollouts(rollouts, method="expert", seed=imitation.config.seed)
 
 
 def some_starts(imitation: Imitation, most: int = FIRST_STARTS) -> tuple[Tensor, Tensor]:
@@ -163,20 +168,3 @@ def _trainer(
     how: dict[str, Any] = {"start": "expert"} if warm else {}
     with together(comm):
         return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)
-
-
-class _Acts:
-    """An expert for the environment that the evaluation makes."""
-
-    def __init__(self, imitation: Imitation, plan: Plan | None):
-        self.imitation, self.plan = imitation, plan
-        self.expert: Expert | None = None
-
-    def env(self, num_envs: int) -> ImitationEnv:
-        env = self.imitation.env(num_envs, auto_reset=False)
-        self.expert = Expert(env, plan=self.plan)
-        return env
-
-    def act(self, obs: Tensor) -> Tensor:
-        assert self.expert is not None
-        return self.expert.act(obs)

@@ -20,8 +20,9 @@ from safetensors.torch import load as parse_tensors
 from safetensors.torch import save as serialise_tensors
 from torch import Tensor
 
-from poise import __version__
 from poise.errors import PoiseError
+from poise.settings import check_data
+from poise.version import __version__
 
 FORMAT = 1
 LATEST = "checkpoint.safetensors"
@@ -50,10 +51,16 @@ def save_checkpoint(path: str | Path, tensors: Mapping[str, Tensor], meta: Mappi
         ) from error
 
 
-def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_checkpoint(
+    path: str | Path, schema: type | None = None
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors (on the CPU) and the metadata of a checkpoint.
 
-    A missing, damaged or foreign file and another format version raise a `PoiseError`.
+    schema: a `TypedDict` of what must stand in the metadata, see `learn.schema`.
+
+    Raises:
+        PoiseError: the file is missing, damaged, foreign or of another format version, or its
+            metadata is not what the schema says.
     """
     path = Path(path)
     try:
@@ -85,6 +92,8 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
         raise damaged from None
     if _checksum(tensors) != meta.get("crc32"):
         raise damaged
+    if schema is not None:
+        check_data(schema, meta, path)
     return tensors, meta
 
 

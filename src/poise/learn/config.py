@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 from poise.errors import PoiseError
+from poise.settings import validate
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class PPOConfig:
     time-outs count as failures, as in the code of the RFC authors."""
 
     def __post_init__(self) -> None:
+        validate(self)
         for name in ("horizon", "epochs", "minibatch", "policy_lr", "value_lr", "clip"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "PPOConfig")

@@ -13,10 +13,12 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
+from poise.learn.schema import ModelMeta
 from poise.learn.state import State, load_module, prefixed, under
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
+from poise.settings import check_data, from_data
 
 #: The file in a model's folder.
 MODEL = "model.safetensors"
@@ -97,10 +99,16 @@ def load_model(path: Path) -> InbetweenModel:
     tensors, meta = load_checkpoint(path)
     if meta.get("kind") != "inbetween model":
         raise PoiseError("the file is not an in-betweening model", path)
+    check_data(ModelMeta, meta, path)
+    hint = "Train it again"
+    if not (meta["fps"] > 0 and min(meta["longest"], meta["past"]) > 0):
+        raise PoiseError("its rate and the lengths that it fills must be above 0", path, hint)
     try:
         said = meta["layout"]
         layout = Layout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
-        sizes = (BetweenConfig if meta["net"] == "transformer" else RTNConfig)(**meta["config"])
+        kind = BetweenConfig if meta["net"] == "transformer" else RTNConfig
+        sizes = from_data(kind, meta["config"], path)
+        _check_sizes(sizes, tensors, path)
         net = make_net(meta["net"], layout, sizes, 0)
         load_module(net, {k: v.float() for k, v in tensors.items()}, "net")
         example = None
@@ -110,7 +118,16 @@ def load_model(path: Path) -> InbetweenModel:
             meta["net"], net.eval(), tuple(meta["names"]), tensors["offsets"], meta["fps"],
             meta["longest"], meta["past"], meta["meta"], example,
         )  # fmt: skip
-    except (KeyError, TypeError) as problem:
-        raise PoiseError(
-            f"the model is of another version ({problem})", path, "Train it again"
-        ) from None
+    except PoiseError as problem:
+        raise PoiseError(problem.what, problem.where or path, problem.hint or hint) from None
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as problem:
+        raise PoiseError(f"the model is of another version ({problem})", path, hint) from None
+
+
+def _check_sizes(sizes: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Refuses sizes that its weights cannot have, before a network of them is made."""
+    held = sum(v.numel() for v in tensors.values())
+    for name, value in dataclasses.asdict(sizes).items():
+        for number in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(number, int) and not 0 <= number <= held:
+                raise PoiseError(f"its weights are not those of a network with {name} = {value}", path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
+from poise.learn.schema import PolicyMeta
 from poise.learn.state import State, load_module, prefixed
 from poise.nets import MLP, Composer, GaussianPolicy, ProgressiveNet, RunningNorm
+from poise.settings import check_data
 
 
 @dataclass(eq=False)
@@ -196,9 +199,36 @@ def load_policy(
     Whatever is given of `character`, `num_obs` and `num_actions` must match, or a `PoiseError`
     says what was found and what was expected.
     """
-    tensors, meta = load_checkpoint(path)
+    tensors, meta = load_checkpoint(path, PolicyMeta)
     check_fits(meta, path, character=character, num_obs=num_obs, num_actions=num_actions)
-    bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
-    bundle.load_state(tensors)
-    bundle.meta = meta
+    return policy_in(tensors, meta, path)
+
+
+def policy_in(tensors: Mapping[str, Tensor], meta: Mapping[str, Any], path: str | Path) -> PolicyBundle:
+    """The policy that a checkpoint's tensors and metadata describe; `path` says where, for errors.
+
+    Raises:
+        PoiseError: they do not belong together, or there are weights that are no numbers.
+    """
+    check_data(PolicyMeta, meta, path)
+    own = {k: v for k, v in tensors.items() if k.startswith(("norm/", "policy/"))}
+    shape, hint = meta["policy"], "The file is damaged or was changed; take another one"
+    sizes = (meta["num_obs"], *shape["hidden"], meta["num_actions"])
+    need = shape.get("columns", 1) * sum(a * b for a, b in pairwise(sizes))
+    # What is stated is compared with what is there before networks of that size are made.
+    if min(*sizes, need) < 1 or need > sum(v.numel() for v in own.values()):
+        raise PoiseError(
+            f"its weights are not those of layers {' x '.join(map(str, sizes))}", path, hint
+        )
+    try:
+        bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], shape)
+        bundle.load_state(own)
+    except PoiseError as problem:
+        raise PoiseError(problem.what, path, problem.hint or hint) from None
+    except (KeyError, TypeError, ValueError, RuntimeError) as problem:
+        raise PoiseError(f"its policy cannot be rebuilt ({problem})", path, hint) from None
+    bad = [k for k, v in own.items() if v.is_floating_point() and not bool(v.isfinite().all())]
+    if bad:
+        raise PoiseError(f"'{bad[0]}' holds values that are no finite numbers", path, hint)
+    bundle.meta = dict(meta)
     return bundle

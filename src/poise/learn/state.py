@@ -62,12 +62,22 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> State:
 
 def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor]) -> None:
     """Restores what `optimizer_state` returned."""
-    for group, lr in zip(optimizer.param_groups, take(state, "lr").tolist(), strict=True):
+    rates, hint = take(state, "lr"), "Use the layer sizes with which the state was saved"
+    if rates.shape != (len(optimizer.param_groups),):
+        raise PoiseError(
+            f"the saved optimiser has learning rates of shape {tuple(rates.shape)}", hint=hint
+        )
+    for group, lr in zip(optimizer.param_groups, rates.tolist(), strict=True):
         group["lr"] = lr
     optimizer.state.clear()
     params = [p for group in optimizer.param_groups for p in group["params"]]
     for i, p in enumerate(params):
         moments = {k: v.detach().clone() for k, v in under(str(i), state).items()}
+        for name, value in moments.items():
+            # A moment is as its parameter, the count of steps a number.
+            if value.shape != p.shape and (name != "step" or value.numel() != 1):
+                what = f"the saved optimiser's '{i}/{name}' has the shape {tuple(value.shape)}"
+                raise PoiseError(f"{what} where {tuple(p.shape)} is expected", hint=hint)
         if moments:
             optimizer.state[p] = {k: v.to(p.device) for k, v in moments.items()}
 

@@ -30,7 +30,9 @@ from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import Style, VecEnv
 from poise.learn.rollout import Episodes, Rollout, collect
+from poise.learn.schema import TrainerMeta
 from poise.learn.state import State, load_module, prefixed, take, under
+from poise.settings import check_data
 
 
 @dataclass(frozen=True)
@@ -247,6 +249,9 @@ class Trainer:
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from what `state` returned, with the same environment and network sizes."""
         device, state = torch.device(self.env.device), own_state(self.comm, state)
+        counters = take(state, "trainer/counters")
+        if counters.shape != (6,) or not bool(counters[:3].isfinite().all() & (counters[:3] >= 0).all()):
+            raise PoiseError(f"the saved counters make no sense: {counters.tolist()[:6]}")
         obs = take(state, "trainer/obs")
         if obs.shape != (self.env.num_envs, self.env.num_obs):
             raise PoiseError(
@@ -257,11 +262,18 @@ class Trainer:
         self.ppo.load_state(state)
         if self.style is not None:
             self.style.load_state(under("style", state))
-        self.env.load_state(under("env", state))
+        try:
+            self.env.load_state(under("env", state))
+        except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as problem:
+            why = f"'{problem.args[0]}' is missing" if isinstance(problem, KeyError) else str(problem)
+            hint = "The checkpoint is damaged or was changed; go on from another one"
+            raise PoiseError(
+                f"the saved state of the worlds cannot be used ({why})", hint=hint
+            ) from problem
         self._obs = obs.to(device, copy=True)
         self.episodes.length.copy_(take(state, "trainer/episode_length"))
         self.episodes.total.copy_(take(state, "trainer/episode_reward"))
-        iteration, samples, self.seconds, a, b, c = take(state, "trainer/counters").tolist()
+        iteration, samples, self.seconds, a, b, c = counters.tolist()
         self.iteration, self.samples, self._ended = int(iteration), int(samples), (a, b, c)
 
     def save(self, path: str | Path, extra: Mapping[str, Tensor] | None = None) -> None:
@@ -294,10 +306,11 @@ class Trainer:
         settings may differ, the present ones hold from here on.
         """
         tensors, meta = load_checkpoint(path)
+        check_fits(meta, path, kind="trainer")
+        check_data(TrainerMeta, meta, path)
         check_fits(
             meta,
             path,
-            kind="trainer",
             processes=self.comm.size if "processes" in meta else None,
             character=self.character,
             num_obs=self.env.num_obs,
@@ -312,7 +325,10 @@ class Trainer:
                 path,
                 "Use the settings it was made with, or start a new run in another folder",
             )
-        self.load_state(tensors)
+        try:
+            self.load_state(tensors)
+        except PoiseError as problem:
+            raise PoiseError(problem.what, problem.where or path, problem.hint) from problem
         return meta
 
 

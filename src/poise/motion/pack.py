@@ -42,11 +42,11 @@ def unpack_clips(tensors: Mapping[str, Tensor], notes: Sequence[Mapping[str, Any
     """What `pack_clips` packed.
 
     Raises:
-        PoiseError: a key is missing, or holds something else.
+        PoiseError: a key is missing, or of another kind.
     """
     try:
         return [_clip(tensors, note, i) for i, note in enumerate(notes)]
-    except (KeyError, TypeError, ValueError, AttributeError) as problem:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as problem:
         raise PoiseError(f"the packed clips are incomplete: {problem}") from None
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from torch import Tensor
+
 from poise.body import Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.env.recovery.clips import RecoveryClips
@@ -15,17 +17,35 @@ from poise.kin import FitReport
 from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Style
-from poise.motion import ClipLibrary
+from poise.motion import Clip, ClipLibrary, read_clip
 from poise.recipes.memory import FEW, check_memory, free_bytes, learner_bytes
-from poise.sim import NanGuard, make_backend
+from poise.sim import Backend, NanGuard, make_backend
+
+#: What a recipe is built of: a clip, the file of one, or a library.
+Clips = Clip | ClipLibrary | str | Path
 
 
-@dataclass(frozen=True, eq=False)
+def as_library(clips: Clips) -> ClipLibrary:
+    """A library as it is, or of one clip or motion file.
+
+    Raises:
+        PoiseError: neither of them, or a file that cannot be read.
+    """
+    if isinstance(clips, ClipLibrary):
+        return clips
+    clip = read_clip(clips) if isinstance(clips, str | Path) else clips
+    if not isinstance(clip, Clip):
+        what = f"a recipe is built of a clip, a motion file or a ClipLibrary, got {type(clip).__name__}"
+        raise PoiseError(what, hint="Put several clips into ClipLibrary.of([...])")
+    return ClipLibrary.of(clip)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Imitation:
     """A library with a body, ready to be learned.
 
     config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
-    ways: what the library knows of coming back, where that is learned by it.
+    recovery_clips: what the library knows of coming back, where that is learned by it.
     """
 
     library: ClipLibrary
@@ -36,6 +56,11 @@ class Imitation:
     task: TaskConfig
     recovery_clips: RecoveryClips | None = None
 
+    def __repr__(self) -> str:
+        clips, seconds = len(self.library), self.library.seconds
+        body = f"{len(self.humanoid.bodies)} bodies, {len(self.humanoid.hinges)} hinges"
+        return f"Imitation({type(self.config).__name__}, {clips} clips, {seconds:.1f} s, {body})"
+
     def env(
         self,
         num_envs: int | None = None,
@@ -43,24 +68,37 @@ class Imitation:
         auto_reset: bool = True,
         threads: int = 0,
         dumps: Path | None = None,
-        help_scale: float = 1.0,
+        help_scale: float | Tensor = 1.0,
         device: str = "cpu",
+        guard: bool = True,
+        backend: Backend | None = None,
     ) -> ImitationEnv:
         """An environment of this task; without `auto_reset` for evaluation from given frames.
 
-        threads: of the physics on the CPU. help_scale: what is left of the residual force's limits.
-        device: "cpu", or "cuda" for the physics on a GPU.
+        threads: of the physics on the CPU. help_scale: what is left of the limits of the help, or of
+        those of each of the task's groups `(G,)`, see `TaskConfig.help_by`. device: "cpu", or "cuda" for
+        the physics on a GPU. guard: whether a world whose simulation goes bad ends everything with an
+        error; without, it is a failure like others. backend: in place of a fresh one, for worlds that
+        are simulated in another way; `num_envs`, `device` and `threads` are then its own.
         """
-        backend = make_backend(
-            self.humanoid.model, num_envs or self.config.num_envs, device, threads=threads
-        )
+        if backend is None:
+            worlds = num_envs or self.config.num_envs
+            backend = make_backend(self.humanoid.model, worlds, device, threads=threads)
         seed = int(self.config.seed if seed is None else seed)
-        guard = NanGuard(backend, dumps, seed=seed)
-        task = replace(self.task, auto_reset=auto_reset)
-        env = ImitationEnv(self.reference, backend, task, self.config.sim.substeps, seed, guard=guard)
-        guard.where = env.where
+        task, substeps = replace(self.task, auto_reset=auto_reset), self.config.sim.substeps
+        watch = NanGuard(backend, dumps, seed=seed) if guard else None
+        env = ImitationEnv(self.reference, backend, task, substeps, seed, guard=watch)
+        if watch is not None:
+            watch.where = env.where
         env.help.set(help_scale)
         return env
+
+    def bare(self, rewards: bool = False, groups: bool = False) -> Imitation:
+        """The same task with what a policy needs alone: no ends, no style, and without rewards but for
+        `rewards`. groups: whether help keeps its groups; else all worlds have the same."""
+        task = replace(self.task, dones=(), style=())
+        task = task if rewards else replace(task, rewards=())
+        return replace(self, task=task if groups else replace(task, help_by="all"))
 
     def ppo(self) -> PPOConfig:
         """The learner's settings, with one deviation of the action noise per action."""

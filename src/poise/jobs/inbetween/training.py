@@ -24,7 +24,7 @@ from typing import Any, Literal
 import torch
 
 from poise.errors import PoiseError
-from poise.eval.inbetween import Protocol, TestSet, deviation, evaluate, test_set
+from poise.eval.inbetween import LAFAN1, Protocol, TestSet, deviation, evaluate, test_set
 from poise.jobs.inbetween.data import library_bank
 from poise.jobs.library import LibraryConfig
 from poise.kin.feet.contact import standing_labels
@@ -42,7 +42,7 @@ from poise.motion.windows import FrameBank, step_contacts
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig
 from poise.nets.transition import Layout
-from poise.settings import from_data, to_data
+from poise.settings import from_data, to_data, validate
 from poise.spatial import normalize
 
 Contacts = Literal["harvey", "two-stage", "floor"]
@@ -70,7 +70,7 @@ class Inbetween:
     name: str = "library"
     final: str = r"(?!)"
     validation: str | None = None
-    contacts: Contacts = "harvey"
+    contacts: Contacts = "floor"
     fps: float = 30.0
     seed: int = 0
     ema: float = 0.999
@@ -82,6 +82,42 @@ class Inbetween:
     between_training: BetweenTraining = field(default_factory=BetweenTraining)
     rtn: RTNConfig = field(default_factory=RTNConfig)
     rtn_training: RTNTraining = field(default_factory=RTNTraining)
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> Inbetween:
+        """Harvey et al. 2020 on LAFAN1 as stated, with the loss of Skeleton2Humanoid's Eq. 3.
+
+        Its alpha is stated nowhere and neither is the width of the LSTM; both are ours, and so is that
+        the losses are weighted as they are rather than made equal for an untrained network first.
+        """
+        own: dict[str, Any] = {
+            "net": "rtn", "name": LAFAN1.name, "final": LAFAN1.final, "contacts": "harvey", "fps": 30.0,
+            "ema": 0.0, "mirror": False, "stretch": 1.0,
+            "rtn": RTNConfig(encoder=(512, 256), decoder=(512, 256), past=10, longest=30, noise=0.5),
+            "rtn_training": RTNTraining(
+                batch=32, lr=1e-3, decay=False, shortest=5, quat=1.0, pos=1.0, root=0.5, contact=0.1,
+                adversarial=0.1, products="float32",
+            ),
+        }  # fmt: skip
+        return cls(**(own | changes))
+
+    @classmethod
+    def code(cls, **changes: Any) -> Inbetween:
+        """The same as public re-implementations have it: an LSTM of 768 units, clips in a mirror, too,
+        an adversarial weight of 0.01, and gradients scaled down to 1.
+
+        Neither paper has published code of its training. Not expressed: critics whose windows differ
+        from 10 and 2 frames, and their other weights of losses, on which they disagree.
+        """
+        own = cls.paper()
+        rtn, how = (
+            replace(own.rtn, hidden=768),
+            replace(own.rtn_training, adversarial=0.01, grad_norm=1.0),
+        )
+        return replace(own, **({"mirror": True, "rtn": rtn, "rtn_training": how} | changes))
 
     @property
     def protocol(self) -> Protocol:

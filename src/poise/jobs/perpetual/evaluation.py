@@ -1,27 +1,20 @@
-"""Every clip of a library from its first frame: which are done to their end, and how closely.
-
-PHC's evaluation: the policy acts without noise, and a clip fails where the mean distance of the bodies
-exceeds 0.5 m in any frame. No frame after a failure is simulated for its own sake, so that a library of
-thousands of clips is evaluated while it is learned.
-"""
+"""Every clip of a library from its first frame, and the table of all such evaluations."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from poise.env import Acts, ImitationEnv
+from poise.env import Acts
+from poise.eval import ClipJudge, ClipResults, simulate
 from poise.learn import PolicyBundle
 from poise.learn.checkpoint import write_atomic
-from poise.metrics import mpjpe_global, mpjpe_root, success_rule
 from poise.recipes.imitation import Imitation
-from poise.sim import make_backend
 
 #: The file of a run folder with every evaluation of every clip.
 SUCCESS = "success.csv"
@@ -33,45 +26,6 @@ COLUMNS = (
 FINAL_STAGE = "final"
 #: Clips that are simulated at once.
 WORLDS = 512
-
-
-@dataclass(frozen=True, eq=False)
-class ClipResults:
-    """What E clips came to, from frame 0; one row per clip.
-
-    clip: its index. succeeded: bool. frames: its frames. tracked: those before it failed, or all.
-    mpjpe_mm, global_mm: means over the frames up to the one that failed, with the root's error and
-    without.
-    """
-
-    clip: Tensor
-    succeeded: Tensor
-    frames: Tensor
-    tracked: Tensor
-    mpjpe_mm: Tensor
-    global_mm: Tensor
-
-    @property
-    def rate(self) -> float:
-        """Share of the clips that succeeded."""
-        return float(self.succeeded.double().mean())
-
-    @property
-    def error_mm(self) -> float:
-        """Global error over the frames of all clips, mm."""
-        seen = (self.tracked + (~self.succeeded).long()).double()
-        return float((self.global_mm * seen).sum() / seen.sum())
-
-    def spread(self, values: Tensor, clips: int) -> Tensor:
-        """`values (E,)` in a row of all `clips`; 0 for those that were not evaluated."""
-        out = values.new_zeros(clips)
-        out[self.clip] = values
-        return out
-
-    def hardest(self, count: int) -> list[int]:
-        """Clips that failed, those first of which the least was tracked."""
-        share = (self.tracked / self.frames)[~self.succeeded]
-        return self.clip[~self.succeeded][share.argsort(stable=True)][:count].tolist()
 
 
 @torch.no_grad()
@@ -117,56 +71,17 @@ def _batch(
     device: str,
 ) -> tuple[Tensor, ...]:
     """Success, frames tracked, mean errors `(E,)` of clips that are simulated together."""
-    env = bare_env(imitation, len(clip), scale, threads, device)
-    limit = success_rule("phc").limit_m * 1000.0
+    task = imitation.bare(groups=isinstance(scale, Tensor))
+    env = task.env(len(clip), None, False, threads, None, scale, device, guard=False)
     last = imitation.reference.length[clip].to(env.device) - 1
-    clip = clip.to(env.device)
-    alive, tracked = torch.ones_like(clip, dtype=torch.bool), torch.ones_like(clip)
-    # The first frame is the clip's own.
-    local, far = (torch.zeros(len(clip), dtype=torch.float64, device=env.device) for _ in range(2))
-    count = torch.ones_like(local)
+    judge = ClipJudge(last)
     try:
+        clip = clip.to(env.device)
         obs = env.reset_to(clip, torch.zeros_like(clip))
-        for t in range(1, int(last.max()) + 1):
-            obs = env.step(policy.act(obs)).final_obs
-            sim, ref = env.pose().pos, env.reference.gather(env.clip, env.frame).pos
-            distance, counted = mpjpe_global(sim, ref), alive & (t <= last)
-            # A world that went bad has no distance, and has failed.
-            good = distance <= limit
-            known = counted & distance.isfinite()
-            far += torch.where(known, distance, 0.0)
-            local += torch.where(known, mpjpe_root(sim, ref), 0.0)
-            count += known
-            alive &= good | ~counted
-            tracked += counted & good
-            if t % 16 == 0 and not bool((alive & (t < last)).any()):
-                break
+        simulate(env, policy, obs, int(last.max()), judge)
     finally:
         env.close()
-    return tuple(x.cpu() for x in (alive, tracked, local / count, far / count))
-
-
-def bare_env(
-    imitation: Imitation,
-    worlds: int,
-    scale: float | Tensor,
-    threads: int,
-    device: str,
-    rewards: bool = False,
-) -> ImitationEnv:
-    """Worlds without a guard and ends: one that goes bad is a failure and no reason to stop.
-
-    scale: what is left of the residual force's limits, or of those of each of the task's groups `(G,)`.
-    rewards: whether they are worked out; else only what the policy sees is.
-    """
-    config = imitation.config
-    backend = make_backend(imitation.humanoid.model, worlds, device, threads=threads)
-    task = replace(imitation.task, dones=(), style=(), auto_reset=False)
-    task = task if rewards else replace(task, rewards=())
-    task = task if isinstance(scale, Tensor) else replace(task, help_by="all")
-    env = ImitationEnv(imitation.reference, backend, task, config.sim.substeps, int(config.seed))
-    env.help.set(scale)
-    return env
+    return judge.results()
 
 
 class History:

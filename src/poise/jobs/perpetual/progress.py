@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from poise.eval import RecoveryCard
-from poise.jobs.perpetual.evaluation import ClipResults
+from poise.eval import ClipResults, RecoveryCard
 from poise.learn import IterationStats, Until
 from poise.recipes.perpetual.config import Recovers
 

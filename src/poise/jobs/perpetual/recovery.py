@@ -8,7 +8,6 @@ from poise.env import Acts
 from poise.env.recovery.falls import fall_states
 from poise.errors import PoiseError
 from poise.eval import RecoveryCard, recovery_card, trial_task
-from poise.jobs.perpetual.evaluation import bare_env
 from poise.learn import PolicyBundle
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual
@@ -51,9 +50,10 @@ def try_recovery(
     if isinstance(policy, PolicyBundle):
         policy = policy.copy().to(device)
     recovery_clips = imitation.recovery_clips
-    tried = replace(imitation, task=trial_task(imitation.task, FAR, trials, recovery_clips is not None))
+    tried = trial_task(imitation.task, FAR, trials, recovery_clips is not None)
+    tried = replace(imitation, task=tried).bare()
     return recovery_card(
-        lambda worlds: bare_env(tried, worlds, 0.0, threads, device),
+        lambda n: tried.env(n, None, False, threads, None, 0.0, device, guard=False),
         policy, trials, method=config.method, clip=clip, frame=frame, seconds=config.recovering.seconds,
         recovery_clips=recovery_clips,
     )  # fmt: skip

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
-from poise import __version__
-from poise.eval import RecoveryCard
-from poise.jobs.perpetual.evaluation import FINAL_STAGE, ClipResults, evaluate_clips
+from poise.eval import ClipResults, RecoveryCard
+from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips
 from poise.jobs.perpetual.progress import Progress
 from poise.jobs.perpetual.recovery import try_recovery
 from poise.jobs.perpetual.stage_initialisation import staged
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.runs import FINAL
+from poise.jobs.run_file import FINAL
 from poise.learn.checkpoint import write_atomic
+from poise.version import __version__
 
 RESULT = "result.json"
 

@@ -17,24 +17,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from poise.body import BodyConfig, BodyTable
+from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.jobs.library.clips import Target
 from poise.jobs.library.folder import LibraryConfig, library_of, split
 from poise.jobs.perpetual.progress import Progress, Stage
 from poise.jobs.perpetual.result import RESULT, PerpetualResult, finish
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.runs import FINAL, RUN_FILE
+from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, read_run, write_run
 from poise.jobs.warm_start import TrainingCallbacks
-from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint, save_checkpoint
+from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
 from poise.learn.run import interruptible
+from poise.learn.schema import PolicyMeta
+from poise.learn.state import prefixed
 from poise.motion import ClipLibrary
-from poise.motion.pack import pack_clips, unpack_clips
+from poise.motion.pack import pack_clips
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import WIDE, config_of
 from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
 from poise.settings import to_data
 
+#: Where a run file holds what its library knows of coming back.
+WAYS = "ways"
 #: Least step size where a policy that is done learns to come back.
 ANEW = 1e-4
 
@@ -130,14 +134,13 @@ def begin(
             f"a library needs at least 2 clips, and there is only '{library.names[0]}'",
             hint="Use poise imitate for a single clip",
         )
-    path, said = folder / RUN_FILE, to_data(config)
-    tensors, notes = pack_clips(library.clips)
-    notes = json.loads(json.dumps(notes))
-    if path.exists():
-        meta = _checked(folder, said, source)
-        if meta["clips"] != notes:
+    said, held = to_data(config), (folder / RUN_FILE).exists()
+    if held:
+        found = _checked(folder, said, source).meta["clips"]
+        notes = json.loads(json.dumps(pack_clips(library.clips)[1]))
+        if found != notes:
             raise PoiseError(
-                f"the folder holds a run of other clips ({len(meta['clips'])}, here {len(notes)})",
+                f"the folder holds a run of other clips ({len(found)}, here {len(notes)})",
                 folder,
                 "Give the library it was begun with, or choose another folder",
             )
@@ -151,14 +154,14 @@ def begin(
             )
     imitation = build(library, config, table)
     imitation.check_memory(config.num_envs, device)
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        meta = {"kind": "run", "recipe": RECIPE["name"], "config": said, "clips": notes}
-        meta |= {"source": source, "character": imitation.humanoid.identity}
+    if not held:
+        meta = {"recipe": RECIPE["name"], "config": said, "source": source}
+        meta |= body_facts(imitation.humanoid, imitation.library.names)
         if earlier is not None:
             meta["earlier"] = {"samples": earlier.samples, "seconds": earlier.seconds}
             meta["table"] = earlier.target.table.to_dict()
-        save_checkpoint(path, tensors, meta)
+        known = imitation.recovery_clips
+        write_run(folder, library, meta, {} if known is None else prefixed(WAYS, known.state()))
     return imitation
 
 
@@ -168,19 +171,18 @@ def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu
     Raises:
         PoiseError: other settings, another source of clips, or another recipe.
     """
-    _checked(folder, to_data(config), source)
-    imitation = _rebuilt(folder)
+    imitation = _rebuilt(_checked(folder, to_data(config), source))
     imitation.check_memory(config.num_envs, device)
     return imitation
 
 
-def _checked(folder: Path, config: dict[str, Any], source: str) -> dict[str, Any]:
-    """What the run file says, unless it is that of another run."""
-    _, meta = load_checkpoint(folder / RUN_FILE)
-    if meta.get("recipe") != RECIPE["name"]:
+def _checked(folder: Path, config: dict[str, Any], source: str) -> RunFile:
+    """The run file, unless it is that of another run."""
+    file = read_run(folder)
+    if file.recipe != RECIPE["name"]:
         raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
     # As this version reads it, so that a run of an older one is compared in what it knew, too.
-    found = to_data(config_of(meta["config"]))
+    found = to_data(config_of(file.meta["config"], file.path))
     # How long the expert was cloned is over and done; a run keeps its own.
     names = sorted(k for k in config if k != "clone" and config[k] != found[k])
     if names:
@@ -189,44 +191,44 @@ def _checked(folder: Path, config: dict[str, Any], source: str) -> dict[str, Any
             folder,
             "Resume it as it is or choose another folder",
         )
-    if meta["source"] != source:
+    if file.meta.get("source", "") != source:
         raise PoiseError(
-            f"the folder holds a run on the library {meta['source'] or 'of a program'}",
+            f"the folder holds a run on the library {file.meta.get('source') or 'of a program'}",
             folder,
             "Give that library, or choose another folder",
         )
-    return meta
+    return file
 
 
-def reopen(folder: Path) -> Imitation:
-    """The task of an existing run as its latest policy knows it, rebuilt from its folder alone.
+def reopen(file: RunFile) -> Imitation:
+    """The task of an existing run as its latest policy knows it, rebuilt from its file alone.
 
     A policy that has not come to recovery yet must not see point goals; its `config` is without.
     """
-    imitation = _rebuilt(folder)
+    imitation = _rebuilt(file)
     config: Perpetual = imitation.config
-    if not config.recovery or _knows_recovery(folder):
+    if not config.recovery or knows_recovery(file.path.parent):
         return imitation
     config = replace(config, recovery=False)
     return replace(imitation, config=config, task=task(config, imitation.humanoid), recovery_clips=None)
 
 
-def _rebuilt(folder: Path) -> Imitation:
-    tensors, meta = load_checkpoint(folder / RUN_FILE)
-    library = ClipLibrary(tuple(unpack_clips(tensors, meta["clips"])))
-    table = BodyTable.from_dict(meta["table"]) if "table" in meta else None
-    return build(library, config_of(meta["config"], folder / RUN_FILE), table)
+def _rebuilt(file: RunFile) -> Imitation:
+    return build(file.library(), config_of(file.meta["config"], file.path), file.table())
 
 
-def _knows_recovery(folder: Path) -> bool:
-    """Whether the stage of a run's latest policy learned to recover."""
+def knows_recovery(folder: Path) -> bool:
+    """Whether the stage of a run's latest policy learned to recover; True where there is none yet."""
     path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
     if not path.exists():
         return True
-    said = load_checkpoint(path)[1]["metadata"]
-    if path.name == FINAL:
-        return bool(said["recovers"])
-    return Stage(**said["course"]["stage"]).recovers is not None
+    said = load_checkpoint(path, PolicyMeta)[1].get("metadata", {})
+    try:
+        if path.name == FINAL:
+            return bool(said["recovers"])
+        return Stage(**said["course"]["stage"]).recovers is not None
+    except (KeyError, TypeError, ValueError):
+        raise PoiseError("it does not say what its stage learns", path, "The file is damaged") from None
 
 
 def train(

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from poise.eval import RecoveryCard
+from poise.eval import ClipResults, RecoveryCard
 from poise.eval.recovery import KINDS
-from poise.jobs.perpetual.evaluation import ClipResults, History, evaluate_clips
+from poise.jobs.perpetual.evaluation import History, evaluate_clips
 from poise.jobs.perpetual.progress import Stage
 from poise.jobs.perpetual.recovery import back, try_recovery
 from poise.jobs.perpetual.stage_initialisation import staged

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from poise.eval import RecoveryCard
-from poise.jobs.perpetual.evaluation import ClipResults
+from poise.eval import ClipResults, RecoveryCard
 from poise.jobs.perpetual.recovery import back
 from poise.learn import Convergence, Decision, HardNegatives, PolicyBundle
 from poise.learn.state import State, prefixed, take, under

@@ -7,7 +7,6 @@ since all arrays of a copy lie side by side: its views are strides of the one wo
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -16,9 +15,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.body.humanoid import make_spec
-from poise.env import ImitationEnv
 from poise.errors import PoiseError
-from poise.recipes.imitation import Imitation
 from poise.sim import CpuBackend, Drive, SimConfig
 from poise.sim.backend import SimState
 
@@ -151,13 +148,3 @@ class Crowd:
         bodies, width = self.model.nbody, whole.shape[-1]
         shape, strides = (self.num_envs, bodies, width), ((bodies - 1) * width, width, 1)
         return whole.as_strided(shape, strides, whole.storage_offset())
-
-
-def crowd_env(imitation: Imitation, count: int) -> ImitationEnv:
-    """An environment of N characters who share a world and get no help."""
-    sim = imitation.config.sim
-    backend = Crowd(imitation.humanoid, sim, count)
-    plain = replace(imitation.task, auto_reset=False)
-    env = ImitationEnv(imitation.reference, backend, plain, sim.substeps, int(imitation.config.seed))
-    env.help.set(0.0)
-    return env

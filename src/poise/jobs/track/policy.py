@@ -1,6 +1,6 @@
 """A trained controller as one small file: weights, body, settings, and what it was trained on.
 
-    policy = policy_of_run(Path("run"))          # or load_tracker("policy.safetensors")
+    policy = open_run("run").tracker             # or of "policy.safetensors"
     save_tracker(policy, "policy.safetensors")
 
 The file is a checkpoint (`poise.learn.checkpoint`). Matrices are in half precision, everything else as
@@ -9,30 +9,50 @@ it was trained; the body stands in it with every number, so that no clip of the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
-from poise import __version__
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.jobs.library.clips import Target
 from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.runs import FINAL, RUN_FILE, trained_policy
+from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, read_run
+from poise.jobs.runs import policy_for
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
+from poise.learn.policy import policy_in
+from poise.learn.schema import PolicyMeta
 from poise.learn.state import prefixed, under
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import RECIPE, Perpetual
 from poise.recipes.perpetual.config import config_of
-from poise.settings import to_data
+from poise.settings import check_data, to_data
+from poise.version import __version__
+
+
+class _About(TypedDict, total=False):
+    clips: list[str]
+    samples: int
+    seconds: float
+    help_n: float
+
+
+class TrackerMeta(PolicyMeta):
+    """The metadata of a policy file."""
+
+    config: dict[str, Any]
+    table: dict[str, Any]
+    example: dict[str, Any]
+    about: _About
+
 
 #: What a policy file calls itself, and the version of what stands in it.
 KIND, VERSION = "tracker", 1
@@ -71,53 +91,53 @@ class Tracker:
         return Target(self.humanoid.skeleton, self.example, self.humanoid.table, "the policy's body")
 
 
-def open_tracker(path: Path | None = None) -> Tracker:
-    """The policy in a file or a run folder; without a path the one that comes with Poise.
+def policy_of_run(file: RunFile) -> Tracker:
+    """The latest policy of a run of `poise train perpetual`.
+
+    Its body stands in the run file; where that is of an earlier version it is made from all clips again.
 
     Raises:
-        PoiseError: it is not there, or it cannot be used.
+        PoiseError: a run of another recipe, or nothing was trained in it.
     """
-    if path is None:
-        path = SHIPPED
-    if not path.exists():
-        raise PoiseError(
-            "there is no such policy", path, "Give a policy file or the folder of a perpetual run"
-        )
-    return policy_of_run(path) if path.is_dir() else load_tracker(path)
-
-
-def policy_of_run(folder: Path) -> Tracker:
-    """The latest policy of a run of `poise train perpetual`; builds its body anew from all its clips.
-
-    Raises:
-        PoiseError: no run, a run of another recipe, or nothing was trained in it.
-    """
-    path = folder / RUN_FILE
-    if not path.exists() and (folder / "run" / RUN_FILE).exists():
-        path = folder / "run" / RUN_FILE
-    if not path.exists():
-        raise PoiseError(
-            f"is no run folder: there is no {RUN_FILE} in it",
-            folder,
-            "Give a policy file or the folder of a perpetual run",
-        )
-    _, meta = load_checkpoint(path)
-    if meta.get("recipe") != RECIPE["name"]:
+    folder = file.path.parent
+    if file.recipe != RECIPE["name"]:
         raise PoiseError(
             "its policy knows only the clips that it was trained on, and cannot track others",
             folder,
             "Give the run of poise train perpetual, or imitate the clip with poise imitate",
         )
-    return tracker_of(path.parent, perpetual_run.reopen(path.parent))
+    config, example = config_of(file.meta["config"], file.path), file.library().clips[0]
+    humanoid = None if config.body.mjcf else file.body(example.skeleton)
+    if humanoid is None:
+        return tracker_of(folder, perpetual_run.reopen(file))
+    config.sim.apply(humanoid.model)
+    told = under(perpetual_run.WAYS, file.tensors)
+    known = RecoveryClips.of(told) if told else None
+    if known is None:
+        # As in a task that is built, see `recipes.perpetual.build`.
+        config = replace(config, recovering=replace(config.recovering, primitive="own"))
+    if config.recovery and not perpetual_run.knows_recovery(folder):
+        config, known = replace(config, recovery=False), None
+    names = file.meta["body"]["names"]
+    return _tracker(file, humanoid, example, names, config, known)
 
 
 def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
     """The latest policy of a run in `folder`, whose task is built already."""
-    policy, said = trained_policy(folder, imitation)
+    i = imitation
+    example, names = i.library.clips[0], i.library.names
+    return _tracker(read_run(folder), i.humanoid, example, names, i.config, i.recovery_clips)
+
+
+def _tracker(
+    file: RunFile, humanoid: Humanoid, example: Clip, names: Sequence[str], config: Perpetual,
+    known: RecoveryClips | None,
+) -> Tracker:  # fmt: skip
+    folder, earlier = file.path.parent, file.earlier
+    policy, said = policy_for(folder, humanoid, config.help_start)
     inner: Mapping[str, Any] = said.get("metadata", {})
-    earlier = load_checkpoint(folder / RUN_FILE)[1].get("earlier", {"samples": 0, "seconds": 0.0})
     about = {
-        "clips": list(imitation.library.names),
+        "clips": list(names),
         "stage": inner.get("stage") or inner.get("course", {}).get("stage", {}).get("kind", ""),
         "finished": (folder / FINAL).exists(),
         # With what the policy had cost that the run went on from.
@@ -126,11 +146,7 @@ def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
         "help_n": float(said["help_limit"]),
         "poise": __version__,
     }
-    example = imitation.library.clips[0]
-    value = value_of_run(folder, policy, imitation.config)
-    return Tracker(
-        policy, imitation.humanoid, example, imitation.config, about, imitation.recovery_clips, value
-    )
+    return Tracker(policy, humanoid, example, config, about, known, value_of_run(folder, policy, config))
 
 
 def value_of_run(folder: Path, policy: PolicyBundle, config: Perpetual) -> Value | None:
@@ -140,12 +156,6 @@ def value_of_run(folder: Path, policy: PolicyBundle, config: Perpetual) -> Value
         return None
     state = load_checkpoint(path)[0]
     return Value(policy, state, config.ppo.activation) if "critic/layers.0.weight" in state else None
-
-
-def export_policy(run: Path, path: Path) -> Tracker:
-    """Writes the latest policy of a run folder as one file, and returns it as the file has it."""
-    save_tracker(policy_of_run(run), path)
-    return load_tracker(path)
 
 
 def save_tracker(tracker: Tracker, path: Path) -> None:
@@ -180,23 +190,14 @@ def load_tracker(path: Path) -> Tracker:
         PoiseError: missing, damaged, of another version, or another kind of file.
     """
     tensors, meta = load_checkpoint(path)
-    _check_kind(meta, path)
-    foreign = PoiseError(
-        f"the policy was written by Poise {meta.get('poise', 'of an unknown version')} and does not fit "
-        f"this version, {__version__}",
-        path,
-        "Export it anew from its run, or install that version",
-    )
-    if meta.get("tracker") != VERSION:
-        raise foreign
+    check_policy_file(meta, path)
+    config = config_of(meta["config"], path)
+    bundle = policy_in(tensors, meta, path)
     try:
-        config = config_of(meta["config"])
         table = BodyTable.from_dict(meta["table"])
         wide = {k.removeprefix(_EXAMPLE): v.double() for k, v in tensors.items() if _EXAMPLE in k}
         example = unpack_clips(wide, [meta["example"]])[0]
         humanoid = make_humanoid(example.skeleton, table)
-        bundle = PolicyBundle.rebuild(meta["num_obs"], meta["num_actions"], meta["policy"])
-        bundle.load_state(tensors)
         about, character = meta["about"], meta["character"]
         told = {k: v.double() for k, v in under(_WAYS.rstrip("/"), tensors).items()}
         recovery_clips = RecoveryClips.of(told) if told else None
@@ -204,8 +205,8 @@ def load_tracker(path: Path) -> Tracker:
             k: v.float() if v.dtype == torch.half else v for k, v in under("value", tensors).items()
         }
         value = Value(bundle, critic, config.ppo.activation) if critic else None
-    except (PoiseError, KeyError, TypeError, ValueError, AttributeError):
-        raise foreign from None
+    except (PoiseError, KeyError, TypeError, ValueError, AttributeError, RuntimeError):
+        raise _foreign(meta, path) from None
     if humanoid.identity != character:
         raise PoiseError(
             f"the policy was trained for the character '{character}', and its body is "
@@ -218,17 +219,29 @@ def load_tracker(path: Path) -> Tracker:
     return Tracker(bundle, humanoid, example, config, about, recovery_clips, value)
 
 
-def _check_kind(meta: Mapping[str, Any], path: Path) -> None:
-    kind = meta.get("kind")
-    if kind == KIND:
-        return
-    if kind == "run":
-        raise PoiseError("it holds a run's clips and settings", path, f"Give the folder {path.parent}")
-    where = f"Give the folder {path.parent}" if (path.parent / RUN_FILE).exists() else ""
-    raise PoiseError(
-        "it holds a policy's weights without the body that they move",
+def check_policy_file(meta: Mapping[str, Any], path: Path) -> None:
+    """Refuses what is no policy file of this version, by its metadata alone.
+
+    Raises:
+        PoiseError: another kind of file, another version, or metadata that is not `TrackerMeta`.
+    """
+    if meta.get("kind") != KIND:
+        where = path.parent if (path.parent / RUN_FILE).exists() else None
+        hint = f"Give the folder {where}" if where else "Give the run's folder, or a policy file"
+        if meta.get("kind") == "run":
+            raise PoiseError("it holds a run's clips and settings alone", path, hint)
+        raise PoiseError("it holds a policy's weights without the body that they move", path, hint)
+    if meta.get("tracker") != VERSION:
+        raise _foreign(meta, path)
+    check_data(TrackerMeta, meta, path)
+
+
+def _foreign(meta: Mapping[str, Any], path: Path) -> PoiseError:
+    wrote = str(meta.get("poise", "of an unknown version"))[:40]
+    return PoiseError(
+        f"the policy was written by Poise {wrote} and does not fit this version, {__version__}",
         path,
-        where or "Give the run's folder, or a file that poise track --save-policy wrote",
+        "Export it anew from its run, or install that version",
     )
 
 

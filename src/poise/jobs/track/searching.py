@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from poise.env import Acts
-from poise.jobs.perpetual.evaluation import bare_env
 from poise.jobs.track.policy import Tracker
 from poise.jobs.track.replay import Replay
 from poise.plan import SamplingConfig, SamplingControl, SamplingResult
@@ -25,7 +24,9 @@ def search(
     threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
     """
     # Worlds that lose the motion may go bad; they are left behind.
-    env = bare_env(imitation, config.characters, 0.0, threads, "cpu", rewards=True)
+    env = imitation.bare(rewards=True).env(
+        config.characters, auto_reset=False, threads=threads, help_scale=0.0, guard=False
+    )
     try:
         return SamplingControl(env, tracker.policy, config, tracker.value, clip).run(show)
     finally:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,17 +14,19 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import run_episodes, score_rollouts
+from poise.eval import ScoreCard, record, score_rollouts
 from poise.eval.judged import judge
-from poise.jobs.deliver import simulated_clip
+from poise.jobs.deliver import finished, simulated_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
-from poise.jobs.track.crowd import crowd_env, places
-from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.crowd import Crowd, places
+from poise.jobs.track.placement import Placed, home, place
 from poise.jobs.track.points import fitted, follow
 from poise.jobs.track.policy import Tracker
 from poise.jobs.track.recovering import Losses, with_returns
 from poise.jobs.track.searching import replay, search, sentence
+from poise.kin import hold_feet
 from poise.kin.fit import widen
 from poise.metrics import mpjpe_global, success_rule
 from poise.motion import Clip, ClipLibrary
@@ -92,8 +96,8 @@ class Clean:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Tracked:
+@dataclass(frozen=True, eq=False, repr=False)
+class Tracked(Result):
     """What came of tracking.
 
     imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
@@ -118,6 +122,33 @@ class Tracked:
     def failed_s(self) -> tuple[float, ...]:
         """Seconds at which the first character failed."""
         return tuple(t for who, t in self.failures if who == 0)
+
+    @cached_property
+    def card(self) -> ScoreCard:
+        """The score of the simulation, help 0, with what holding the feet did."""
+        return finished(self.imitation, self.evaluation).card
+
+    @property
+    def clip(self) -> Clip:
+        """The first character's motion on the skeleton that came in, standing feet held."""
+        return self.delivered()
+
+    def delivered(self, character: int = 0, hold: bool = True) -> Clip:
+        """A character's motion on the skeleton that came in. hold: standing feet are held."""
+        made = self.motion(character)
+        if hold:
+            made = hold_feet(made, self.imitation.humanoid.table)[0]
+        if self.placed.moved is None:
+            return made
+        return home(made, self.placed, self.tracker).replaced(name=made.name)
+
+    def _shown(self) -> Shown:
+        return Shown(self.clip, self.placed.source, self.card, self.notes)
+
+    def _save_all(self, folder: Path) -> dict[str, Path]:
+        from poise.jobs.track.written import write
+
+        return write(self, folder).paths
 
     def motion(self, character: int = 0) -> Clip:
         """The simulated motion on the body's skeleton, as it was simulated."""
@@ -158,19 +189,18 @@ def track(
         notes.append(sentence(found, config.search, imitation.reference.rate_hz))
     if config.recover and (back := with_returns(tracker, placed, imitation, config.threads)):
         placed, imitation, acts, losses = back
-    keeper = Keeper(acts, config.reset_on_fail)
-
-    def make_env(worlds: int) -> ImitationEnv:
-        if worlds > 1:
-            keeper.env = crowd_env(imitation, worlds)
-        else:
-            keeper.env = imitation.env(1, auto_reset=False, threads=config.threads, help_scale=0.0)
-        check_fits(tracker, keeper.env)
-        return keeper.env
-
     all_of_them = torch.arange(config.count)
-    starts = torch.zeros_like(all_of_them)
-    rollouts, recordings = run_episodes(make_env, keeper, all_of_them, starts, cycles=1)
+    starts, sim = torch.zeros_like(all_of_them), imitation.config.sim
+    crowd = Crowd(imitation.humanoid, sim, config.count) if config.count > 1 else None
+    env = imitation.env(
+        1, None, False, config.threads, help_scale=0.0, guard=crowd is None, backend=crowd
+    )
+    try:
+        check_fits(tracker, env)
+        keeper = Keeper(env, acts, config.reset_on_fail)
+        rollouts, recordings = record(env, keeper, all_of_them, starts, cycles=1)
+    finally:
+        env.close()
     about, rate = tracker.about, imitation.reference.rate_hz
     card = score_rollouts(
         rollouts,
@@ -262,7 +292,6 @@ def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
     have = (tracker.policy.num_obs, tracker.policy.num_actions)
     need = (env.num_obs, env.num_actions)
     if have != need:
-        env.close()
         raise PoiseError(
             f"the policy takes {have[0]} observations and gives {have[1]} actions, and its body here "
             f"has {need[0]} and {need[1]}",
@@ -276,16 +305,15 @@ class Keeper:
     resets: off, it only acts. fallen: (world, frame) of every failure that it mended.
     """
 
-    def __init__(self, policy: Acts, resets: bool):
-        self.policy, self.resets = policy, resets
-        self.env: ImitationEnv | None = None
+    def __init__(self, env: ImitationEnv, policy: Acts, resets: bool):
+        self.env, self.policy, self.resets = env, policy, resets
         self.fallen: list[tuple[int, int]] = []
         self._limit_mm = success_rule(RULE).limit_m * 1000.0
 
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
         env = self.env
-        if self.resets and env is not None:
+        if self.resets:
             ref = env.reference.gather(env.clip, env.frame).pos
             failed = ~(mpjpe_global(env.pose().pos, ref) <= self._limit_mm)
             if bool(failed.any()):

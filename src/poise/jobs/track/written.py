@@ -7,9 +7,7 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 from poise.jobs.deliver import Delivery, deliver
-from poise.jobs.track.placement import home
 from poise.jobs.track.tracking import Tracked
-from poise.kin import hold_feet
 from poise.motion.io import home_suffix, write_clip
 
 
@@ -39,10 +37,7 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
         if k >= count:
             paths[name] = path
             continue
-        made = t.motion(k)
-        if hold:
-            made = hold_feet(made, t.imitation.humanoid.table)[0]
-        back = home(made, placed, t.tracker).replaced(name=made.name)
+        back = t.delivered(k, hold)
         body = name.replace("simulated", "body", 1)
         paths[body] = path.rename(out / f"{body}{path.suffix}")
         paths[name] = motion or out / f"{name}{home_suffix(back)}"

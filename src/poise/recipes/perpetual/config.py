@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from poise.errors import PoiseError
 from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
 from poise.plan import TrajOptConfig
 from poise.recipes.perpetual.shapes import BodyShapes
-from poise.settings import Migration, from_data
+from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
 #: Deviations from the mean at which observations are clipped where who lies must be told from who leans.
@@ -50,6 +51,7 @@ class RecoveryPlan:
     enough: float = 0.98
 
     def __post_init__(self) -> None:
+        validate(self)
         if not 0 < self.share < 1 or not 0 < self.enough <= 1:
             what = f"share must lie in (0, 1) and enough in (0, 1], got {self.share} and {self.enough}"
             raise PoiseError(what, "RecoveryPlan")
@@ -72,8 +74,9 @@ class Perpetual:
     are observed in any case. action: "absolute" as in the paper, or "additive"
     to the reference's angles. faithful: where the paper and its code disagree about Eq. 2 and about
     recovery.
-    energy: weight of the energy penalty in the code's form, 0 for none; by default that of the code's
-    composer, since with ten times as much falling early would pay, see `phc_reward.energy_term`.
+    energy: weight of the energy penalty, 0 for none; by default that of the code's composer, since with
+    ten times as much falling early would pay, see `phc_reward.energy_term`. energy_form: of the "paper",
+    squares of the hinges' power, or of the "code", its amount.
     style: the motion prior, None for none.
     termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
     "code". first: share of the episodes that begin on frame 0, as evaluations do.
@@ -114,6 +117,7 @@ class Perpetual:
     action: Literal["absolute", "additive"] = "absolute"
     faithful: Literal["paper", "code"] = "code"
     energy: float = 0.00005
+    energy_form: Literal["paper", "code"] = "code"
     style: AmpConfig | None = field(default_factory=AmpConfig)
     termination: Literal["relaxed", "all", "code"] = "relaxed"
     first: float = 0.1
@@ -160,6 +164,7 @@ class Perpetual:
     )
 
     def __post_init__(self) -> None:
+        validate(self)
         if self.max_primitives < 1:
             raise PoiseError(f"there must be at least 1 primitive, got {self.max_primitives}")
         first, last = self.shares
@@ -223,6 +228,40 @@ class Perpetual:
         }  # fmt: skip
         return cls(action="additive", **(own | changes))
 
+    @classmethod
+    def paper(cls, **changes: Any) -> Perpetual:
+        """All that the paper states, for a GPU and a week. changes: settings that differ.
+
+        PPO, the number of worlds and what of the motion prior the paper leaves open (Sec. 3.1) are the
+        code's, see `code`. Of the two ways in which a primitive begins (Sec. 3.2), lateral connections
+        to random weights are taken; start="copy", lateral=False is the other.
+
+        Not expressed: the SMPL body with its gains (kd = 0.1 kp here as there), a composer whose weights
+        only have to be positive (softmax), and an episode that is worth nothing after its last frame.
+        """
+        own: dict[str, Any] = {
+            "faithful": "paper", "energy_form": "paper", "termination": "relaxed",
+            "style": AmpConfig.phc("paper"), "mining": MiningConfig.phc("paper"),
+            "start": "random", "lateral": True, "combine": "product", "weights": "softmax",
+        }  # fmt: skip
+        return cls(**(_PHC | own | changes))
+
+    @classmethod
+    def code(cls, **changes: Any) -> Perpetual:
+        """All that the authors' code does, of the version with the paper; changes: settings that differ.
+
+        Not expressed: action noise on the composer's weights (here on the actions), the energy weight of
+        0.00005 in the composer's stage alone, gains that differ between the SMPL body's joints, a critic
+        and a discriminator that share PPO's optimiser, a new set of clips in memory every 500 epochs,
+        fallen starts alone until a given epoch, and an episode that is worth nothing after its end.
+        """
+        own: dict[str, Any] = {
+            "faithful": "code", "energy_form": "code", "termination": "code",
+            "style": AmpConfig.phc("code"), "mining": MiningConfig.phc("code"),
+            "start": "copy", "lateral": False, "combine": "means", "weights": "relu",
+        }  # fmt: skip
+        return cls(**(_PHC | own | changes))
+
     @property
     def widens(self) -> bool:
         """Whether ranges of hinges may grow after training: absolute targets are shares of them."""
@@ -239,6 +278,26 @@ class Perpetual:
         """N and N m that are left at the end."""
         return 0.0
 
+
+#: What `Perpetual.paper` and `.code` share. The paper: goals, absolute actions, no help, networks of
+#: 1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds, steps.
+_PHC: dict[str, Any] = {
+    "goal": "rotations", "shape": False, "action": "absolute", "energy": 0.0005, "first": 0.0,
+    "recovery": True, "recovering": RecoveryPlan(primitive="own", demonstrations=0),
+    "multiplicative": True, "progressive": True, "single": False, "max_primitives": 3,
+    "composer_hidden": (1024, 512), "composer_clone": False, "expert": False, "trajopt": None,
+    "help_start": 0.0, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip",
+    "cooling": 0.0, "num_envs": 3072, "horizon": 300,
+    "body": BodyConfig(damping=0.1, armature=0.02),
+    "sim": SimConfig(rate_hz=60.0, control_hz=30.0),
+    "ppo": PPOConfig(
+        horizon=32, minibatch=16_384, epochs=6, gamma=0.99, lam=0.95, clip=0.2, policy_lr=2e-5,
+        value_lr=2e-5, policy_grad_norm=50.0, value_grad_norm=50.0, policy_hidden=(1024, 512),
+        value_hidden=(1024, 512), activation="relu", std=math.exp(-2.9), bound_weight=10.0,
+        bound_limit=1.0, kl_target=None, kl_stop=None, normalise_returns=True, obs_clip=5.0,
+        bootstrap_timeouts=True,
+    ),
+}  # fmt: skip
 
 #: What earlier versions called the settings, and what their runs did that name none.
 MIGRATION = Migration(

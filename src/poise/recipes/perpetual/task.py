@@ -36,8 +36,7 @@ from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_recovery import recovery_terms
 from poise.kin import fit_humanoid
 from poise.kin.place import on_own_body
-from poise.motion import Clip, ClipLibrary
-from poise.recipes.imitation import Imitation
+from poise.recipes.imitation import Clips, Imitation, as_library
 from poise.recipes.perpetual.config import Perpetual, Recovers, RecoveryPlan
 from poise.recipes.perpetual.recovery import known_recovery_clips
 from poise.recipes.perpetual.shapes import shaped
@@ -88,7 +87,7 @@ def _rewards(config: Perpetual, recovers: bool) -> tuple[RewardTerm, ...]:
     rewards = phc_reward.imitation_terms(config.faithful)
     if config.energy:
         halved = config.style.task_weight if config.style else 1.0
-        rewards += (phc_reward.energy_term(halved, weight=config.energy),)
+        rewards += (phc_reward.energy_term(halved, config.energy_form, config.energy),)
     if config.help_start:
         rewards += (RewardTerm("residual", reward.residual, 0.1, imitation=False),)
     return recovery_terms(rewards, config.faithful) if recovers else rewards
@@ -123,16 +122,13 @@ def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:
     return PDTargets("absolute", range_scale(ranges))
 
 
-def build(
-    library: ClipLibrary | Clip, config: Perpetual | None = None, table: BodyTable | None = None
-) -> Imitation:
+def build(library: Clips, config: Perpetual | None = None, table: BodyTable | None = None) -> Imitation:
     """Body, reference and task for a library of one skeleton; train it with `perpetual.run.train`.
 
     table: the body of a policy that goes on to learn, see `fit_humanoid`; by default one is made.
     """
     config = config or Perpetual()
-    library = ClipLibrary.of(library) if isinstance(library, Clip) else library
-    library, own = on_own_body(library, config.body)
+    library, own = on_own_body(as_library(library), config.body)
     widens = table is None or config.widens
     table = table or own
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)

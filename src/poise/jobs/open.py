@@ -1,0 +1,191 @@
+"""Opening what was trained: a run folder, a result with one inside, a policy file, a network's file.
+
+run = open_run("out")                 # what `poise imitate walk.bvh -o out` wrote
+run.card, run.clip(), run.evaluate(help_limit=0.0)
+open_run().tracker                    # the policy that comes with Poise
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from poise.errors import PoiseError, did_you_mean
+from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.run_file import (
+    RUN_FILE,
+    InbetweenMeta,
+    RunFile,
+    RunMeta,
+    learning_curve,
+    run_folder,
+)
+from poise.jobs.runs import Evaluation, episode, evaluate, reopen, score, trained_policy
+from poise.jobs.track.policy import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
+from poise.learn import PolicyBundle, load_checkpoint
+from poise.learn.model import MODEL, InbetweenModel, load_model
+from poise.recipes.perpetual.config import config_of as perpetual_config
+from poise.recipes.perpetual.task import RECIPE as PERPETUAL
+from poise.recipes.residual_force import RECIPE as RESIDUAL_FORCE
+from poise.recipes.residual_force import config_of
+from poise.settings import check_data, from_data
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from poise.eval import ScoreCard
+    from poise.motion import Clip
+    from poise.recipes.imitation import Imitation
+
+#: The name of the recipe of in-betweening networks.
+INBETWEEN = "inbetween"
+
+
+@dataclass(eq=False, repr=False)
+class Run:
+    """What was trained, opened; everything in it is read or built when it is asked for.
+
+    path: the run folder, or the file. recipe: "residual-force", "perpetual" or "inbetween". config: the
+    recipe's settings, None in the file of an in-betweening network.
+    """
+
+    path: Path
+    recipe: str
+    config: Any
+    file: RunFile | None = None
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r}, {self.recipe})"
+
+    @cached_property
+    def task(self) -> Imitation:
+        """The task as the latest policy knows it, rebuilt from the run's own clips.
+
+        Raises:
+            PoiseError: a policy or network file, which holds no clips.
+        """
+        if self.file is None or self.recipe == INBETWEEN:
+            raise PoiseError("it holds no clips to simulate", self.path, "Give the folder of a run")
+        return (perpetual_run.reopen if self.recipe == PERPETUAL["name"] else reopen)(self.file)
+
+    @property
+    def policy(self) -> PolicyBundle:
+        """The latest policy; it acts deterministically on raw observations."""
+        return self.tracker.policy if self.file is None else self.trained[0]
+
+    @cached_property
+    def trained(self) -> tuple[PolicyBundle, dict[str, Any]]:
+        """The latest policy and what its checkpoint says, "help_limit" among it: N that it was left."""
+        return trained_policy(self.path, self.task)
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """The policy with its body, which tracks any motion.
+
+        Raises:
+            PoiseError: a run of another recipe, or nothing was trained in it.
+        """
+        if self.recipe == INBETWEEN:
+            raise PoiseError("it holds a network that fills keyframes, and no policy", self.path)
+        return load_tracker(self.path) if self.file is None else policy_of_run(self.file)
+
+    @cached_property
+    def model(self) -> InbetweenModel:
+        """The network that fills keyframes.
+
+        Raises:
+            PoiseError: a run of another recipe, or nothing was trained in it.
+        """
+        if self.recipe != INBETWEEN:
+            hint = "Give a run of poise train inbetween"
+            raise PoiseError("it holds a policy, and no network that fills keyframes", self.path, hint)
+        return load_model(self.path)
+
+    def evaluate(
+        self,
+        rule: str = "phc",
+        help_limit: float | None = None,
+        most: int | None = None,
+        device: str = "cpu",
+    ) -> Evaluation:
+        """Simulates start frames of the run's clips to their ends, see `runs.evaluate`."""
+        return evaluate(self.task, *self.trained, rule, help_limit, most, device)
+
+    def score(
+        self, rule: str = "phc", help_limit: float | None = None, device: str = "cpu"
+    ) -> ScoreCard:
+        """The score card of `evaluate`, also of large libraries."""
+        return score(self.task, *self.trained, rule, help_limit, device)
+
+    @cached_property
+    def card(self) -> ScoreCard:
+        """The score card of all start frames, simulated when it is first asked for."""
+        return self.score()
+
+    def episode(self, clip: int | str = 0, frame: int = 0) -> Evaluation:
+        """One episode of a clip (its number or name) from one of its control frames."""
+        names = self.task.library.names
+        if isinstance(clip, str):
+            if clip not in names:
+                raise PoiseError(f"the run has no clip '{clip}'. {did_you_mean(clip, names)}", self.path)
+            clip = names.index(clip)
+        if not 0 <= clip < len(names):
+            raise PoiseError(f"the run has clips 0 to {len(names) - 1}, got {clip}", self.path)
+        if not 0 <= frame < int(self.task.reference.length[clip]) - 1:
+            raise PoiseError(f"'{names[clip]}' has no step after its frame {frame}", self.path)
+        return episode(self.task, *self.trained, clip, frame)
+
+    def clip(self, clip: int | str = 0) -> Clip:
+        """The simulated motion of one of the run's clips on the skeleton that it came on."""
+        from poise.jobs.deliver import simulated_clip
+
+        return simulated_clip(self.task, self.episode(clip))
+
+    @property
+    def curve(self) -> dict[str, np.ndarray]:
+        """The columns of the learning curve by name; empty where nothing was logged."""
+        return learning_curve(self.path) if self.path.is_dir() else {}
+
+
+def open_run(path: Path | str | None = None) -> Run:
+    """What was trained in a folder or a file; without a path the policy that comes with Poise.
+
+    Args:
+        path: a run folder, a result folder with one in it, a policy file, or an in-betweening network.
+
+    Raises:
+        PoiseError: there is nothing, it is damaged, or it is something else.
+    """
+    path = SHIPPED if path is None else Path(path)
+    if path.is_dir() and not (path / RUN_FILE).exists() and (path / MODEL).exists():
+        path = path / MODEL
+    if not path.exists():
+        hint = "Give the folder of a run or a result, or a policy file"
+        raise PoiseError("there is no such file or folder", path, hint)
+    if path.is_dir():
+        return _folder(run_folder(path))
+    _, meta = load_checkpoint(path)
+    if meta.get("kind") == "inbetween model":
+        return Run(path, INBETWEEN, None)
+    check_policy_file(meta, path)
+    return Run(path, PERPETUAL["name"], perpetual_config(meta["config"], path))
+
+
+def _folder(folder: Path) -> Run:
+    path = folder / RUN_FILE
+    tensors, meta = load_checkpoint(path)
+    if meta.get("kind") == "inbetween run":
+        # It takes longer to import than a policy takes to open.
+        from poise.jobs.inbetween.training import Inbetween
+
+        check_data(InbetweenMeta, meta, path)
+        return Run(folder, INBETWEEN, from_data(Inbetween, meta["config"], path))
+    check_data(RunMeta, meta, path)
+    file = RunFile(path, meta, tensors)
+    known = {PERPETUAL["name"]: perpetual_config, RESIDUAL_FORCE["name"]: config_of}
+    if file.recipe not in known:
+        raise PoiseError(f"there is no recipe '{json.dumps(file.recipe)[1:40]}'", path)
+    return Run(folder, file.recipe, known[file.recipe](meta["config"], path), file)

@@ -1,0 +1,45 @@
+"""Settings by name: what a paper states, what its code does, and what is fast here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from poise.errors import PoiseError, did_you_mean
+from poise.jobs.inbetween.training import Inbetween, small
+from poise.motion import Clip
+from poise.recipes.perpetual import Perpetual
+from poise.recipes.residual_force import ResidualForce
+
+#: The names of presets.
+NAMES = ("paper", "code", "fast")
+
+_PRESETS: dict[str, dict[str, Callable[..., Any]]] = {
+    "residual-force": {
+        "paper": ResidualForce.paper, "code": ResidualForce.code, "fast": lambda _: ResidualForce(),
+    },
+    "perpetual": {
+        "paper": lambda _: Perpetual.paper(), "code": lambda _: Perpetual.code(),
+        "fast": lambda _: Perpetual.additive(),
+    },
+    "inbetween": {
+        "paper": lambda _: Inbetween.paper(), "code": lambda _: Inbetween.code(),
+        "fast": lambda _: small(Inbetween()),
+    },
+}  # fmt: skip
+
+
+def preset_of(recipe: str, name: str, clip: Clip | None = None) -> Any:
+    """The settings of a recipe ("residual-force", "perpetual" or "inbetween") by the name of a preset.
+
+    clip: what is imitated, by which the paper chooses its reward and the code its damping.
+
+    Raises:
+        PoiseError: a recipe or a preset that there is not.
+    """
+    if recipe not in _PRESETS:
+        raise PoiseError(f"there is no recipe '{recipe}'", hint=did_you_mean(recipe, list(_PRESETS)))
+    known = _PRESETS[recipe]
+    if name not in known:
+        raise PoiseError(f"{recipe} has no preset '{name}'", hint=did_you_mean(name, list(known)))
+    return known[name](clip)

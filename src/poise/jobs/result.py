@@ -1,0 +1,75 @@
+"""What the verbs of `import poise` give back: a motion, its score, what is to be said about it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import NamedTuple
+
+from poise.eval import ScoreCard
+from poise.eval import table as rows_of
+from poise.motion import Clip, read_clip
+from poise.motion.io import check_writable, write_clip
+from poise.view.notebook import result_html
+
+
+class Shown(NamedTuple):
+    """What a result shows of itself.
+
+    clip: the motion on the skeleton that came in. source: what came in. card: the score of the
+    simulation, None where nothing was simulated. notes: sentences. keys: frames that stand out.
+    """
+
+    clip: Clip
+    source: Clip
+    card: ScoreCard | None
+    notes: tuple[str, ...]
+    keys: tuple[int, ...] = ()
+
+
+class Result(ABC):
+    """A motion that a verb made. Each has `clip`, `card`, `notes`, and what its own class says."""
+
+    @abstractmethod
+    def _shown(self) -> Shown: ...
+
+    @abstractmethod
+    def _save_all(self, folder: Path) -> dict[str, Path]: ...
+
+    def save(self, path: str | Path) -> dict[str, Path]:
+        """Writes the motion into the file `path`, or all there is into the folder `path`; what was
+        written, by name.
+
+        Raises:
+            PoiseError: a suffix of no motion format, or nothing can be written there.
+        """
+        path = Path(path)
+        if path.suffix and not path.is_dir():
+            check_writable(path)
+            write_clip(self._shown().clip, path)
+            return {"motion": path}
+        path.mkdir(parents=True, exist_ok=True)
+        return self._save_all(path)
+
+    def __repr__(self) -> str:
+        _, source, card, _, _ = self._shown()
+        said = f"{type(self).__name__}({source.name!r}, {source.seconds:.1f} s"
+        if card is not None:
+            said += f", success {card.succ:.0%}, {card.mpjpe_mm:.0f} mm"
+            said += f", help {card.help.force_mean_n:.1f} N"
+        return said + ")"
+
+    def _repr_html_(self) -> str:
+        """A picture and a table for notebooks, self-contained."""
+        clip, source, card, notes, keys = self._shown()
+        rows = () if card is None else rows_of(card)
+        return result_html(source.name, clip, source, rows, notes, keys)
+
+
+def clip_of(motion: Clip | str | Path) -> Clip:
+    """A clip as it is, or that in a file.
+
+    Raises:
+        PoiseError: the file cannot be read.
+    """
+    return motion if isinstance(motion, Clip) else read_clip(motion)

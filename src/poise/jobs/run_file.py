@@ -1,0 +1,204 @@
+"""The file that says what a run is: its clips, its settings, its body; and where run folders lie.
+
+OUT/                        what a verb wrote: motions, score.json, report.html
+OUT/run/                    the run folder itself
+    run.safetensors         the run file
+    checkpoint.safetensors  the trainer's whole state (`learn.run`)
+    policy.safetensors      the policy of a run that came to an end by itself; it needs no help
+    log.csv                 the learning curve
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypedDict
+
+import numpy as np
+from torch import Tensor
+
+from poise.body import BodyTable, Humanoid
+from poise.body.humanoid import make_humanoid
+from poise.errors import PoiseError
+from poise.learn import LATEST, load_checkpoint, save_checkpoint
+from poise.motion import ClipLibrary, Skeleton
+from poise.motion.pack import pack_clips, unpack_clips
+
+#: The file that says what a run is.
+RUN_FILE = "run.safetensors"
+#: The policy of a run that comes to an end by itself; it needs no help.
+FINAL = "policy.safetensors"
+
+
+class _ClipNote(TypedDict):
+    name: str
+    fps: float
+    cyclic: bool
+    names: list[str]
+    parents: list[int]
+    ends: list[list[Any]]
+    source: dict[str, Any]
+
+
+class _Earlier(TypedDict):
+    samples: int
+    seconds: float
+
+
+class _Body(TypedDict):
+    table: dict[str, Any]
+    names: list[str]
+
+
+class _Run(TypedDict):
+    kind: Literal["run"]
+    config: dict[str, Any]
+    clips: list[_ClipNote]
+
+
+class RunMeta(_Run, total=False):
+    """The metadata of a run file.
+
+    source: where the clips are from. character: the identity of the body. earlier: what the policy had
+    cost from which the run went on, and table its body. body: that of the run, with the names of the
+    clips that are learned; runs of earlier versions are without.
+    """
+
+    recipe: str
+    source: str
+    character: str
+    earlier: _Earlier
+    table: dict[str, Any]
+    body: _Body
+
+
+class InbetweenMeta(TypedDict):
+    """The metadata of the run file of an in-betweening network."""
+
+    config: dict[str, Any]
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class RunFile:
+    """A run file that was read: its metadata, as `RunMeta` says, and its tensors."""
+
+    path: Path
+    meta: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]
+
+    @property
+    def recipe(self) -> str:
+        """The recipe's name; runs of the first versions do not name it."""
+        return self.meta.get("recipe", "residual-force")
+
+    @property
+    def earlier(self) -> Mapping[str, Any]:
+        """What the policy had cost that the run went on from."""
+        return self.meta.get("earlier", {"samples": 0, "seconds": 0.0})
+
+    def library(self) -> ClipLibrary:
+        """The clips that the run learns."""
+        try:
+            return ClipLibrary(tuple(unpack_clips(self.tensors, self.meta["clips"])))
+        except PoiseError as problem:
+            raise PoiseError(problem.what, problem.where or self.path, problem.hint) from None
+
+    def table(self) -> BodyTable | None:
+        """The body of the policy that the run went on from, None where it made its own."""
+        return self._table(self.meta["table"]) if "table" in self.meta else None
+
+    def body(self, skeleton: Skeleton) -> Humanoid | None:
+        """The run's body on its clips' skeleton, None where the file does not hold it.
+
+        Raises:
+            PoiseError: it is not the body by which the run calls itself.
+        """
+        if "body" not in self.meta:
+            return None
+        made = make_humanoid(skeleton, self._table(self.meta["body"]["table"]))
+        if made.identity != self.meta.get("character"):
+            raise PoiseError("its body is not that of its policy", self.path, "The file is damaged")
+        return made
+
+    def _table(self, data: Any) -> BodyTable:
+        try:
+            return BodyTable.from_dict(data)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as problem:
+            raise PoiseError(f"the body in it cannot be read ({problem})", self.path) from None
+
+
+def run_folder(path: Path) -> Path:
+    """The run folder that `path` names: itself, or the `run` or `learned` folder inside a result.
+
+    Raises:
+        PoiseError: there is no run in it.
+    """
+    for folder in (path, path / "run", path / "learned"):
+        if (folder / RUN_FILE).exists():
+            return folder
+    if not path.exists():
+        raise PoiseError("there is no such folder", path, "Give the folder of a result or a run")
+    what = f"is no run folder: there is no {RUN_FILE} in it"
+    raise PoiseError(what, path, "Give the folder of a result, or the 'run' folder in it")
+
+
+def read_run(folder: Path) -> RunFile:
+    """The run file of a run folder.
+
+    Raises:
+        PoiseError: there is none, or it is damaged or of another kind.
+    """
+    path = folder / RUN_FILE
+    if not path.exists():
+        path = run_folder(folder) / RUN_FILE
+    tensors, meta = load_checkpoint(path, RunMeta)
+    return RunFile(path, meta, tensors)
+
+
+def write_run(
+    folder: Path,
+    clips: ClipLibrary,
+    meta: Mapping[str, Any],
+    tensors: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Writes the run file, whole or not at all.
+
+    meta: that of `RunMeta` but for what is said of the clips. tensors: more than those of the clips.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    packed, notes = pack_clips(clips.clips)
+    save_checkpoint(
+        folder / RUN_FILE, packed | dict(tensors or {}), {"kind": "run", **meta, "clips": notes}
+    )
+
+
+def body_facts(humanoid: Humanoid, names: tuple[str, ...]) -> dict[str, Any]:
+    """What a run file says of its body, so that it need not be made from all clips again."""
+    body = {"table": humanoid.table.to_dict(), "names": list(names)}
+    return {"character": humanoid.identity, "body": body}
+
+
+def latest_policy(folder: Path) -> Path:
+    """The file of a run's policy: that of the finished run, else the last checkpoint.
+
+    Raises:
+        PoiseError: nothing was trained yet.
+    """
+    path = folder / FINAL if (folder / FINAL).exists() else folder / LATEST
+    if not path.exists():
+        raise PoiseError("nothing has been trained in it yet", folder, "Train it with --resume first")
+    return path
+
+
+def learning_curve(folder: Path) -> dict[str, np.ndarray]:
+    """Columns of the run's CSV by name; empty where nothing was trained."""
+    path = next(iter(sorted(folder.glob("*.csv"))), None)
+    if path is None:
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = rows[0].keys() if rows else ()
+    return {name: np.array([float(r[name] or "nan") for r in rows]) for name in names}
