@@ -237,7 +237,7 @@ def test_presets_by_name() -> None:
         if default is not None:
             assert preset_of(recipe, "fast") == default
     assert isinstance(preset_of("inbetween", "fast"), Inbetween)
-    with pytest.raises(PoiseError, match="no preset 'papr'. Did you mean 'paper'"):
+    with pytest.raises(PoiseError, match=r"no preset 'papr'\. Did you mean 'paper'"):
         preset_of("perpetual", "papr")
     with pytest.raises(PoiseError, match="no recipe 'phc'"):
         preset_of("phc", "paper")
