@@ -16,7 +16,7 @@ help:
 	@echo "make test    run the tests"
 	@echo "make check   lint, formatting, types, order of imports"
 	@echo "make format  mend formatting and simple lint"
-	@echo "make bench   measure the figures of the README on the CMU clips in DATA=FOLDER"
+	@echo "make bench   measure a walk and a cartwheel again on the CMU clips in DATA=FOLDER"
 	@echo "make docs    check the links of the documents"
 	@echo "make clean   remove $(VENV), demo/ and caches"
 

@@ -21,7 +21,7 @@ from poise.jobs.track.noise import robustness
 from poise.jobs.track.points import points_of
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip
-from poise.motion.io.raw import Options as Stated
+from poise.motion.io.raw import ReadOptions as Stated
 from poise.motion.noise import robustness_levels
 
 

@@ -95,10 +95,8 @@ def test_python_snippets_run(
         shutil.copytree(request.getfixturevalue("net"), tmp_path / "net")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
-    if "imitate(" in code:
-        assert {"simulated.bvh", "score.json", "report.html", "run"} <= {
-            p.name for p in (tmp_path / "out").iterdir()
-        }
+    if '.save("out")' in code:
+        assert {"score.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
 
 
 def test_commands_are_shown() -> None:

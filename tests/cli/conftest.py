@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tiny_clips import deepmimic, put
@@ -31,8 +33,22 @@ def listing(folder: Path) -> list[str]:
 
 
 @pytest.fixture
+def answered(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    """Runs a command line with --json; gives the document, which alone stands on stdout."""
+
+    def check(*argv: object, code: int = 0) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main([*map(str, argv), "--json"]) == code
+        document = json.loads(capsys.readouterr().out)
+        assert document["exit_code"] == code and document["verb"] == argv[0]
+        return document
+
+    return check
+
+
+@pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Runs a command line that must fail: exit code 2, one line, nothing written in `tmp_path`."""
+    """Runs a command line that must fail: exit code 2, one error line, nothing written in `tmp_path`."""
 
     def check(*argv: object, words: tuple[str, ...] = ()) -> str:
         before = listing(tmp_path)
@@ -41,7 +57,8 @@ def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[...,
         said, complained = capsys.readouterr()
         assert code == 2, complained
         lines = complained.splitlines()
-        assert len(lines) == 1 and lines[0].startswith("error: "), complained
+        # What it reads is said before it is read.
+        assert [x.startswith("error: ") for x in lines[-2:]] in ([True], [False, True]), complained
         assert "Traceback" not in complained + said
         for word in words:
             assert word in complained

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poise.cli.fleet import _is_clip
+from poise.cli.folder import _is_clip
 from poise.cli.main import main
 from poise.motion import read_clip, write_clip
 

@@ -43,7 +43,7 @@ def test_imitate_writes_everything(trained: Path, capsys: pytest.CaptureFixture[
     assert 0 < score["help"]["limit_n"] <= 100
     assert iterations(trained / "run") == [1, 2]
     assert main(["info", "--json", str(trained / "simulated.bvh")]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json.loads(capsys.readouterr().out)["result"]
     assert facts["frames"] == 16 and facts["fps"] == pytest.approx(30, rel=1e-4)
 
 
@@ -56,7 +56,7 @@ def test_the_motion_goes_into_the_file_that_was_named(
     assert {p.name for p in (tmp_path / "moved").iterdir()} == {"score.json", "report.html", "run"}
     assert str(out) in capsys.readouterr().out
     assert main(["info", "--json", str(out)]) == 0
-    assert json.loads(capsys.readouterr().out)["format"] == "gltf"
+    assert json.loads(capsys.readouterr().out)["result"]["format"] == "gltf"
 
 
 def test_a_file_that_cannot_be_written_is_refused_before_any_work(
@@ -107,14 +107,14 @@ def test_play_opens_the_page_when_asked(
     assert opened == [page.as_uri()]
 
 
-def test_eval_gives_the_score_of_the_result(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main(["eval", str(trained), "--json"]) == 0
-    said, complained = capsys.readouterr()
+def test_eval_gives_the_score_of_the_result(
+    trained: Path, capsys: pytest.CaptureFixture[str], answered
+) -> None:
+    said = answered("eval", trained)["result"]
     result = json.loads((trained / "score.json").read_text())
     # Only a delivery writes a motion whose feet can be told.
     assert result.pop("delivered")[0]["delivered"]["penetration_mm"] < 0.01
-    assert json.loads(said) == {**result, "delivered": []} and complained == ""
+    assert said == {**result, "delivered": []}
     assert main(["eval", str(trained / "run"), "--rule", "any_25cm"]) == 0
     assert "Success (any_25cm)" in capsys.readouterr().out
 
@@ -153,3 +153,17 @@ def test_claimed_leaves_no_folder_after_a_failure(tmp_path: Path) -> None:
 
 def test_clock() -> None:
     assert [clock(s) for s in (0, 59.6, 245, 3725)] == ["0:00", "1:00", "4:05", "1:02:05"]
+
+
+def test_ctrl_c_while_cloning_says_that_nothing_is_saved(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("poise.jobs.runs.start_training", stopped)
+    assert main(["imitate", str(clip), "-o", str(tmp_path / "out"), *MINIATURE]) == 130
+    told = capsys.readouterr().err
+    assert (
+        "Stopped before there was anything to save. Begin again with:" in told and "saved." not in told
+    )

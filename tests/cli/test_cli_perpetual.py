@@ -93,7 +93,7 @@ def test_all_stages_by_one_command(
     assert result["clips"] == 2 and result["help_n"] == 0.0 and result["iterations"] <= 4
     # The run is evaluated and played as any other, without help.
     assert main(["eval", str(out), "--json"]) == 0
-    score = json.loads(capsys.readouterr().out)
+    score = json.loads(capsys.readouterr().out)["result"]
     assert score["method"] == "perpetual" and score["help"]["limit_n"] == 0.0
     assert score["samples"] == result["samples"] > 0
     assert main(["play", str(out), "--clip", "nobody"]) == 2

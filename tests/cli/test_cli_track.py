@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tiny_clips import deepmimic, put
 
+from poise.cli.answer import LOST
 from poise.cli.main import main
 from poise.jobs.open import open_run
 from poise.motion import read_clip, trim, write_clip
@@ -36,7 +37,8 @@ def file(run: Path, short: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = tmp_path_factory.mktemp("policy")
     path = folder / "policy.safetensors"
     argv = ["track", str(short), "--policy", str(run), "-o", str(folder / "out")]
-    assert main([*argv, "--save-policy", str(path)]) == 0
+    # A policy that was trained for three iterations loses it.
+    assert main([*argv, "--save-policy", str(path)]) == LOST
     return path
 
 
@@ -44,9 +46,9 @@ def test_motion_score_and_report(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "made.bvh"
-    assert main(["track", str(short), "--policy", str(file), "-o", str(out)]) == 0
+    assert main(["track", str(short), "--policy", str(file), "-o", str(out)]) == LOST
     said = capsys.readouterr().out
-    assert "The character failed at" in said and "--reset-on-fail puts it back" in said
+    assert "Lost: the character failed at" in said and "--reset-on-fail puts it back" in said
     assert str(out) in said and (tmp_path / "made/report.html").exists()
     score = json.loads((tmp_path / "made/score.json").read_text())
     assert score["episodes"] == 1 and score["help"]["limit_n"] == 0.0
@@ -62,7 +64,7 @@ def test_a_motion_that_is_lost_is_learned(
     out = tmp_path / "made.bvh"
     argv = ["track", str(short), "--policy", str(file), "-o", str(out), "--threads", "1", "--learn"]
     before = file.read_bytes()
-    assert main([*argv, "0.02"]) == 0
+    assert main([*argv, "0.02"]) == LOST
     said = capsys.readouterr()
     assert "loses the motion at" in said.err and "minutes at most" in said.err
     assert "it gets to" in said.err and "Learned 0:0" in said.err
@@ -73,7 +75,8 @@ def test_a_motion_that_is_lost_is_learned(
     assert score["samples"] == about["samples"] > open_run(file).tracker.about["samples"]
     # A tiny network does not learn it in a second; more minutes go on.
     assert "--learn 0.04" in said.out
-    assert main([*argv, "0.04"]) == 0
+    # The results are those of its own run.
+    assert main([*argv, "0.04"]) == LOST
     assert open_run(tmp_path / "made/learned").tracker.about["samples"] > about["samples"]
 
 
@@ -81,8 +84,9 @@ def test_a_motion_that_is_lost_is_looked_for(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["track", str(short), "--policy", str(file), "-o", str(tmp_path / "o.bvh"), "--search"]
-    assert main([*argv, "--characters", "16", "--threads", "1"]) == 0
+    code = main([*argv, "--characters", "16", "--threads", "1"])
     said = capsys.readouterr()
+    assert code == (0 if "Found to its end" in said.out else LOST)
     assert "0 % searched" in said.err and "16 characters looked for it" in said.out
     score = json.loads((tmp_path / "o/score.json").read_text())
     assert score["method"] == "perpetual-single, searched" and score["help"]["limit_n"] == 0.0
@@ -111,7 +115,7 @@ def test_another_skeleton_with_noise_and_resets(
     person = put(tmp_path, "person.txt", deepmimic(45))
     out = tmp_path / "out"
     argv = ["track", str(person), "--policy", str(file), "-o", str(out), "--noise", "jitter:0.2"]
-    assert main([*argv, "--seed", "3", "--reset-on-fail"]) == 0
+    assert main([*argv, "--seed", "3", "--reset-on-fail"]) == LOST
     said = capsys.readouterr().out
     assert "on another skeleton" in said and "without noise" in said
     back = read_clip(out / "simulated.bvh")
@@ -119,9 +123,24 @@ def test_another_skeleton_with_noise_and_resets(
     assert (out / "body.bvh").exists()
 
 
+def test_the_report_tells_of_the_file_that_came_in(
+    file: Path, tmp_path: Path, refused, capsys: pytest.CaptureFixture[str]
+) -> None:
+    person, out = put(tmp_path, "person.txt", deepmimic(45)), tmp_path / "out"
+    main(["track", str(person), "--policy", str(file), "-o", str(out)])
+    page = (out / "report.html").read_text("utf-8")
+    assert "deepmimic" in page and "The file states no unit" not in page
+    put(out, "score.json", "{}")
+    for verb in ("eval", "play"):
+        refused(verb, out, words=("result of poise track", "report.html"))
+    (out / "learned").mkdir()
+    put(out / "learned", "run.safetensors", "")
+    refused("eval", out, words=(str(out / "learned"),))
+
+
 def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["track", str(short), "--policy", str(file), "-o", str(out), "--count", "2"]) == 0
+    assert main(["track", str(short), "--policy", str(file), "-o", str(out), "--count", "2"]) == LOST
     assert "0 of 2 characters tracked all" in capsys.readouterr().out
     assert {p.name for p in out.iterdir()} == {
         "simulated_short-1.bvh", "simulated_short-2.bvh", "score.json", "report.html"

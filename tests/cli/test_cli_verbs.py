@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import subprocess
 import sys
@@ -60,11 +59,31 @@ def test_version_and_help_come_quickly_and_without_torch() -> None:
     assert done.stdout == f"poise {poise.__version__}\n" and done.returncode == 0
     # A loaded machine gets some slack; the command itself takes 0.1 s.
     assert time.perf_counter() - start < 2.0
+    for argv, heavy in (
+        *((x, ("torch", "mujoco", "numpy", "rich", "tyro")) for x in ([], ["--help"], ["--version"])),
+        (["imitate", "--help"], ("torch", "mujoco", "numpy")),
+    ):
+        code = f"import sys, poise.cli.main as m; code = m.main({argv}); "
+        code += f"sys.exit(code or 3 * any(x in sys.modules for x in {heavy}))"
+        assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0, argv
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str) -> None:
+    argv = {
+        "doctor": [],
+        "convert": ["a.bvh", "b.bvh"],
+        "retarget": ["a.bvh", "--onto", "b.bvh", "-o", "c.bvh"],
+        "train": ["residual-force", "a.bvh", "-o", "out"],
+        "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
+    }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "fleet") else [])])
     code = (
-        "import sys, poise.cli.main as m; code = m.main(['imitate', '--help']); "
-        "sys.exit(code or 3 * any(x in sys.modules for x in ('torch', 'mujoco', 'numpy')))"
+        "import sys, poise.cli.console as c, poise.cli.main as m\n"
+        "def tell(text, style=''):\n"
+        "    sys.exit(7 + any(x in sys.modules for x in ('torch', 'mujoco', 'numpy')))\n"
+        f"c.tell = tell\nsys.exit(m.main({[verb, *argv]}))"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 7
 
 
 def test_an_unknown_verb_is_answered_with_the_nearest(refused) -> None:
@@ -95,8 +114,9 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     from typing import get_type_hints
 
     from poise.cli.train import RECIPES
+    from poise.jobs import inbetween
     from poise.metrics.tracking import RULES
-    from poise.recipes import RECIPE, ResidualForce, inbetween, perpetual
+    from poise.recipes import RECIPE, ResidualForce, perpetual
 
     hints = get_type_hints(ResidualForce)
     assert hints["method"] == options.Method and hints["reward"] == options.Reward
@@ -113,40 +133,42 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     assert (plain.help_start, plain.help_limit) == (mine.help_start, mine.help_limit) == (100.0, 0.0)
 
 
-def test_info_json_holds_exactly_the_keys(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(clip), "--json"]) == 0
-    said, complained = capsys.readouterr()
-    facts = json.loads(said)
-    assert tuple(facts) == KEYS and complained == ""
+def test_info_json_holds_exactly_the_keys(clip: Path, answered) -> None:
+    facts = answered("info", clip)["result"]
+    assert tuple(facts) == KEYS
     assert facts["frames"] == 16 and facts["format"] == "deepmimic" and facts["unit_m"] == 1.0
 
 
-def test_info_of_several_clips(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_several_clips(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], answered
+) -> None:
     walk = put(tmp_path, "walk [bold].bvh", bvh())
     assert main(["info", str(clip), str(walk)]) == 0
     said = capsys.readouterr().out
     assert "walk [bold].bvh" in said and "The file states no unit" in said and "15" in said
-    assert main(["info", "--json", str(clip), str(walk)]) == 0
-    assert [f["format"] for f in json.loads(capsys.readouterr().out)] == ["deepmimic", "bvh"]
+    assert [f["format"] for f in answered("info", clip, walk)["result"]] == ["deepmimic", "bvh"]
 
 
-def test_info_takes_the_reading_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_takes_the_reading_options(tmp_path: Path, answered) -> None:
     walk = put(tmp_path, "walk.bvh", bvh())
-    assert main(["info", "--json", str(walk), "--fps", "25", "--unit", "0.012", "--up", "Z"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = answered("info", walk, "--fps", "25", "--unit", "0.012", "--up", "Z")["result"]
     assert (facts["fps"], facts["unit_m"], facts["up_axis"]) == (25.0, 0.012, "Z")
+    facts = answered("info", walk, "--unit", "cm")["result"]
+    assert facts["unit_m"] == 0.01 and main(["info", str(walk), "--unit", "feet"]) == 2
     motion = put(tmp_path, "02_01.amc", amc())
     skeleton = put(tmp_path, "other.asf", ASF)
-    assert main(["info", "--json", str(motion), "--skeleton", str(skeleton)]) == 0
-    assert json.loads(capsys.readouterr().out)["joints"] == 5
+    assert answered("info", motion, "--skeleton", skeleton)["result"]["joints"] == 5
 
 
-def test_convert_and_resample(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_convert_and_resample(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], answered
+) -> None:
     target = tmp_path / "half.bvh"
     assert main(["convert", str(clip), str(target), "--resample", "15"]) == 0
     assert str(target) in capsys.readouterr().out
-    assert main(["info", "--json", str(target)]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    again = answered("convert", clip, "-o", target, "--resample", "15", "--force")
+    assert again["outputs"] == {"clip": str(target)} and again["result"]["frames"] == 8
+    facts = answered("info", target)["result"]
     assert facts["frames"] == 8 and facts["fps"] == pytest.approx(15.0)
 
 
@@ -154,12 +176,13 @@ def test_convert_refuses_unknown_suffixes_and_itself(clip: Path, tmp_path: Path,
     refused("convert", clip, tmp_path / "x.fbx", words=("fbx", ".bvh"))
     refused("convert", clip, clip, words=("over itself",))
     refused("convert", clip, tmp_path / "x.bvh", "--resample", "0", words=("frame rate",))
+    refused("convert", clip, words=("needs OUT", "-o OUT"))
+    refused("convert", clip, tmp_path / "x.bvh", "-o", tmp_path / "y.bvh", words=("twice",))
 
 
-def test_body_lists_what_is_trained(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_body_lists_what_is_trained(clip: Path, capsys: pytest.CaptureFixture[str], answered) -> None:
     command = ["body", str(clip), "--mass", "50", "--set", "right_ankle.kp=123"]
-    assert main([*command, "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = answered(*command)["result"]
     rows = {row["body"]: row for row in facts["bodies"]}
     assert facts["mass_kg"] == pytest.approx(50.0) and rows["right_ankle"]["kp"] == 123.0
     assert main(command) == 0
@@ -173,11 +196,10 @@ def test_overrides_are_name_and_number() -> None:
             override(text)
 
 
-def test_doctor(capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["doctor", "--json"])
-    facts = json.loads(capsys.readouterr().out)
+def test_doctor(answered) -> None:
+    facts = answered("doctor")["result"]
     states = {c["name"]: c["state"] for c in facts["checks"]}
-    assert code == 0 and facts["ready"]
+    assert facts["ready"]
     assert {states[n] for n in ("python", "torch", "mujoco", "mujoco.batch", "physics")} == {"ok"}
     assert all(c["todo"] for c in facts["checks"] if c["state"] != "ok")
 
@@ -203,7 +225,7 @@ def test_an_unexpected_fault_is_one_sentence(
     monkeypatch.setattr("poise.motion.io.read_clip", broken)
     assert main(["info", str(clip)]) == 1
     complained = capsys.readouterr().err
-    assert complained.count("\n") == 1 and "[red]half way[/red]" in complained
+    assert complained.count("\n") == 2 and "[red]half way[/red]" in complained
     assert "ZeroDivisionError" in complained and "POISE_DEBUG=1" in complained
     monkeypatch.setenv("POISE_DEBUG", "1")
     assert main(["info", str(clip)]) == 1
@@ -221,7 +243,7 @@ def test_a_full_disk_and_a_lack_of_memory(
         monkeypatch.setattr("poise.motion.io.read_clip", broken)
         assert main(["info", str(clip)]) == code
         complained = capsys.readouterr().err
-        assert complained.startswith("error: ") and complained.count("\n") == 1
+        assert complained.startswith("reading ") and complained.count("\nerror: ") == 1
 
 
 def test_ctrl_c_anywhere(
@@ -232,7 +254,7 @@ def test_ctrl_c_anywhere(
 
     monkeypatch.setattr("poise.motion.io.read_clip", stopped)
     assert main(["info", str(clip)]) == 130
-    assert capsys.readouterr().err == "error: interrupted\n"
+    assert capsys.readouterr().err == f"reading {clip}\nerror: interrupted\n"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes of a shell")

@@ -47,7 +47,10 @@ class Puppets:
 
 
 def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) -> None:
-    env, own = made.bare().env(2, None, False, 1, help_scale=0.0, guard=False), made.reference
+    env, own = (
+        made.bare().env(2, auto_reset=False, threads=1, help_scale=0.0, guard=False),
+        made.reference,
+    )
     clip = torch.tensor([own.names.index("walk")] * 2)
     env.reset_to(clip, torch.zeros_like(clip))
     assert made.recovery_clips is not None
@@ -75,7 +78,7 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
 
 
 def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imitation) -> None:
-    env = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
+    env = made.bare().env(1, auto_reset=False, threads=1, help_scale=0.0, guard=False)
     zero = torch.zeros(1, dtype=torch.long)
     env.reset_to(zero, zero)
     assert made.recovery_clips is not None

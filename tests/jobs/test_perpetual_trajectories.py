@@ -18,7 +18,7 @@ from poise.recipes.perpetual.shapes import BodyShapes
 from poise.settings import to_data
 from toy_library import library, tiny
 
-PATH = TrajOptConfig(iterations=2, stretch_s=0.3)
+PATH = TrajOptConfig(iterations=2, segment_s=0.3)
 
 
 def run(folder: Path, stop_after: int = 0) -> list[TrajOptStats]:

@@ -22,7 +22,7 @@ from poise.jobs.track.points import points_of
 from poise.jobs.track.policy import Tracker
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, read_clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions as Options
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Jitter
 from poise.motion.points.fit import JOINT_PLACES

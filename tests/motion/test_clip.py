@@ -72,8 +72,8 @@ def test_faults_are_told_with_joint_and_frame():
     assert broken(root_pos=pos) == "still: the root position is not finite at frame 1"
     assert "got (3, 2) and (3, 3, 4)" in broken(root_pos=np.zeros((3, 2)))
     assert "got (4, 3) and (3, 3, 4)" in broken(root_pos=np.zeros((4, 3)))
-    for fps in (0.0, -30.0, math.nan, math.inf):
-        assert "frame rate must be above 0" in broken(fps=fps)
+    for fps in (0.0, -30.0, math.nan, math.inf, 1e-3, 2001.0, 1e300):
+        assert "frame rate must be from 0.1 to 2000 per second, got" in broken(fps=fps)
     with pytest.raises(PoiseError, match="the clip has 1 frame; motion needs at least 2"):
         still(1)
 
@@ -105,8 +105,6 @@ def test_skeletons_answer():
     skeleton = replace(arm(), ends=((2, (0.0, 0.0, 0.5)),))
     assert skeleton.index("lower") == 2 and skeleton.children(0) == (1,) and len(skeleton) == 3
     np.testing.assert_array_equal(skeleton.rest_positions(), [[0, 0, 0], [0, 0, 1], [2, 0, 1]])
-    np.testing.assert_array_equal(skeleton.end_positions(), [[2, 0, 1.5]])
-    assert arm().end_positions().shape == (0, 3)
     with pytest.raises(PoiseError, match=r"no joint 'lowr'. Did you mean 'lower'\?"):
         skeleton.index("lowr")
 

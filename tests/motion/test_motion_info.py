@@ -43,8 +43,9 @@ def test_unit_override(tmp_path: Path) -> None:
             read_clip(path, unit_m=unit)
     with pytest.raises(PoiseError, match="--up must be Y or Z, got 'X'"):
         read_clip(path, up_axis="X")
-    with pytest.raises(PoiseError, match="--fps must be above 0"):
-        read_clip(path, fps=0)
+    for fps in (0, -1.0, float("nan"), 1e6, 1e300):
+        with pytest.raises(PoiseError, match="--fps: the frame rate must be from"):
+            read_clip(path, fps=fps)
 
 
 def test_up_override_and_fps_override(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from poise.errors import PoiseError
 from poise.motion import read_clip, resample
 from poise.motion.io.points.raw import assemble_points
 from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import (
     TRIANGULATED,
@@ -275,7 +275,9 @@ def test_processes_have_unit_size() -> None:
 def test_triangulated_noise_is_like_pose2sims(data_dir) -> None:
     folder = data_dir / "noisy/pose2sim/single"
     raw, clean = (
-        assemble_points(trc_points(folder / f"S00_P00_T01_BalancingTrial_0-100{tail}.trc"), Options())
+        assemble_points(
+            trc_points(folder / f"S00_P00_T01_BalancingTrial_0-100{tail}.trc"), ReadOptions()
+        )
         for tail in ("", "_filt_butterworth")
     )
     made = perturb_points(clean, TRIANGULATED)

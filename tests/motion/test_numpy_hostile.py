@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 import random
 import time
 import zipfile
@@ -85,7 +86,7 @@ AMASS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "bad rate": (
         {**amass(), "mocap_framerate": np.array(0)},
-        ": mocap_framerate is 0, which is no frame rate. State it with --fps F",
+        ": the frame rate must be from 0.1 to 2000 per second, got 0. State the right one with --fps F",
     ),
     "nan rate": (
         {**amass(), "mocap_framerate": np.array(np.nan)},
@@ -146,6 +147,15 @@ def test_sizes_that_are_stated_are_not_believed(tmp_path: Path) -> None:
     assert ": its NumPy header" in refusal(path)
     forged(path, "poses", header_of((2, 66), "|V500000000000"), b"")
     assert "array 'poses'" in refusal(path)
+
+
+def test_characters_that_do_not_exist_are_refused(tmp_path: Path) -> None:
+    path = forged(tmp_path / "a.npz", "gender", header_of((), "<U1"), (0x110000).to_bytes(4, "little"))
+    assert refusal(path) == (
+        ", array 'gender': it holds characters that do not exist. The file seems cut off"
+    )
+    data = pickle.dumps({"poses": np.array(["x"])}).replace(b"x\0\0\0", b"\0\0\x11\0")
+    assert "characters that do not e" in refusal(put(tmp_path, "a.pkl", data), allow_pickle=True)
 
 
 def test_a_zip_bomb_is_left_unpacked(tmp_path: Path) -> None:

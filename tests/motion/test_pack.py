@@ -34,8 +34,8 @@ def test_everything_comes_back_through_json():
         (Channel(("Zrotation", "Xrotation"), (0.1, 0.2, 0.3), "XYZ", ((-1.0, 1.0), (0.0, 2.0))),),
         1 / 30,
         "Hips",
-        ("a note",),
-        (("key", "value"),),
+        notes=("a note",),
+        extra=(("key", "value"),),
     )
     clip = swing(speed=1.0, cyclic=True, name="walk")
     clip = clip.replaced(skeleton=clip.skeleton.with_source(**vars(source)))
@@ -66,3 +66,13 @@ def test_a_missing_note_is_told(key):
     del notes[0][key]
     with pytest.raises(PoiseError, match=f"packed clips are incomplete: '{key}'"):
         unpack_clips(tensors, notes)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("ends", "text"), ("name", ["a"]), ("fps", "fast"), ("source", []), ("names", [1]), ("parents", 3)],
+)
+def test_a_note_of_another_kind_is_told(key, value):
+    tensors, notes = pack_clips([swing()])
+    with pytest.raises(PoiseError, match="packed clips are incomplete"):
+        unpack_clips(tensors, [{**notes[0], key: value}])

@@ -91,6 +91,11 @@ REFUSED = {
     "empty stack": (b"\x80\x02.", "the pickle is damaged"),
     "no mark": (b"\x80\x02]e.", "the pickle is damaged"),
     "huge bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b"ab.", "the pickle is damaged"),
+    "huge bytearray": (b"\x80\x05\x96" + struct.pack("<Q", 1 << 40) + b"ab.", "the pickle is damaged"),
+    "a set": (pickle.dumps({"a": {1}}), "uses EMPTY_SET"),
+    "no instruction": (b"\x80\x02\xff.", "uses an unknown instruction"),
+    "a state of a list": (b"\x80\x02]}b.", "the pickle is damaged"),
+    "a call of a list": (b"\x80\x02])R.", "the pickle is damaged"),
     "huge array": (
         b"\x80\x02cnumpy\nndarray\n0cnumpy.core.multiarray\n_reconstruct\n)R(K\x01\x8a\x06"
         + (1 << 44).to_bytes(6, "little")
@@ -221,7 +226,9 @@ def test_poselib_refusals(tmp_path: Path) -> None:
         ": the rotation of joint 'torso' at frame 3 is nan, not a usable number"
     )
     assert refusal(root_translation=None).startswith(": this poselib motion lacks root_translation.")
-    assert refusal(fps=0) == ": fps is 0, which is no frame rate. State it with --fps F"
+    assert refusal(fps=0) == (
+        ": the frame rate must be from 0.1 to 2000 per second, got 0. State the right one with --fps F"
+    )
     tree = dict(poselib()["skeleton_tree"])
     tree["parent_indices"] = np.array([-1, 2, 0, 0, 1])
     assert refusal(skeleton_tree=tree) == ": its parent_indices do not put parents before children"

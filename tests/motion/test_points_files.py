@@ -15,7 +15,7 @@ from poise.motion.io.points.c3d import c3d_points
 from poise.motion.io.points.csv import csv_points
 from poise.motion.io.points.raw import assemble_points
 from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.points import FitConfig, fit_clip, fit_distances
 
 # A standing person in a file's Y-up axes, facing +Z, left at +X, m.
@@ -73,7 +73,7 @@ def test_trc_by_hand(tmp_path: Path) -> None:
     positions[3, NAMES.index("RWrist"), 1] = np.nan
     raw = trc_points(saved(tmp_path, trc_text(positions * 1000, unit="mm")))
     assert (raw.names, raw.fps, raw.unit_m) == (NAMES, 30.0, 0.001)
-    points = assemble_points(raw, Options())
+    points = assemble_points(raw, ReadOptions())
     # Y up becomes Z up: (x, y, z) -> (x, -z, y).
     expected = np.stack((positions[..., 0], -positions[..., 2], positions[..., 1]), -1)
     expected[3, NAMES.index("RWrist")] = np.nan
@@ -185,7 +185,7 @@ def test_csv_by_hand(tmp_path: Path) -> None:
 def test_csv_confidence_of_zero_is_a_missing_point(tmp_path: Path) -> None:
     lines = csv_text(walking()).splitlines()
     lines = [f"{lines[0]},Nose_confidence"] + [f"{row},{int(t != 2)}" for t, row in enumerate(lines[1:])]
-    points = assemble_points(csv_points(saved(tmp_path, "\n".join(lines), "x.csv")), Options())
+    points = assemble_points(csv_points(saved(tmp_path, "\n".join(lines), "x.csv")), ReadOptions())
     assert np.flatnonzero(points.missing[:, NAMES.index("Nose")]).tolist() == [2]
 
 
@@ -232,7 +232,7 @@ def test_keypoint_arrays(tmp_path: Path) -> None:
     for change, message in (
         ({"positions": walking()[..., :2]}, "they are 2D"),
         ({"names": np.array(NAMES[:-1])}, "16 names and 17 keypoints"),
-        ({"fps": np.array(0.0)}, "fps must be above 0"),
+        ({"fps": np.array(0.0)}, "frame rate must be from 0.1 to 2000"),
         ({"up_axis": np.array("X")}, "up_axis must be Y or Z"),
         ({"positions": np.array(["a"])}, "not numbers"),
     ):
@@ -304,7 +304,7 @@ def test_broken_c3d_files_are_refused(tmp_path: Path) -> None:
 
 def test_surface_markers_become_joint_centres(data_dir: Path) -> None:
     raw = trc_points(data_dir / f"{POSE2SIM}_filt_butterworth_LSTM.trc")
-    points = assemble_points(raw, Options())
+    points = assemble_points(raw, ReadOptions())
     keep = [k for k, n in enumerate(points.names) if n.endswith("_study")]
     markers = points.replaced(
         names=tuple(points.names[k] for k in keep), positions=points.positions[:, keep]
@@ -340,7 +340,7 @@ def test_surface_markers_become_joint_centres(data_dir: Path) -> None:
 def test_pose2sim_keypoints_are_followed_within_centimetres(
     data_dir: Path, tail: str, limit: float
 ) -> None:
-    points = assemble_points(trc_points(data_dir / f"{POSE2SIM}{tail}.trc"), Options())
+    points = assemble_points(trc_points(data_dir / f"{POSE2SIM}{tail}.trc"), ReadOptions())
     clip = fit_clip(points, FitConfig())
     assert (clip.frames, clip.fps, points.source.unit_m, points.source.up_axis) == (100, 60.0, 1.0, "Y")
     assert np.mean([np.nanmean(d) for d in fit_distances(points, clip).values()]) < limit

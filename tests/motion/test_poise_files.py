@@ -126,7 +126,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         {"parents": np.array([-1, 0])},
         ": 3 names, 2 parents, 3 offsets, 3 end joints and 3 ends do not fit together",
     ),
-    "rate": ({"fps": np.array(0.0)}, ": the frame rate must be above 0, got 0.0"),
+    "rate": ({"fps": np.array(0.0)}, ": the frame rate must be from 0.1 to 2000 per second, got 0"),
     "rates": (
         {"fps": np.array([1.0, 2.0])},
         ", array 'fps': it has the shape 2, not 1",
@@ -230,4 +230,4 @@ def test_csv_refusals(tmp_path: Path) -> None:
         ": the skeleton record lacks names, parents, offsets, ends. It is empty"
     )
     slow = [x if not x.startswith("# fps") else "# fps: 0" for x in lines]
-    assert csv_refusal(tmp_path, slow) == ", '# fps:': the frame rate must be above 0, got 0"
+    assert csv_refusal(tmp_path, slow).startswith(": the frame rate must be from 0.1 to 2000 per second")

@@ -328,3 +328,9 @@ def test_any_names_on_any_tree_give_roles_or_none(words: list[str], data: st.Dat
             while a is not None and b is not None and b != a:
                 b = parents[b]
                 assert b >= a
+
+
+def test_a_chain_of_many_joints_is_read() -> None:
+    names = ("LeftUpLeg", *(f"LeftPart{i}" for i in range(1500)), "LeftFoot")
+    chain = Skeleton(names, tuple(range(-1, len(names) - 1)), np.ones((len(names), 3)))
+    assert find_roles(chain).joint("left_foot") in (None, len(names) - 1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from handmade_motion_files import bvh_text, deepmimic_text
+from handmade_numpy_files import odd_clip
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip, write_clip
@@ -34,7 +35,8 @@ def clips(folder: Path) -> list[Clip]:
 def same(a: Clip, b: Clip) -> None:
     assert a.skeleton.names == b.skeleton.names and a.skeleton.parents == b.skeleton.parents
     assert (a.frames, a.fps, a.cyclic) == (b.frames, b.fps, b.cyclic)
-    np.testing.assert_allclose(a.skeleton.end_positions(), b.skeleton.end_positions(), atol=1e-6)
+    for (_, tip), (_, other) in zip(a.skeleton.ends, b.skeleton.ends, strict=True):
+        np.testing.assert_allclose(tip, other, atol=1e-6)
     np.testing.assert_allclose(a.positions(), b.positions(), atol=1e-5)
     angle = quat_distance(torch.tensor(a.rot), torch.tensor(b.rot)).max()
     assert float(angle) < 1e-4
@@ -171,3 +173,18 @@ def test_refusals(pxr: Any, tmp_path: Path, text: str, message: str) -> None:
         read_clip(path)
     assert str(error.value).startswith(str(path)) and message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_fault_within_the_library_is_a_refusal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damaged binary files fail anywhere in OpenUSD, long after they were opened."""
+    from poise.motion.io.usd import read
+
+    def fails(*_: object) -> None:
+        raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+
+    write_clip(odd_clip(), tmp_path / "a.usda")
+    monkeypatch.setattr(read, "_raw_motion", fails)
+    with pytest.raises(PoiseError, match=r"a\.usda: USD cannot read the file. It seems cut off"):
+        read_clip(tmp_path / "a.usda")

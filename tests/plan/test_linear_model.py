@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
-from poise.plan.linear_model import driven, slopes
+from poise.plan.linear_model import driven, linearise
 from poise.sim import CpuBackend, SimConfig, difference, displaced
 from toy_human import human
 
@@ -60,7 +60,7 @@ def test_successors_do_not_depend_on_what_a_world_did_before(model: mujoco.MjMod
 def test_slopes_in_the_air_are_the_derivatives(model: mujoco.MjModel) -> None:
     backend, (qpos, qvel) = CpuBackend(model, 700, 1), states(model, 3, 3.0)
     action = torch.cat((qpos[:, 7:], torch.zeros(3, 6, dtype=torch.float64)), 1)
-    got = slopes(backend, qpos, qvel, action, UNIT, 2, 1e-4)
+    got = linearise(backend, qpos, qvel, action, UNIT, 2, 1e-4)
     assert got.a.shape == (3, 2 * model.nv, 2 * model.nv) and got.b.shape[2] == model.nu + 6
     # A wrench of one unit moves the whole mass.
     mass, step = model.body_subtreemass[1], 2 * model.opt.timestep
@@ -108,7 +108,7 @@ def test_large_differences_see_the_floor_that_small_ones_miss(model: mujoco.MjMo
             break
         height += 0.005
     qpos[0, 2] -= height - 0.03
-    near, far = (slopes(backend, qpos, qvel, action, UNIT, 2, size).a[0] for size in (1e-4, 0.2))
+    near, far = (linearise(backend, qpos, qvel, action, UNIT, 2, size).a[0] for size in (1e-4, 0.2))
     z = model.nv + 2
     assert near[z, 2] == pytest.approx(0.0, abs=0.05)
     assert far[z, 2] < -0.5

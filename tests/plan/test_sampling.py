@@ -96,7 +96,7 @@ def test_bad_settings_are_refused() -> None:
     with pytest.raises(PoiseError, match="4 characters"):
         SamplingConfig(characters=4)
     with pytest.raises(PoiseError, match="must be positive"):
-        SamplingConfig(least=0.3, most=0.1)
+        SamplingConfig(noise_range=(0.3, 0.1))
     with pytest.raises(PoiseError, match="searched for a single character"):
         TrackConfig(search=FEW, count=2)
     with pytest.raises(PoiseError, match="one that comes or is put back"):

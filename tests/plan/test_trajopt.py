@@ -13,13 +13,13 @@ from poise.env import ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.metrics import mpjpe_global
 from poise.plan import LqrTeacher, TrajectoryOptimizer, TrajOptConfig
-from poise.plan.shooting import stretches
+from poise.plan.shooting import segments
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
 from poise.sim import SimConfig
 from toy_human import swing
 
-SHORT = TrajOptConfig(iterations=3, stretch_s=0.3)
+SHORT = TrajOptConfig(iterations=3, segment_s=0.3)
 
 
 def search(imitation: Imitation, config: TrajOptConfig = SHORT) -> TrajectoryOptimizer:
@@ -73,7 +73,7 @@ def test_clips_are_found_as_if_each_were_alone(make_task, monkeypatch: pytest.Mo
 def test_stretches_cover_every_step_once() -> None:
     lengths = np.array([61, 5, 130, 2])
     for shift in (0, 15):
-        cut = stretches(lengths, 30, shift)
+        cut = segments(lengths, 30, shift)
         steps = np.concatenate([np.arange(a, b) for a, b in cut])
         ends = np.cumsum(lengths) - 1
         assert sorted(steps) == sorted(set(range(lengths.sum())) - set(ends.tolist()))
@@ -89,7 +89,7 @@ def test_on_its_path_a_character_gets_the_paths_targets(make_task) -> None:
     imitation = make_task(swing(0.5, name="calm"), method="deepmimic")
     env, obs = at(imitation, 3)
     ahead = env.reference.hinges[4].float()
-    paths = search(imitation).paths()
+    paths = search(imitation).trajectories()
     paths = replace(paths, feedback=torch.randn_like(paths.feedback))
     given = LqrTeacher(env, paths).act(obs)
     torch.testing.assert_close(given[0] + ahead, paths.target[3])
@@ -101,7 +101,7 @@ def test_on_its_path_a_character_gets_the_paths_targets(make_task) -> None:
 def test_a_later_cycle_is_followed_like_the_first(make_task) -> None:
     imitation = make_task(swing(1.0, cyclic=True, speed=1.0, bend=0.6, name="loop"), method="deepmimic")
     found, last = search(imitation), int(imitation.reference.length[0]) - 1
-    paths = found.paths()
+    paths = found.trajectories()
     env, obs = at(imitation, 4)
     first = LqrTeacher(env, paths).act(obs)
     env, obs = at(imitation, 4 + 2 * last)
@@ -111,7 +111,7 @@ def test_a_later_cycle_is_followed_like_the_first(make_task) -> None:
 def test_a_residual_force_is_left_alone(make_task) -> None:
     imitation = make_task(swing(0.5, name="calm"))
     env, obs = at(imitation, 0)
-    given = LqrTeacher(env, search(imitation).paths()).act(obs)
+    given = LqrTeacher(env, search(imitation).trajectories()).act(obs)
     assert given.shape[1] == env.num_actions and not given[:, env.hinges :].any()
 
 
@@ -139,7 +139,7 @@ def test_a_real_run_is_followed_without_help(data_dir: Path) -> None:
     while not found.done:
         found.iterate()
     env, obs = at(imitation, 0)
-    teacher, far = LqrTeacher(env, found.paths()), 0.0
+    teacher, far = LqrTeacher(env, found.trajectories()), 0.0
     for _ in range(int(imitation.reference.length[0]) - 1):
         env.step(teacher.act(obs))
         reference = env.reference.gather(env.clip, env.frame).pos

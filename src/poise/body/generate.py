@@ -25,16 +25,19 @@ _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 class BodyConfig:
     """What a user may state about the body that is generated.
 
-    mass_kg: total mass; None is `default_mass`: body mass index 22 at an adult's height.
-    preset: "auto" takes "cmu-rfc" (38 DoF, 20 bodies, Residual Force Control) for a CMU ASF
-        skeleton and "generic" for all others.
-    damping: joint damping kd as a fraction of kp, in seconds. The paper's 0.2 kp stops a jump
-        (`kd * speed` exceeds the torque limit); 0.02 is stable at 60 Hz and leaves the strength.
-    armature: rotor inertia added to every hinge at `RFC_MASS_KG`, kg m^2.
-        All four, with the torque limits, follow the body's size (`Strength`).
-    margin: rad, how far joint ranges reach beyond the reference motion.
-    overrides: ("lfoot.kp", 400.0) pairs, see `BodyTable.overridden`.
-    mjcf: a file with a body of the user's own in place of a generated one, see `read_mjcf`.
+    Stiffness, damping, armature and torque limits follow the body's size (`Strength`).
+
+    Attributes:
+        mass_kg: total mass; None is `default_mass`: body mass index 22 at an adult's height.
+        preset: "auto" takes "cmu-rfc" (38 DoF, 20 bodies, Residual Force Control) for a CMU ASF
+            skeleton and "generic" for all others.
+        damping: joint damping kd as a fraction of kp, in seconds. The paper's 0.2 kp stops a jump
+            (`kd * speed` exceeds the torque limit); 0.02 is stable at 60 Hz and leaves the strength.
+        armature: rotor inertia added to every hinge at `RFC_MASS_KG`, kg m^2.
+        friction: sliding friction of the soles.
+        margin: rad, how far joint ranges reach beyond the reference motion.
+        overrides: ("lfoot.kp", 400.0) pairs, see `BodyTable.overridden`.
+        mjcf: a file with a body of the user's own in place of a generated one, see `read_mjcf`.
     """
 
     mass_kg: float | None = None
@@ -61,7 +64,7 @@ def generate_table(
     """The parameters of a humanoid that moves like `skeleton`.
 
     Args:
-        skeleton: any human skeleton whose hands and feet can be told by name or shape.
+        skeleton: any human skeleton with hands and feet that can be told by name or shape.
         config: mass, preset, gains, overrides.
         clips: motions of this skeleton; they tell the neutral pose (where identity rotations are no
             pose of a human) and how the soles lie.

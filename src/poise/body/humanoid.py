@@ -23,8 +23,10 @@ _GEOMS = {
 class Humanoid:
     """A skeleton with a body.
 
-    table: the parameters; row i is MuJoCo body `i + 1`. model: compiled, with a floor at z = 0, a
-    free root and one position actuator per hinge (`ctrl` is its target angle in rad).
+    Attributes:
+        table: the parameters; row i is MuJoCo body `i + 1`.
+        model: compiled, with a floor at z = 0, a free root and one position actuator per hinge (`ctrl`
+            is its target angle in rad).
     """
 
     skeleton: Skeleton

@@ -45,8 +45,11 @@ _OTHER = PartNumbers(0.0, 0.0, 100.0, 50.0, 3)
 class MjcfBody:
     """A body from a file.
 
-    skeleton: one joint per body, at its hinges' anchor, standing at identity as the file's default pose
-    does. table: its rows, in the same order and of the same names. notes: what was changed or added.
+    Attributes:
+        skeleton: one joint per body, at its hinges' anchor, standing at identity as the file's default
+            pose does.
+        table: its rows, in the same order and of the same names.
+        notes: what was changed or added.
     """
 
     skeleton: Skeleton
@@ -148,7 +151,7 @@ class _Reader:
         return self.data.xanchor[hinges[0]] if hinges else self.data.xpos[body]
 
     def skeleton(self) -> Skeleton:
-        """The tree as a skeleton whose frames are the world's in the default pose."""
+        """The tree as a skeleton with the world's frames in the default pose."""
         at = {b: i for i, b in enumerate(self.bodies)}
         parents = tuple(at.get(int(self.model.body_parentid[b]), -1) for b in self.bodies)
         origins = np.array([self._origin(b) for b in self.bodies])

@@ -22,8 +22,9 @@ MOST_SPINE, MOST_NECK = 5, 2
 class Part:
     """One joint's place in the body.
 
-    kind: pelvis, spine, neck, head, clavicle, upper_arm, forearm, hand, thigh, shin, foot.
-    side: "left", "right" or "".
+    Attributes:
+        kind: pelvis, spine, neck, head, clavicle, upper_arm, forearm, hand, thigh, shin, foot.
+        side: "left", "right" or "".
     """
 
     joint: int
@@ -35,8 +36,10 @@ class Part:
 class Anatomy:
     """The parts found in a skeleton; joints that are no part ride rigidly on their nearest ancestor.
 
-    parts: depth first, as MuJoCo numbers bodies; the first is the pelvis. toes: first joint below each
-    foot, by side, where there is one. evidence: what was told by shape instead of by name, in sentences.
+    Attributes:
+        parts: depth first, as MuJoCo numbers bodies; the first is the pelvis.
+        toes: first joint below each foot, by side, where there is one.
+        evidence: what was told by shape instead of by name, in sentences.
     """
 
     parts: tuple[Part, ...]
@@ -98,8 +101,9 @@ def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
     """The body parts of a human skeleton: by its joints' names, else by its shape.
 
     Args:
-        skeleton: any human tree. clips: motions of it; their first frame shows how it stands, for
-            skeletons whose names say nothing and whose rest pose is folded.
+        skeleton: any human tree.
+        clips: motions of it; their first frame shows how it stands, for skeletons with names that
+            say nothing and a folded rest pose.
 
     Raises:
         PoiseError: where a foot or a hand can be told neither by name nor by shape.

@@ -20,8 +20,14 @@ BODY_MASS_INDEX = 22.0
 
 @dataclass(frozen=True)
 class PartNumbers:
-    """mass: fraction of body mass (both sides each). radius: fraction of the height.
-    kp: N m/rad and torque: N m at `RFC_MASS_KG`. dofs: hinges on a skeleton that states none.
+    """What a preset states about a kind of part, at `RFC_MASS_KG`.
+
+    Attributes:
+        mass: fraction of body mass (both sides each).
+        radius: fraction of the height.
+        kp: N m/rad.
+        torque: N m.
+        dofs: hinges on a skeleton that states none.
     """
 
     mass: float
@@ -45,10 +51,10 @@ PARTS: dict[str, PartNumbers] = {
     "foot": PartNumbers(0.0145, 0.018, 400.0, 100.0, 3),
 }
 
-#: Parts whose degrees of freedom in an ASF are dropped by the Residual Force Control humanoid:
+#: Parts of which the degrees of freedom in an ASF are dropped by the Residual Force Control humanoid:
 #: 32 hinges and 20 bodies remain of CMU's 56 and 31. The CMU data hold the clavicles at zero.
 CMU_RIGID = ("clavicle", "hand")
-#: CMU joints whose bodies ride rigidly on `lowerneck`.
+#: CMU joints with bodies that ride rigidly on `lowerneck`.
 CMU_RIGID_JOINTS = ("head",)
 #: CMU joints without a body of their own.
 CMU_MERGED = ("upperneck",)

@@ -30,8 +30,10 @@ GIANT_M = 2.0
 class Strength:
     """Factors on the numbers that are stated at `presets.RFC_MASS_KG`.
 
-    torque: of torque limits and stiffness, m L. time: sqrt(L), so that damping goes as torque x time.
-    inertia: m L^2, of the armature.
+    Attributes:
+        torque: of torque limits and stiffness, m L.
+        time: sqrt(L), so that damping goes as torque x time.
+        inertia: m L^2, of the armature.
     """
 
     torque: float

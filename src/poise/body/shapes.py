@@ -24,8 +24,13 @@ _UP = np.array([0.0, 0.0, 1.0])
 class Ruler:
     """Measures in metres, directions as unit vectors in each joint's own frame.
 
-    height: standing height. tips: bone vector of every part. lateral: right to left at the pelvis
-    and at the chest. soles: per foot joint (down, forward, ankle height, toe reach).
+    Attributes:
+        anatomy: the parts of the skeleton.
+        height: standing height.
+        tips: bone vector of every part.
+        lateral: right to left at the pelvis and at the chest.
+        hip_width: distance of the hip joints.
+        soles: per foot joint (down, forward, ankle height, toe reach).
     """
 
     anatomy: Anatomy

@@ -14,8 +14,11 @@ from poise.errors import PoiseError, did_you_mean
 class Geom:
     """A rigid shape in its body's frame.
 
-    kind: "capsule" (size = radius, half length; along local z), "box" (half sizes), "sphere" (radius).
-    pos: m. quat: wxyz.
+    Attributes:
+        kind: "capsule" (along local z), "box" or "sphere".
+        size: m; capsule (radius, half length), box (half sizes), sphere (radius).
+        pos: m.
+        quat: wxyz.
     """
 
     kind: str
@@ -28,12 +31,23 @@ class Geom:
 class BodyRow:
     """One rigid body and the hinges that move it against its parent body.
 
-    joint: index of the skeleton joint whose frame this body carries. kind, side: its part.
-    parent: index of the parent row, -1 for the pelvis.
-    pos: m and quat: wxyz, place and orientation in the parent body's frame at zero angles.
-    order: hinge axes, first the one nearest the parent, as letters of `frame` ("ZYX"; "" is rigid).
-    frame: wxyz, the axes' frame in the body's frame.
-    ranges: (low, high) rad per hinge. kp: N m/rad. kd: N m s/rad. torque: N m. armature: kg m^2.
+    Attributes:
+        name: of the body.
+        joint: index of the skeleton joint that this body carries the frame of.
+        kind: of its part.
+        side: of its part.
+        parent: index of the parent row, -1 for the pelvis.
+        pos: m, place in the parent body's frame at zero angles.
+        quat: wxyz, orientation there.
+        order: hinge axes, first the one nearest the parent, as letters of `frame` ("ZYX"; "" is rigid).
+        frame: wxyz, the axes' frame in the body's frame.
+        ranges: (low, high) rad per hinge.
+        mass: kg.
+        kp: N m/rad.
+        kd: N m s/rad.
+        torque: N m, limit.
+        armature: kg m^2.
+        geoms: rigid shapes.
     """
 
     name: str
@@ -62,8 +76,11 @@ class BodyRow:
 class BodyTable:
     """All rows of a humanoid, parents first.
 
-    height_m: standing height estimated from the legs. friction: sliding friction of the soles.
-    contact_exclusions: pairs of body names that never collide.
+    Attributes:
+        rows: one per body.
+        height_m: m, standing height estimated from the legs.
+        friction: sliding friction of the soles.
+        contact_exclusions: pairs of body names that never collide.
     """
 
     rows: tuple[BodyRow, ...]

@@ -1,4 +1,4 @@
-"""The limbs of a skeleton whose names say nothing: by its tree, its lengths and how it stands."""
+"""The limbs of a skeleton with names that say nothing: by its tree, its lengths and how it stands."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ HIP_WIDTH, SHOULDER_WIDTH = 0.1, 0.4
 
 @dataclass(frozen=True)
 class Limbs:
-    """Three joints per limb: hip, knee, ankle and shoulder, elbow, wrist, by side.
+    """Three joints per limb, by side.
 
-    pose: `(J, 3)` m, the joint positions by which they were told. evidence: why, one sentence each.
+    Attributes:
+        legs: hip, knee and ankle.
+        arms: shoulder, elbow and wrist.
+        pose: `(J, 3)` m, the joint positions by which they were told.
+        evidence: why, one sentence each.
     """
 
     legs: dict[str, tuple[int, int, int]]
@@ -34,8 +38,8 @@ class Limbs:
 def find_limbs(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Limbs | None:
     """The legs and arms of a human tree, or None where it has no two pairs of equal limbs.
 
-    A pair of limbs are two sibling subtrees whose longest ways down have equal bones. The two longest
-    pairs that do not lie in one another are legs and arms; the legs are those whose ends are lower in
+    A pair of limbs are two sibling subtrees with equal bones along their longest chains. The two longest
+    pairs that do not lie in one another are legs and arms; the legs are the pair with lower ends in
     the first frame of the first clip, else in the rest pose. Left and right follow from the toes.
     """
     pose = trim(clips[0], 0, 2).positions()[0] if clips else skeleton.rest_positions()
@@ -86,7 +90,7 @@ def find_limbs(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Limbs | None:
 
 
 def head_line(skeleton: Skeleton, chest: int, limbs: Sequence[int], pose: np.ndarray) -> list[int]:
-    """The joints from above the chest to the head: the central branch whose end is the highest."""
+    """The joints from above the chest to the head: the central branch with the highest end."""
     taken = set(limbs)
     best: list[int] = []
     for child in skeleton.children(chest):
@@ -146,9 +150,9 @@ def _limb(
 ) -> list[tuple[int, int, int]]:
     """The three joints of both limbs of a pair, at the same places of their ways from the trunk.
 
-    Of all triples the one whose upper and lower bone have the human ratio and make the most of the way;
-    triples whose first joints stand closer than `width` of both bones, as those of collar bones and hip
-    helpers do, come last.
+    Of all triples the one with an upper and a lower bone of the human ratio that make the most of the
+    length; triples with first joints that stand closer than `width` of both bones, as those of collar
+    bones and hip helpers do, come last.
     """
     at = [
         np.append(0.0, np.linalg.norm(np.diff(pose[list(line)], axis=0), axis=-1).cumsum())
@@ -200,7 +204,7 @@ def _left_first(
     across = (pose[legs[0][0]] - pose[legs[1][0]])[:2]
     names = [skeleton.names[leg[0]] for leg in legs]
     if np.linalg.norm(ahead) < 0.02 * np.linalg.norm(pose[legs[0][0]] - pose[legs[0][2]]):
-        # No toes: whoever made the skeleton most likely let it look along +x or, from Y up, along -y.
+        # No toes: most skeletons look along +x or, where they come from Y up, along -y.
         ahead = np.array([0.0, -1.0]) if abs(across[0]) > abs(across[1]) else np.array([1.0, 0.0])
         reason = "there are no toes, so it was taken to face along the file's usual axis"
     else:

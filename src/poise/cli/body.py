@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.console import notes, say_json, table
-from poise.cli.options import Body, Reading
+from poise.cli.answer import Answer
+from poise.cli.console import table
+from poise.cli.options import Body, Flag, Reading
 
 if TYPE_CHECKING:
     from poise.body import BodyConfig
@@ -23,13 +24,13 @@ class Options:
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
-    json: bool = False
-    """Print JSON alone."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Fits the body as training would, so that the table is the one that is trained."""
     config = options.body.config()
     from poise.kin import fit_humanoid
@@ -37,18 +38,15 @@ def run(options: Options, argv: Sequence[str]) -> int:
     clip = options.reading.read(options.clip)
     humanoid, _, report = fit_humanoid(clip, config)
     rows = humanoid.table.describe()
-    if options.json:
-        facts = {"height_m": humanoid.table.height_m, "mass_kg": humanoid.mass}
-        say_json({**facts, "hinges": len(humanoid.hinges), "bodies": rows})
-        return 0
     title = (
         f"{options.clip.name}: {len(rows)} bodies, {len(humanoid.hinges)} hinges, "
         f"{humanoid.mass:.1f} kg, {humanoid.table.height_m:.2f} m"
     )
     columns = ("body", "part", "parent", "hinges", "shape", "kg", "kp", "kd", "N m", "range, degrees")
     table(title, columns, [_row(r) for r in rows], left=5)
-    notes([*_made(clip, config), *report.sentences()])
-    return 0
+    facts = {"height_m": humanoid.table.height_m, "mass_kg": humanoid.mass}
+    facts |= {"hinges": len(humanoid.hinges), "bodies": rows}
+    return Answer(facts, notes=[*_made(clip, config), *report.sentences()])
 
 
 def _made(clip: Clip, config: BodyConfig) -> list[str]:

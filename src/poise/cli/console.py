@@ -73,6 +73,8 @@ def error(sentence: str, everywhere: bool = False) -> None:
 
 def say_json(value: Any) -> None:
     """JSON alone on stdout, to be read by a program."""
+    if rank():
+        return
     sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.console import notes, say
-from poise.cli.options import Reading
+from poise.cli.answer import Answer
+from poise.cli.console import say
+from poise.cli.folder import each
+from poise.cli.options import Flag, Reading
+from poise.cli.output import claimed, may_write
 from poise.errors import PoiseError
 
 
@@ -19,26 +22,54 @@ class Options:
     """Write a motion file in another format or at another frame rate."""
 
     source: Annotated[Positional[Path], arg(metavar="IN")]
-    """The motion file to read."""
-    target: Annotated[Positional[Path], arg(metavar="OUT")]
-    """The motion file to write; its suffix names the format (.bvh)."""
+    """The motion file to read, or a folder of such files."""
+    target: Annotated[Positional[Path | None], arg(metavar="OUT", help_behavior_hint="")] = None
+    """The motion file to write; its suffix names the format (.bvh). For a folder the folder to write."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
+    """The same as OUT."""
     resample: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None
     """Frames per second of the result."""
+    to: Annotated[str, arg(metavar="FORMAT")] = "bvh"
+    """The format of the files that are made of a folder: bvh, glb, npz, ..."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, resamples where asked to, writes."""
     from poise.motion import resample
-    from poise.motion.io import write_clip
+    from poise.motion.io import check_writable, write_clip
 
-    target = options.target
-    if target.exists() and options.source.exists() and target.samefile(options.source):
-        raise PoiseError("the clip would be written over itself", target, "Give OUT another name")
+    target = target_of(options)
+    if options.source.is_dir():
+        to = "." + options.to.lstrip(".")
+        check_writable(Path(f"OUT{to}"))
+
+        def one(path: Path, name: str) -> Answer:
+            into = target / f"{name}{to}"
+            into.parent.mkdir(parents=True, exist_ok=True)
+            return run(replace(options, source=path, target=into, out=None), argv)
+
+        with claimed(target):
+            return each("convert", (options.source,), target, one)
+    may_write(target, options.force, options.source)
     clip = options.reading.read(options.source)
     if options.resample is not None:
         clip = resample(clip, options.resample)
     write_clip(clip, target)
-    say(f"{target}: {clip.frames} frames at {clip.fps:.5g} fps, {clip.seconds:.2f} s")
-    notes(clip.skeleton.source.notes)
-    return 0
+    say(f"{clip.frames} frames at {clip.fps:.5g} fps, {clip.seconds:.2f} s")
+    figures = {"frames": clip.frames, "fps": clip.fps, "seconds": clip.seconds}
+    notes, outcome = clip.skeleton.source.notes, f"{clip.frames} frames"
+    return Answer(figures, {"clip": target}, notes, outcome=outcome)
+
+
+def target_of(options: Options) -> Path:
+    """OUT, which may be given by its place or with -o."""
+    given = [x for x in (options.target, options.out) if x is not None]
+    if len(given) != 1:
+        what = "OUT is given twice" if given else "poise convert needs OUT"
+        raise PoiseError(what, hint="Write poise convert IN OUT, or poise convert IN -o OUT")
+    return given[0]

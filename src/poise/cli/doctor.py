@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
@@ -9,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,8 +20,11 @@ from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise import __version__
-from poise.cli.console import out, say, say_json
-from poise.cli.options import Reading
+from poise.cli.answer import Answer
+from poise.cli.console import out, say
+from poise.cli.folder import each
+from poise.cli.options import Flag, Reading
+from poise.cli.output import claimed
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -46,29 +50,36 @@ class Options:
     """Say what is wrong with a motion, and mend it; without a clip, what works on this machine."""
 
     clip: Annotated[Positional[Path | None], arg(metavar="[CLIP]", help_behavior_hint="")] = None
-    """A motion file: sliding, floating, penetration, jumps, flips, jitter, frames, bones."""
-    fix: bool = False
+    """A motion file or a folder of them: sliding, floating, penetration, jumps, flips, jitter, bones."""
+    fix: Flag = False
     """Mend what kinematics can mend, and write the result to OUT."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """The mended motion on the same skeleton; its suffix names the format."""
-    json: bool = False
-    """Print JSON alone."""
+    """The mended motion on the same skeleton; its suffix names the format. For a folder a folder."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """For a clip see `doctor_motion`; for the machine exit code 0 if all is there, else 1."""
     if options.clip is not None:
         from poise.cli.doctor_motion import run_on
 
-        return run_on(options.clip, options.fix, options.out, options.json, options.reading)
+        if not options.clip.is_dir():
+            return run_on(options.clip, options)
+        o, folder = options, options.out
+
+        def one(path: Path, name: str) -> Answer:
+            return run_on(path, replace(o, out=None if folder is None else folder / f"{name}.bvh"))
+
+        with contextlib.nullcontext() if folder is None else claimed(folder):
+            return each("doctor", (options.clip,), folder, one)
     if options.fix or options.out is not None:
         raise PoiseError("no clip was given", hint="Write poise doctor CLIP --fix -o OUT")
     checks = [check() for check in CHECKS]
     ready = all(c.state != "missing" for c in checks)
-    if options.json:
-        say_json({"poise": __version__, "ready": ready, "checks": [asdict(c) for c in checks]})
-        return 0 if ready else 1
     wide = max(len(c.name) for c in checks)
     styles = {"ok": "green", "missing": "bold red", "optional": "yellow"}
     for c in checks:
@@ -76,7 +87,8 @@ def run(options: Options, argv: Sequence[str]) -> int:
         line = Text.assemble((f"{c.state:<9}", styles[c.state]), f"{c.name:<{wide}}  {c.found}{todo}")
         out().print(line, soft_wrap=True)
     say("This machine is ready." if ready else "Something needed is missing; see above.")
-    return 0 if ready else 1
+    facts = {"poise": __version__, "ready": ready, "checks": [asdict(c) for c in checks]}
+    return Answer(facts, exit_code=0 if ready else 1)
 
 
 def python() -> Check:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from poise.cli.console import say, say_json, table
-from poise.cli.options import Reading
+from poise.cli.answer import Answer
+from poise.cli.console import say, table
+from poise.cli.output import may_write
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
+    from poise.cli.doctor import Options
     from poise.kin import Examination, Fault
     from poise.motion import Clip
 
@@ -28,51 +30,36 @@ FIGURES = (
 ROWS = 6
 
 
-def run_on(path: Path, fix: bool, target: Path | None, json: bool, reading: Reading) -> int:
+def run_on(path: Path, options: Options) -> Answer:
     """Examines, mends and writes where asked to; exit code 0 whatever was found."""
+    fix, target = options.fix, options.out
+    from poise.kin import examine, heal
+    from poise.motion.io import check_writable, write_clip
+
     if fix != (target is not None):
         hint = f"Write poise doctor {path} --fix -o OUT"
         raise PoiseError("--fix needs -o OUT" if fix else "-o OUT needs --fix", hint=hint)
     if target is not None:
-        _check_target(path, target)
-    from poise.kin import examine, heal
-    from poise.motion import write_clip
-
-    clip = reading.read(path)
+        check_writable(target)
+        may_write(target, options.force, path)
+    clip = options.reading.read(path)
     found = examine(clip)
     facts: dict[str, Any] = {"clip": str(path), "frames": clip.frames, "fps": clip.fps}
     facts |= found.to_dict()
+    _show(str(path), found)
+    outcome = f"{len(found.faults)} faults"
     if target is None:
-        _tell(json, facts, str(path), found)
-        return 0
+        return Answer(facts, outcome=outcome)
     healed = heal(clip)
     write_clip(healed, target)
     left = examine(healed)
     facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
-    _tell(json, facts, str(path), found)
-    if not json:
-        _compare(found, left)
-        _written(target, clip, healed, found, left)
-    return 0
+    _compare(found, left)
+    _written(clip, healed, found, left)
+    return Answer(facts, {"clip": target}, outcome=f"{outcome}, {len(left.faults)} after")
 
 
-def _check_target(path: Path, target: Path) -> None:
-    from poise.motion.io.formats import WRITERS
-
-    if target.exists() and path.exists() and target.samefile(path):
-        raise PoiseError("the clip would be written over itself", target, "Give OUT another name")
-    if target.suffix.lower() not in WRITERS:
-        raise PoiseError(
-            f"a clip cannot be written as '{target.suffix or target.name}'",
-            target,
-            f"Suffixes that can be written: {', '.join(WRITERS)}",
-        )
-
-
-def _tell(json: bool, facts: dict[str, Any], title: str, found: Examination) -> None:
-    if json:
-        say_json(facts)
-        return
+def _show(title: str, found: Examination) -> None:
     if not found.judged:
         say("No human body is told by the joints' names, so feet and floor were not judged.")
     if not found.faults:
@@ -120,10 +107,10 @@ def _compare(found: Examination, left: Examination) -> None:
     table("", ("", "", "before", "after"), rows, left=2)
 
 
-def _written(target: Path, clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:
+def _written(clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:
     if healed is clip:
-        say(f"{target}: nothing had to be mended; written as it was read.")
+        say("Nothing had to be mended; written as it was read.")
         return
     dropped = clip.frames - healed.frames
     frames = f", {dropped} repeated frames left out" if dropped else ""
-    say(f"{target}: {len(found.faults)} faults before, {len(left.faults)} after{frames}.")
+    say(f"{len(found.faults)} faults before, {len(left.faults)} after{frames}.")

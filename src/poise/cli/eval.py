@@ -9,8 +9,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from poise.cli.console import say_json
-from poise.cli.options import Device, Rule, check_device
+from poise.cli.answer import Answer
+from poise.cli.options import Device, Flag, Rule, check_device
 from poise.cli.output import run_folder
 from poise.cli.progress import working
 from poise.cli.results import print_card
@@ -22,8 +22,8 @@ class Options:
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a result or of a run."""
-    json: bool = False
-    """Print JSON alone: what score.json holds."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
     help_limit: Annotated[float | None, arg(metavar="NEWTONS", help_behavior_hint="")] = None
@@ -32,7 +32,7 @@ class Options:
     """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
     check_device(options.device)
     folder = run_folder(options.run)
@@ -41,8 +41,5 @@ def run(options: Options, argv: Sequence[str]) -> int:
     with working("simulating every start frame"):
         o = options
         card = open_run(folder).score(o.rule, o.help_limit, o.device)
-    if options.json:
-        say_json(card.to_dict())
-    else:
-        print_card(card)
-    return 0
+    print_card(card)
+    return Answer(card.to_dict())

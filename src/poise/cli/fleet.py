@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import say, table, tell
+from poise.cli.folder import clips_in
+from poise.cli.options import Flag
 from poise.cli.output import claimed
 from poise.cli.parse import parse
 from poise.cli.progress import clock
@@ -56,8 +59,11 @@ class Options:
     """Run on a Ray cluster: HOST:PORT, ray://HOST:PORT, auto or local. Its machines must see the
     same files. By default the jobs run on this machine, without Ray."""
 
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
 
-def run(options: Options, argv: Sequence[str]) -> int:
+
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Exit code 0 if every job is done, 1 if one has failed, 130 after Ctrl-C."""
     o = options
     if o.workers < 0:
@@ -78,12 +84,16 @@ def run(options: Options, argv: Sequence[str]) -> int:
     for record in result.records:
         if record.state == "failed":
             tell(f"{record.name} failed {record.attempts} times: {record.error}")
-    say(str(o.out / FLEET_FILE))
+    keys = ("name", "state", "seconds", "attempts", "error", "score")
+    jobs_done = [{key: getattr(r, key) for key in keys} for r in result.records]
+    answer = Answer({"jobs": jobs_done}, {"table": o.out / FLEET_FILE})
     if result.interrupted:
         tell(f"Stopped; {result.count('done')} of {len(jobs)} jobs are done. Go on with:")
         tell(f"  {shlex.join(('poise', 'fleet', *argv))}")
-        return 130
-    return 1 if result.count("failed") else 0
+        answer.exit_code = INTERRUPTED
+    elif result.count("failed"):
+        answer.exit_code = 1
+    return answer
 
 
 def plan(o: Options) -> list[FleetJob]:
@@ -110,46 +120,6 @@ def plan(o: Options) -> list[FleetJob]:
                 facts = {"clip": str(path), "seed": seed, "set": chosen}
                 jobs.append(FleetJob(name, tuple(command), out / name / "score.json", facts))
     return jobs
-
-
-def clips_in(library: Sequence[Path], out: Path) -> list[tuple[str, Path]]:
-    """Every motion file with a name of its own; results below `out` are none."""
-    found: list[tuple[str, Path]] = []
-    for path in library:
-        if not path.exists():
-            raise PoiseError("there is no such file or folder", path, "Give a folder of motion files")
-        root = path.absolute()
-        files = [root] if path.is_file() else sorted(f for f in root.rglob("*") if _is_clip(f))
-        base = root.parent if path.is_file() else root
-        found += [
-            ("-".join(f.relative_to(base).with_suffix("").parts), f)
-            for f in files
-            if not f.is_relative_to(out)
-        ]
-    if not found:
-        where = ", ".join(map(str, library)) or None
-        raise PoiseError("holds no motion file", where, "Give a folder with BVH, AMC or DeepMimic files")
-    seen: dict[str, int] = {}
-    named = []
-    for name, path in found:
-        seen[name] = seen.get(name, 0) + 1
-        named.append((name if seen[name] == 1 else f"{name}-{seen[name]}", path))
-    return named
-
-
-def _is_clip(path: Path) -> bool:
-    """Whether a file of a library is a motion; text files that are none may lie beside."""
-    from poise.motion.io.formats import READERS
-
-    suffix = path.suffix.lower()
-    if suffix in (".bvh", ".amc"):
-        return path.is_file()
-    readers = [r for r in READERS if suffix in r.suffixes and r.name != "ASF" and not r.asks]
-    if not path.is_file() or not readers:
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096).lstrip()
-    return any(r.looks_like(head) for r in readers)
 
 
 def _setting(text: str) -> tuple[str, list[str]]:

@@ -9,12 +9,13 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from poise.cli.answer import Answer
 from poise.cli.callbacks import first_delivery
-from poise.cli.console import say
-from poise.cli.options import Body, Reading, Training
+from poise.cli.options import Body, Flag, Reading, Training
+from poise.cli.output import may_deliver, places
 from poise.cli.progress import working
 from poise.cli.results import print_card
-from poise.cli.training import Job, command_line
+from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError
 
 
@@ -28,18 +29,30 @@ class Options:
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
-    hold_feet: bool = True
-    """In the written motion standing feet are held to the spot; so they stay as simulated."""
+    hold_feet: Flag = True
+    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Trains, evaluates, delivers; Ctrl-C during training saves and evaluates nothing."""
     o = options
+    if o.clip.is_dir():
+        hint = "Give one clip, or all of them to poise fleet DIR -o OUT"
+        raise PoiseError("is a folder", o.clip, hint)
     again = command_line("imitate", argv)
-    out, motion = _places(o)
+    from poise.jobs.runs import RUN_FILE
+
+    out, motion = places(o.out)
+    # A run that is not resumed is refused by `Job`, with or without --force: training takes hours.
+    held = (out / "run" / RUN_FILE).exists()
+    may_deliver(out, motion, o.force or held, o.clip)
     job = Job((o.clip,), out, out / "run", o.training, o.body, o.reading, again)
     from poise.learn.parallel import joined
 
@@ -47,9 +60,9 @@ def run(options: Options, argv: Sequence[str]) -> int:
         imitation = job.start(comm)
         result = job.train(imitation, comm, first_delivery(imitation, out, motion, o.hold_feet))
     if result.interrupted:
-        return job.stopped("Stopped; the training so far is saved.")
+        return stopped(job.run, again)
     if comm.rank:
-        return 0
+        return Answer()
     from poise.jobs.deliver import deliver
     from poise.jobs.runs import evaluate, learning_curve, trained_policy
 
@@ -60,22 +73,6 @@ def run(options: Options, argv: Sequence[str]) -> int:
             curve = learning_curve(job.run)
             done = deliver(imitation, evaluation, out, curve, motion, o.hold_feet)
     except KeyboardInterrupt:
-        return job.stopped("Stopped in the evaluation; the training is saved.")
+        return stopped(job.run, again, " in the evaluation")
     print_card(done.card)
-    for note in done.notes:
-        say(note)
-    for path in (*done.paths.values(), job.run):
-        say(str(path))
-    return 0
-
-
-def _places(o: Options) -> tuple[Path, Path | None]:
-    """The folder of the results, and the file of the motion where one was named."""
-    if not o.out.suffix or o.out.is_dir():
-        return o.out, None
-    from poise.motion.io import check_writable
-
-    check_writable(o.out)
-    if o.out.exists() and o.clip.exists() and o.out.samefile(o.clip):
-        raise PoiseError("the clip would be written over itself", o.out, "Give -o another name")
-    return o.out.with_suffix(""), o.out
+    return Answer(done.card.to_dict(), {**done.paths, "run": job.run}, done.notes)

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.console import notes, say, tell
-from poise.cli.options import Reading
+from poise.cli.answer import Answer
+from poise.cli.console import say, tell
+from poise.cli.options import Flag, Reading
+from poise.cli.output import may_write
 from poise.cli.progress import clock, showing
 from poise.errors import PoiseError
 
@@ -34,8 +36,9 @@ class Options:
     comes with Poise."""
     samples: Annotated[int, arg(metavar="N")] = 1
     """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others are variants."""
-    foot_lock: bool = True
-    """Feet that stand are held, and step clear of the floor; so they are left as they are."""
+    foot_lock: Flag = True
+    """Leave feet as the network made them; by default standing feet are held, and step clear of the
+    floor."""
     adapt: Annotated[int, arg(metavar="N")] = 20
     """Iterations of test-time adaptation for each gap, about a second in all: its feet slide less.
     0 does without."""
@@ -43,10 +46,14 @@ class Options:
     """Seed of the variants."""
     picture: Annotated[Path | None, arg(metavar="FILE.svg", help_behavior_hint="")] = None
     """Also draw the poses, keyframes black, over the clip that came in."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, fills, writes."""
     from poise.motion.io import write_clip
     from poise.synth.gaps import check_keyframes
@@ -56,14 +63,17 @@ def run(options: Options, argv: Sequence[str]) -> int:
     keys = frames_of(o.keyframes)
     if not 0 <= o.adapt <= 1000:
         raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}")
-    if o.out.exists() and o.clip.exists() and o.out.samefile(o.clip):
-        raise PoiseError("the clip would be written over itself", o.out, "Give --out another name")
+    one = o.samples == 1
+    outs = [o.out] if one else [o.out.with_stem(f"{o.out.stem}-{k}") for k in range(o.samples)]
+    for path in (*outs, *((o.picture,) if o.picture else ())):
+        may_write(path, o.force, o.clip)
     clip = o.reading.read(o.clip)
     check_keyframes(keys, clip.frames, str(o.clip))
     model = model_of(o.model)
     adaptation = replace(EACH_GAP, iterations=o.adapt) if o.adapt else None
     filling = Filling(o.samples, o.foot_lock, adaptation=adaptation, seed=o.seed)
     begun = time.monotonic()
+    tell(f"filling {len(keys) - 1} gaps", "dim")
     with showing("filling", at_once=False) as show:
 
         def count(done: int, of: int) -> None:
@@ -74,14 +84,15 @@ def run(options: Options, argv: Sequence[str]) -> int:
         filled = fill_keyframes(clip, keys, model, filling, count)
     for warning in filled.warnings:
         tell(f"warning: {warning}.", "yellow")
-    for k, made in enumerate(filled.clips):
-        path = o.out if o.samples == 1 else o.out.with_name(f"{o.out.stem}-{k}{o.out.suffix}")
+    outputs = {"clip" if one else f"clip-{k}": path for k, path in enumerate(outs)}
+    for made, path in zip(filled.clips, outs, strict=True):
         write_clip(made, path)
-        say(f"{path}: {made.frames} frames at {made.fps:.5g} fps, keyframes {o.keyframes}")
+        say(f"{path.name}: {made.frames} frames at {made.fps:.5g} fps, keyframes {o.keyframes}")
     if o.picture is not None:
         draw(clip, filled.clips, keys, o.picture)
-    notes(clip.skeleton.source.notes)
-    return 0
+        outputs["picture"] = o.picture
+    result = {"frames": clip.frames, "fps": clip.fps, "keyframes": keys, "warnings": filled.warnings}
+    return Answer(result, outputs, clip.skeleton.source.notes)
 
 
 def draw(clip: Clip, made: Sequence[Clip], keys: Sequence[int], path: Path) -> None:
@@ -95,18 +106,15 @@ def draw(clip: Clip, made: Sequence[Clip], keys: Sequence[int], path: Path) -> N
     rows = [PoseRow(c.name, c.positions(), ghost) for c in made[:4]]
     title = f"{clip.name}: {len(keys)} keyframes"
     pose_rows(title, rows, clip.skeleton.parents, frames, clip.fps, keys, path=path)
-    say(str(path))
 
 
 def frames_of(text: str) -> tuple[int, ...]:
-    """(0, 30, 45) from "0,30,45"."""
+    """(0, 30, 45) from "0,30,45" or "0 30 45"."""
     try:
-        return tuple(int(word) for word in text.replace(" ", "").split(","))
+        return tuple(int(word) for word in text.replace(",", " ").split())
     except ValueError:
         hint = "Write for example --keyframes 0,30,45"
-        raise PoiseError(
-            f"--keyframes needs whole numbers with commas, got '{text}'", hint=hint
-        ) from None
+        raise PoiseError(f"--keyframes needs whole numbers, got '{text}'", hint=hint) from None
 
 
 def model_of(folder: Path | None):

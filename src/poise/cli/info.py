@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.console import notes, say, say_json, table
-from poise.cli.options import Reading
+from poise.cli.answer import Answer
+from poise.cli.console import notes, say, table
+from poise.cli.folder import each
+from poise.cli.options import Flag, Reading
 from poise.errors import PoiseError
 
-#: The keys of `--json`, which programs rely on.
+#: The keys of a clip in the result, which programs rely on.
 KEYS = (
     *("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "height_m", "warnings"),
     *("repairs", "guesses"),
@@ -27,16 +29,18 @@ class Options:
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
-    """Motion files: BVH, AMC with its ASF, DeepMimic."""
-    json: bool = False
-    """Print JSON alone: one object, or a list of them for several clips."""
+    """Motion files, or folders of them."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads every file before the first line is printed."""
     if not options.clips:
         raise PoiseError("no clip was given", hint="Write poise info CLIP")
+    if any(path.is_dir() for path in options.clips):
+        return each("info", options.clips, None, lambda p, _: run(replace(options, clips=(p,)), argv))
     from poise.kin import find_faults, find_guesses
     from poise.motion.info import describe
 
@@ -46,10 +50,6 @@ def run(options: Options, argv: Sequence[str]) -> int:
         fact["repairs"] = None if fault is None else fault.numbers
     for clip, fact in zip(clips, facts, strict=True):
         fact["guesses"] = [g.to_dict() for g in find_guesses(clip)]
-    if options.json:
-        plain = [{key: fact[key] for key in KEYS} for fact in facts]
-        say_json(plain[0] if len(plain) == 1 else plain)
-        return 0
     for path, fact, fault in zip(options.clips, facts, faults, strict=True):
         table(str(path), ("", ""), _rows(fact), left=2)
         say("Guessed, and how to state it instead:")
@@ -62,7 +62,9 @@ def run(options: Options, argv: Sequence[str]) -> int:
         if fault is not None and fault.sentences:
             say("Will be repaired or should be checked:")
             notes(fault.sentences, 40)
-    return 0
+    plain = [{key: fact[key] for key in KEYS} for fact in facts]
+    frames = f"{facts[0]['format']}, {facts[0]['frames']} frames at {facts[0]['fps']:.5g} fps"
+    return Answer(plain[0] if len(plain) == 1 else plain, outcome=frames)
 
 
 def _guess(guess: dict[str, Any]) -> str:

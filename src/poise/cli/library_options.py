@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import UseAppendAction, arg
 
+from poise.cli.options import Flag
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class Library:
     """REGEX=FILE.asf, for AMC files of such names that have none beside them."""
     library_fps: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RE=HZ")] = ()
     """REGEX=HZ, frames per second of files of such names."""
-    mirror: bool = False
+    mirror: Flag = False
     """Learn from every clip in a mirror, too."""
     backwards: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
     """perpetual: learn clips whose names match backwards, too."""

@@ -1,18 +1,22 @@
 """`poise VERB ...`: finds the verb, runs it, and turns every failure into one sentence.
 
-Exit codes: 0 done; 1 a fault of Poise or of the machine; 2 a mistake the user can mend; 130 Ctrl-C.
+Exit codes: 0 done; 1 a fault of Poise or of the machine; 2 a mistake that the user can mend; 3 done, but
+a motion was lost; 130 Ctrl-C.
 """
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 from poise import __version__
+from poise.cli.answer import INTERRUPTED, Answer, document, failure, inputs_of
 from poise.errors import PoiseError, did_you_mean
 
 #: Every verb and what it does; its module is imported only when it runs.
@@ -38,25 +42,38 @@ _FIRST = (
     ("poise doctor walk.bvh", "what is wrong with the motion"),
     ("poise doctor", "whether this machine is ready"),
 )
-_INTERRUPTED = 130
 _PIPE_CLOSED = 141
-_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command line (default: the process's own) and returns the exit code."""
     given = sys.argv[1:] if argv is None else list(argv)
-    return guarded(lambda: _run(given))
+    answer, inputs, problems = Answer(), [], []
+
+    def work() -> int:
+        made = _run(given, inputs)
+        vars(answer).update(vars(made))
+        return made.exit_code
+
+    if "--json" not in given or {"-h", "--help"} & {*given}:
+        return guarded(work)
+    with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(nowhere):
+        answer.exit_code = guarded(work, problems.append)
+    from poise.cli.console import say_json
+
+    return guarded(lambda: say_json(document(given[0], inputs, answer, *problems or [None]))) or (
+        answer.exit_code
+    )
 
 
-def guarded(work: Callable[[], int]) -> int:
-    """The exit code of `work`; every failure of it becomes one sentence."""
+def guarded(work: Callable[[], int | None], told: Callable[[PoiseError], Any] | None = None) -> int:
+    """The exit code of `work`; every failure of it becomes one sentence on stderr, which `told` gets."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             # A name that the terminal cannot show must not end the program.
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
-        code = work()
+        code = work() or 0
         sys.stdout.flush()
         return code
     except SystemExit as stop:
@@ -65,43 +82,53 @@ def guarded(work: Callable[[], int]) -> int:
         # Whoever read our output has seen enough; what is still buffered goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _PIPE_CLOSED
-    except KeyboardInterrupt:
-        return _fail("interrupted", _INTERRUPTED)
-    except PoiseError as problem:
-        return _fail(str(problem), 2)
-    except OSError as problem:
-        if problem.filename is None and problem.errno not in _DISK:
-            return _unexpected(problem)
-        return _fail(str(of_path(problem)), 2)
-    except MemoryError:
-        return _fail("there is not enough memory; use fewer --envs or a shorter clip", 1)
-    except Exception as problem:
-        return _unexpected(problem)
+    except (KeyboardInterrupt, Exception) as problem:
+        from poise.cli.console import error
+
+        code, sentence = failure(problem)
+        if os.environ.get("POISE_DEBUG") and code != INTERRUPTED:
+            traceback.print_exc()
+        # A mistake of the user's is told by rank 0 for all processes; a fault may be one process's own.
+        error(str(sentence), everywhere=code == 1)
+        if told is not None:
+            told(sentence)
+        return code
 
 
-def of_path(problem: OSError) -> PoiseError:
-    """A failed access to a path of the user's, in one sentence."""
-    reason = (problem.strerror or str(problem)).lower()
-    hint = "Free some space" if problem.errno in _DISK[:2] else "Choose a path that can be used"
-    return PoiseError(f"cannot be read or written ({reason})", problem.filename or "the disk", hint)
-
-
-def _run(argv: list[str]) -> int:
+def _run(argv: list[str], inputs: list[Path]) -> Answer:
+    """Finds the verb and runs it; `inputs` is filled with what it reads before it does."""
     if not argv or argv[0] in ("-h", "--help", "help"):
         welcome()
-        return 0
+        return Answer()
     if argv[0] in ("--version", "-V"):
         sys.stdout.write(f"poise {__version__}\n")
-        return 0
+        return Answer()
     verb, rest = argv[0], argv[1:]
     if verb not in VERBS:
         raise PoiseError(f"there is no command '{verb}'. {did_you_mean(verb, list(VERBS))}")
+    from poise.cli.console import notes, say, tell
     from poise.cli.parse import parse
 
     module = import_module(f"poise.cli.{verb}")
     options = parse(module.Options, rest, f"poise {verb}")
+    inputs += inputs_of(options)
+    # What is imported now takes seconds.
+    tell(_begins(verb, inputs), "dim")
     _share_cores()
-    return module.run(options, rest)
+    answer = module.run(options, rest)
+    notes(answer.notes)
+    for path in answer.outputs.values():
+        say(str(path))
+    return answer
+
+
+def _begins(verb: str, inputs: Sequence[Path]) -> str:
+    """What the verb begins with: "reading walk.bvh"."""
+    if not inputs:
+        return "looking at this machine" if verb == "doctor" else f"poise {verb}"
+    more = f" and {len(inputs) - 3} more" if len(inputs) > 3 else ""
+    doing = "opening" if verb in ("eval", "play") else "reading"
+    return f"{doing} {', '.join(map(str, inputs[:3]))}{more}"
 
 
 def _share_cores() -> None:
@@ -127,25 +154,6 @@ def welcome() -> None:
     lines += [f"  {verb:<9} {what}" for verb, what in VERBS.items()]
     lines += ["", "poise COMMAND --help tells its options; poise --version the version."]
     sys.stdout.write("\n".join(lines) + "\n")
-
-
-def _fail(sentence: str, code: int) -> int:
-    from poise.cli.console import error
-
-    if os.environ.get("POISE_DEBUG") and code != _INTERRUPTED:
-        traceback.print_exc()
-    # A mistake of the user's is told by rank 0 for all processes; a fault may be one process's own.
-    error(sentence, everywhere=code == 1)
-    return code
-
-
-def _unexpected(problem: Exception) -> int:
-    said = f": {problem}" if str(problem) else ""
-    return _fail(
-        f"unexpected {type(problem).__name__}{said}. This is a fault of Poise; set POISE_DEBUG=1 "
-        "and run again for the traceback",
-        1,
-    )
 
 
 if __name__ == "__main__":

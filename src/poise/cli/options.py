@@ -16,10 +16,16 @@ if TYPE_CHECKING:
     from poise.motion import Clip
     from poise.recipes import ResidualForce
 
+#: A switch; its help states no default, which the sentence tells.
+Flag = Annotated[bool, arg(help_behavior_hint="")]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
 Method = Literal["rfc-implicit", "rfc-explicit", "deepmimic"]
 Reward = Literal["world", "local"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
+
+
+#: Units that --unit knows by name, in metres.
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 
 @dataclass(frozen=True)
@@ -30,17 +36,17 @@ class Reading:
     """The ASF skeleton of an AMC motion."""
     fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
     """Frames per second."""
-    unit: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """Metres in one unit of the file: 0.01 for centimetres."""
+    unit: Annotated[str | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """Metres in one unit of the file, 0.01 for example; or m, cm, mm, in."""
     up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
     """The file's vertical."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
     """Which animation of a file that holds several (glTF, USD); by default the longest."""
     ground: Annotated[str | None, arg(metavar="METRES|auto", help_behavior_hint="")] = None
     """The floor's height, which becomes 0; auto takes the one that the soles tell."""
-    swap_sides: bool = False
+    swap_sides: Flag = False
     """Exchange the names of left and right joints."""
-    allow_pickle: bool = False
+    allow_pickle: Flag = False
     """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
     smooth: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="")] = None
@@ -55,7 +61,7 @@ class Reading:
             path,
             skeleton=self.skeleton,
             fps=self.fps,
-            unit_m=self.unit,
+            unit_m=self.unit_m(),
             up_axis=self.up,
             allow_pickle=self.allow_pickle,
             take=self.take,
@@ -69,6 +75,16 @@ class Reading:
                 support = support_of(clip, anatomy_of(clip)) if floor is None else None
                 clip = grounded(clip, support, floor)
         return clip
+
+    def unit_m(self) -> float | None:
+        """Metres in one unit of the file, None where nothing is stated."""
+        if self.unit is None or self.unit in UNITS:
+            return UNITS.get(self.unit or "")
+        try:
+            return float(self.unit)
+        except ValueError:
+            hint = f"Known names: {', '.join(UNITS)}"
+            raise PoiseError(f"--unit needs metres or a name, got '{self.unit}'", hint=hint) from None
 
     def _floor(self) -> float | None:
         """The stated height of the floor in m, None where it is to be guessed or stays."""
@@ -147,9 +163,9 @@ class Training:
     """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
     iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Stop after so many iterations as well; for tests."""
-    expert: bool = True
-    """Start from a scripted expert (inverse dynamics and feedback) that is cloned first."""
-    resume: bool = False
+    expert: Flag = True
+    """Start from nothing; by default a scripted expert (inverse dynamics) is cloned first."""
+    resume: Flag = False
     """Go on with the run that is in the folder."""
 
     def check(self) -> None:

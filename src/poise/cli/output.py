@@ -1,4 +1,4 @@
-"""Result folders: tried out before the work starts, and left as they were if it cannot start."""
+"""What a verb writes: nothing that is there is lost, and folders are tried before the work starts."""
 
 from __future__ import annotations
 
@@ -8,6 +8,59 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from poise.errors import PoiseError
+
+#: What `imitate` and `track` write into their folder.
+_RESULTS = ("simulated.*", "simulated_*.*", "body.bvh", "score.json", "report.html")
+
+
+def may_write(path: Path, force: bool, *read: Path) -> None:
+    """Refuses to write where something would be lost, before any work is done.
+
+    Args:
+        force: an existing file may be written over.
+        read: files that are read, which nothing is written over.
+
+    Raises:
+        PoiseError: a file that is there or is read; a folder, a symbolic link, a pipe or a device.
+    """
+    if path.is_symlink():
+        raise PoiseError("is a symbolic link, which a file would replace", path, "Name the file itself")
+    if not path.exists():
+        return
+    if any(source.exists() and path.samefile(source) for source in read):
+        raise PoiseError("the clip would be written over itself", path, "Give OUT another name")
+    if path.is_dir():
+        raise PoiseError("is a folder", path, "Name a file in it")
+    if not path.is_file():
+        raise PoiseError("is a pipe or a device, which a file would replace", path, "Name a file")
+    if not force:
+        raise PoiseError("is there already", path, "Choose another name, or write over it with --force")
+
+
+def places(out: Path) -> tuple[Path, Path | None]:
+    """The folder of the results, and the file of the motion where `out` names one.
+
+    `out` names a file where its suffix is one of a motion format: run_v1.0 is a folder.
+
+    Raises:
+        PoiseError: a format that cannot be written.
+    """
+    from poise.motion.io import check_writable
+    from poise.motion.io.formats import READERS, WRITERS
+
+    suffix = out.suffix.lower()
+    known = {*WRITERS, ".fbx", *(s for r in READERS for s in r.suffixes)}
+    if suffix not in known or out.is_dir():
+        return out, None
+    check_writable(out)
+    return out.with_suffix(""), out
+
+
+def may_deliver(folder: Path, motion: Path | None, force: bool, *read: Path) -> None:
+    """Refuses to write results over others, see `may_write`."""
+    held = sorted(p for name in _RESULTS for p in folder.glob(name))
+    for path in (*([motion] if motion else ()), *held):
+        may_write(path, force, *read)
 
 
 @contextlib.contextmanager
@@ -60,7 +113,7 @@ def run_folder(path: Path) -> Path:
     """The run folder that `path` names: itself, or the `run` folder inside a result.
 
     Raises:
-        PoiseError: there is no such folder.
+        PoiseError: there is no such folder, or it is a result of `track`, which has no run.
     """
     # The name of the run file stands in poise.jobs.runs, whose import takes seconds.
     from poise.jobs.runs import RUN_FILE
@@ -68,4 +121,12 @@ def run_folder(path: Path) -> Path:
     if not path.exists():
         raise PoiseError("there is no such folder", path, "Give the folder of a result or a run")
     inner = path / "run"
+    held = (path / RUN_FILE).exists() or (inner / RUN_FILE).exists()
+    if (path / "score.json").exists() and not held:
+        learned = path / "learned"
+        if (learned / RUN_FILE).exists():
+            hint = f"Give what --learn trained for it: {learned}"
+        else:
+            hint = "Its score is score.json and its page report.html; or give the run of the policy"
+        raise PoiseError("is a result of poise track, which has no run of its own", path, hint)
     return inner if not (path / RUN_FILE).exists() and (inner / RUN_FILE).exists() else path

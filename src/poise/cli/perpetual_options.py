@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import arg
 
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Training
+from poise.cli.options import Body, Flag, Training
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -24,20 +24,20 @@ Action = Literal["absolute", "additive"]
 class Primitives:
     """What only the recipe perpetual knows."""
 
-    single: bool = False
+    single: Flag = False
     """perpetual: one larger network in place of primitives and a composer."""
     max_primitives: Annotated[int, arg(metavar="K")] = 3
     """perpetual: train at most so many primitives, each on what the ones before it fail."""
     goal: Annotated[Goal, arg(metavar="NAME")] = "rotations"
     """perpetual: rotations tells of places and rotations, keypoints of places alone."""
-    recovery: bool = True
+    recovery: Flag = True
     """perpetual: fallen and far characters learn to get up and come back; so nobody does."""
-    recovery_clips: bool = True
+    recovery_clips: Flag = True
     """perpetual: they follow ways that are made of the library's clips, where somebody gets up in it and
     somebody walks; so they are told a point to come back to, as in the paper."""
-    multiplicative: bool = True
+    multiplicative: Flag = True
     """perpetual: a composer combines primitives; so there is one network of their size."""
-    progressive: bool = True
+    progressive: Flag = True
     """perpetual: a primitive learns what earlier ones fail; so all learn with the composer."""
     termination: Annotated[Termination, arg(metavar="NAME")] = "relaxed"
     """perpetual: bodies whose mean distance ends an episode: relaxed leaves feet out, all; or code."""
@@ -50,7 +50,7 @@ class Primitives:
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
-    style: bool = True
+    style: Flag = True
     """perpetual: a discriminator rewards motion like that of the library; so the task alone does."""
 
 
@@ -99,7 +99,7 @@ def check_going_on(primitives: Primitives, body: Body, library: Library, returns
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    free = ["recovery", "ways", "single", "going_on"]
+    free = ["recovery", "recovery_clips", "single", "going_on"]
     if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.append("max_primitives")
     own = {name: getattr(primitives, name) for name in free}

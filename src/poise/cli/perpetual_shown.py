@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from poise.cli.answer import Answer
 from poise.cli.console import say, table, tell
 from poise.cli.progress import clock, showing
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 NAMED = 10
 
 
-def report(imitation: Imitation, result: PerpetualResult, out: Path) -> None:
+def report(imitation: Imitation, result: PerpetualResult, out: Path) -> Answer:
     """What the run came to, and which clips are the hardest."""
     if result.last is None:
         say(f"{out} had reached its limit before; nothing was trained.")
@@ -40,7 +41,8 @@ def report(imitation: Imitation, result: PerpetualResult, out: Path) -> None:
             k = r.clip.tolist().index(c)
             rows.append((names[c], f"{int(r.tracked[k])} of {int(r.frames[k])}"))
         table(f"The hardest of {total - won} that fail", ("clip", "frames tracked"), rows)
-    say(str(out))
+    figures = {"succeeded": won, "clips": total, "succ": r.rate, "error_mm": r.error_mm}
+    return Answer(figures, {"run": out})
 
 
 def recovered(card: RecoveryCard) -> str:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from poise.cli.console import say
-from poise.cli.output import run_folder
+from poise.cli.answer import Answer
+from poise.cli.options import Flag
+from poise.cli.output import may_write, run_folder
 from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
 
@@ -31,13 +32,19 @@ class Options:
     """The frame of the clip to start from."""
     clip: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The clip, where the run has several; by default the first one."""
-    open: bool = False
+    open: Flag = False
     """Open the page in the browser."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Simulates one episode to its end and writes its report page."""
     folder = run_folder(options.run)
+    if options.out is not None:
+        may_write(options.out, options.force)
     from poise.jobs.deliver import make_report
     from poise.jobs.open import open_run
     from poise.view import write_report
@@ -47,10 +54,10 @@ def run(options: Options, argv: Sequence[str]) -> int:
         clip, frame = _place(run.task, options.clip, options.start)
         page = options.out or folder / "play.html"
         write_report(make_report(run.task, run.episode(clip, frame), run.curve), page)
-    say(str(page))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
         raise PoiseError("no browser could be opened", page, "Open the page by hand")
-    return 0
+    clip_name = run.task.library.names[clip]
+    return Answer({"clip": clip_name, "start": options.start}, {"page": page})
 
 
 def _place(imitation: Imitation, name: str | None, start: int) -> tuple[int, int]:

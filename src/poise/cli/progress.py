@@ -90,9 +90,10 @@ def training(until: Until) -> Iterator[Callable[[IterationStats], None]]:
 
 @contextlib.contextmanager
 def working(what: str) -> Iterator[None]:
-    """A spinner in a terminal while something takes seconds."""
+    """A spinner in a terminal while something takes seconds, elsewhere a line."""
     console = err()
     if not console.is_terminal:
+        tell(what, "dim")
         yield
         return
     with console.status(Text(what)):

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.console import notes, say, say_json, table
-from poise.cli.options import Reading
+from poise.cli.answer import Answer
+from poise.cli.console import say, table
+from poise.cli.options import Flag, Reading
+from poise.cli.output import may_write
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -33,34 +35,31 @@ class Options:
     such as left_upper_arm=upperarm_l."""
     onto_skeleton: Annotated[Path | None, arg(metavar="ASF", help_behavior_hint="")] = None
     """The ASF skeleton where FILE is an AMC."""
-    contacts: bool = True
-    """Hold standing feet and hands where the clip has them."""
-    json: bool = False
-    """Print the report as JSON alone."""
+    contacts: Flag = True
+    """Do not hold standing feet and hands where the clip has them."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads both files, moves the motion over, writes, says what was matched and measured."""
     from poise.kin import RetargetConfig, retarget
     from poise.motion.io import read_clip, write_clip
 
     out = options.out
-    for path in (options.clip, options.onto):
-        if out.exists() and path.exists() and out.samefile(path):
-            raise PoiseError("a file that is read would be written over", out, "Give OUT another name")
+    may_write(out, options.force, options.clip, options.onto)
     mapping = pairs(options.map)
     clip = options.reading.read(options.clip)
     onto = read_clip(options.onto, skeleton=options.onto_skeleton)
     config = RetargetConfig(contacts=options.contacts, clear=options.contacts)
     made, report = retarget(clip, onto, mapping, config)
     write_clip(made, out)
-    if options.json:
-        say_json(report.to_dict())
-        return 0
     show(report)
-    say(f"{out}: {made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
-    return 0
+    say(f"{made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
+    return Answer(report.to_dict(), {"clip": out}, report.sentences())
 
 
 def pairs(texts: Sequence[str]) -> dict[str, str]:
@@ -79,7 +78,7 @@ def pairs(texts: Sequence[str]) -> dict[str, str]:
 
 
 def show(report: RetargetReport) -> None:
-    """The table of joints that are moved, and the sentences of the report."""
+    """The table of joints that are moved."""
     joints = report.joints
     source, target = joints.source.skeleton.names, joints.target.skeleton.names
     rows = [
@@ -94,4 +93,3 @@ def show(report: RetargetReport) -> None:
         if row.source
     ]
     table("", ("part", "moved by", "joint", "sure", "why"), rows, left=5)
-    notes(report.sentences())

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from poise.cli.console import notes, say, tell
-from poise.cli.options import Reading
-from poise.cli.output import claimed
+from poise.cli.answer import INTERRUPTED, LOST, Answer
+from poise.cli.console import say, tell
+from poise.cli.folder import each
+from poise.cli.options import Flag, Reading
+from poise.cli.output import claimed, may_deliver, may_write, places
 from poise.cli.progress import clock, showing, working
 from poise.cli.results import print_card
 from poise.errors import PoiseError
@@ -35,14 +37,14 @@ class Options:
     the motion, score.json and report.html. For a motion that it loses it can --search, or --learn it."""
 
     clip: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The motion file: a clip of any human skeleton, or keypoints."""
+    """The motion file: a clip of any human skeleton, or keypoints; or a folder of them."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
     Poise."""
-    search: bool = False
+    search: Flag = False
     """If the policy loses the motion, look for it: many characters try at once, those that come near it
     go on. What is found is one simulation, without help; it takes seconds for each of the motion."""
     characters: Annotated[int, arg(metavar="N")] = 512
@@ -54,26 +56,48 @@ class Options:
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores for --search and --learn; 0 is all."""
-    reset_on_fail: bool = False
+    reset_on_fail: Flag = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
-    recover: bool = False
+    recover: Flag = False
     """A character that is 0.5 m off gets up, walks back and goes on where the motion waits for it."""
     count: Annotated[int, arg(metavar="N")] = 1
-    """Characters who do the motion side by side in one world, where they may collide."""
+    """Characters that do the motion side by side in one world, where they may collide."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise, and of what --search and --learn draw."""
-    hold_feet: bool = True
-    """In the written motion standing feet are held to the spot; so they stay as simulated."""
+    hold_feet: Flag = True
+    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the policy as one file (.safetensors), which starts faster than a run folder."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
-    """Opens the policy, reads, tracks, writes; says where the character failed."""
-    o = options
+def run(options: Options, argv: Sequence[str]) -> Answer:
+    """One motion, or each of a folder with one policy, into a folder of its name."""
+    check(o := options)
+    if not o.clip.is_dir():
+        return track_one(o)
+    if o.save_policy is not None:
+        raise PoiseError("--save-policy is for one motion", hint="Leave it out")
+    from poise.jobs.open import open_run
+
+    with claimed(o.out):
+        with working("opening the policy"):
+            tracker = open_run(o.policy).tracker
+
+        def one(path: Path, name: str) -> Answer:
+            return track_one(replace(o, clip=path, out=o.out / name), tracker, o.out / name)
+
+        return each("track", (o.clip,), o.out, one)
+
+
+def check(o: Options) -> None:
+    """Refuses numbers that make no sense, before anything is read or made."""
     if not 1 <= o.count <= 64:
         raise PoiseError(f"--count must lie in 1 to 64, got {o.count}")
     if not 0 <= o.seed < 2**31:
@@ -89,7 +113,19 @@ def run(options: Options, argv: Sequence[str]) -> int:
         raise PoiseError(f"--rounds must lie in 1 to 20, got {o.rounds}")
     if o.threads < 0:
         raise PoiseError(f"--threads must be at least 0, got {o.threads}")
-    out, motion = places(o.clip, o.out)
+
+
+def track_one(options: Options, tracker: Tracker | None = None, folder: Path | None = None) -> Answer:
+    """Opens the policy, reads, tracks, writes; says where the character failed. folder: of the results,
+    where that is settled."""
+    o = options
+    from poise.jobs.runs import RUN_FILE
+
+    out, motion = places(o.out) if folder is None else (folder, None)
+    goes_on = o.learn > 0 and (out / "learned" / RUN_FILE).exists()
+    may_deliver(out, motion, o.force or goes_on, o.clip)
+    if o.save_policy is not None:
+        may_write(o.save_policy, o.force)
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
     from poise.jobs.open import open_run
@@ -99,8 +135,9 @@ def run(options: Options, argv: Sequence[str]) -> int:
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
-    with working("opening the policy"):
-        tracker = open_run(o.policy).tracker
+    if tracker is None:
+        with working("opening the policy"):
+            tracker = open_run(o.policy).tracker
     config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
     config = replace(config, search=searches(o), search_threads=o.threads)
     with claimed(out):
@@ -110,7 +147,7 @@ def run(options: Options, argv: Sequence[str]) -> int:
             tracked = track(tracker, given, plain)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
-                return 130
+                return Answer(exit_code=INTERRUPTED, outcome="interrupted")
             tracker = learned
             tracked = track(tracker, given, replace(config, search=None))
         if o.search and tracked.failures:
@@ -120,13 +157,23 @@ def run(options: Options, argv: Sequence[str]) -> int:
             if o.save_policy is not None:
                 save_tracker(tracked.tracker, o.save_policy)
     print_card(done.card)
-    notes((*tracked.notes, *done.notes))
-    say(outcome(tracked, o.reset_on_fail))
-    if tracked.failures:
+    said, lost = outcome(tracked, o.reset_on_fail), is_lost(tracked)
+    say(said)
+    if lost:
         say(advice(o))
-    for path in (*done.paths.values(), *((o.save_policy,) if o.save_policy else ())):
-        say(str(path))
-    return 0
+    word = "lost" if lost else "found" if tracked.found else "came back" if tracked.losses else "tracked"
+    failures = [{"character": who, "seconds": t} for who, t in tracked.failures]
+    result = {"outcome": word, "sentence": said, "failures": failures, "score": done.card.to_dict()}
+    saved = {"policy": o.save_policy} if o.save_policy else {}
+    told = (*tracked.notes, *done.notes)
+    code = LOST if lost else 0
+    return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
+
+
+def is_lost(tracked: Tracked) -> bool:
+    """Whether the character failed and did not end on the motion."""
+    losses = tracked.losses
+    return bool(tracked.failures) and (losses is None or len(losses.back) < len(losses.lost))
 
 
 def searches(options: Options) -> SamplingConfig | None:
@@ -194,7 +241,7 @@ def outcome(tracked: Tracked, reset: bool) -> str:
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
     count, fell = len(reference.length), {who for who, _ in tracked.failures}
     if count > 1:
-        first = f", the first at {tracked.failures[0][1]:.1f} s" if fell else ""
+        first = f", the first lost at {tracked.failures[0][1]:.1f} s" if fell else ""
         again = f"; they were put back {len(tracked.failures)} times" if fell and reset else ""
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if tracked.losses is not None:
@@ -205,36 +252,24 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"Tracked to its end, {seconds:.1f} s, without help."
     if not reset:
         return (
-            f"The character failed at {times[0]:.1f} s of {seconds:.1f} s, where it was 0.5 m off; "
+            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; "
             "what follows is not tracking. --reset-on-fail puts it back and goes on."
         )
     named = ", ".join(f"{t:.1f}" for t in times[:NAMED]) + (", ..." if len(times) > NAMED else "")
     return (
-        f"The character failed {len(times)} times in {seconds:.1f} s and was put back, at {named} s; "
-        "the score ends at the first failure."
+        f"Lost: the character failed {len(times)} times in {seconds:.1f} s and was put back, at {named} "
+        "s; the score ends at the first failure."
     )
 
 
 def read(path: Path, reading: Reading) -> Clip | Keypoints:
     """The motion in a file; keypoints stay keypoints."""
     from poise.jobs.track.points import points_of
-    from poise.motion.io.raw import Options as Stated
+    from poise.motion.io.raw import ReadOptions as Stated
 
     clip = reading.read(path)
     if reading.ground is not None or reading.swap_sides:
         # What was stated about the skeleton is known to the clip alone.
         return clip
-    stated = Stated(fps=reading.fps, unit_m=reading.unit, up_axis=reading.up)
+    stated = Stated(fps=reading.fps, unit_m=reading.unit_m(), up_axis=reading.up)
     return points_of(clip, stated) or clip
-
-
-def places(clip: Path, out: Path) -> tuple[Path, Path | None]:
-    """The folder of the results, and the file of the motion where one was named."""
-    if not out.suffix or out.is_dir():
-        return out, None
-    from poise.motion.io import check_writable
-
-    check_writable(out)
-    if out.exists() and clip.exists() and out.samefile(clip):
-        raise PoiseError("the motion would be written over itself", out, "Give -o another name")
-    return out.with_suffix(""), out

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Reading, Training
+from poise.cli.options import Body, Flag, Reading, Training
 from poise.cli.perpetual_options import Primitives
 from poise.cli.train_inbetween import Network
-from poise.cli.training import Job, command_line
+from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
 
 #: Recipes that can be trained.
@@ -44,6 +45,8 @@ class Options:
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
     """Motion files."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     library: OmitArgPrefixes[Library] = field(default_factory=Library)
     network: OmitArgPrefixes[Network] = field(default_factory=Network)
@@ -52,7 +55,7 @@ class Options:
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-def run(options: Options, argv: Sequence[str]) -> int:
+def run(options: Options, argv: Sequence[str]) -> Answer:
     """Trains until the limit or Ctrl-C."""
     o = options
     if o.recipe not in RECIPES:
@@ -71,16 +74,20 @@ def run(options: Options, argv: Sequence[str]) -> int:
         imitation = job.start(comm)
         result = job.train(imitation, comm)
     if result.interrupted:
-        return job.stopped("Stopped; the training so far is saved.")
+        return stopped(job.run, again)
     if result.last is None:
         say(f"{o.out} had reached its limit before; nothing was trained.")
     else:
         say(f"Trained {result.last.seconds:.0f} s, {result.last.samples:,} samples")
-    say(str(o.out))
-    return 0
+    return Answer(trained(result.last), {"run": o.out})
 
 
-def _perpetual(o: Options, argv: Sequence[str]) -> int:
+def trained(last: Any) -> dict[str, Any] | None:
+    """What a training took, as JSON data; None where it had reached its limit before."""
+    return None if last is None else {"seconds": last.seconds, "samples": last.samples}
+
+
+def _perpetual(o: Options, argv: Sequence[str]) -> Answer:
     """One policy for a folder of clips."""
     from poise.cli.train_perpetual import run as train
 
@@ -99,7 +106,7 @@ def _only_a_folder(o: Options) -> None:
             raise PoiseError(f"--{name.replace('_', '-')} is about a single clip", hint=instead)
 
 
-def _inbetween(o: Options, argv: Sequence[str]) -> int:
+def _inbetween(o: Options, argv: Sequence[str]) -> Answer:
     """A network instead of a character: only some of the options have a meaning."""
     from poise.cli.train_inbetween import run as train
 

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from poise.cli.console import notes, say, tell
+from poise.cli.answer import Answer
+from poise.cli.console import say, tell
 from poise.cli.library_options import Library
 from poise.cli.output import claimed
 from poise.cli.progress import clock, showing
+from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ class Network:
 
 
 def run(library: Library, network: Network, out: Path, minutes: float, seed: int, steps: int | None,
-        threads: int, resume: bool, again: str) -> int:  # fmt: skip
+        threads: int, resume: bool, again: str) -> Answer:  # fmt: skip
     """Trains until the last step or Ctrl-C."""
     import os
 
@@ -71,21 +73,18 @@ def run(library: Library, network: Network, out: Path, minutes: float, seed: int
         task, steps = begin(out, folder, config, minutes, steps, tell)
     used = len(task.data.first) - 1
     say(f"{used} clips, {task.data.frames:,} frames to learn from; {steps:,} steps")
-    notes(task.notes)
     with showing("training") as show:
         _, stats, stopped = train(
             task, out, steps, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}")
         )
     if stopped:
-        tell("Stopped; the training so far is saved. Go on with:")
-        tell(f"  {again}")
-        return 130
+        return interrupted(out, again)
     if stats is None:
         say(f"{out} had reached its last step before; nothing was trained.")
     else:
         say(f"Trained {stats.seconds:.0f} s, {stats.samples:,} windows")
-    say(str(out))
-    return 0
+    result = None if stats is None else {"seconds": stats.seconds, "samples": stats.samples}
+    return Answer(result, {"run": out}, task.notes)
 
 
 def times(stats: BlockStats) -> str:

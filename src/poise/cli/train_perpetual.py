@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
+from poise.cli.answer import Answer
 from poise.cli.callbacks import beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.library_options import Library
@@ -18,6 +19,7 @@ from poise.cli.perpetual_options import Primitives, check_going_on, settings
 from poise.cli.perpetual_shown import report
 from poise.cli.perpetual_shown import training as shown
 from poise.cli.progress import clock
+from poise.cli.training import stopped
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
 def run(
     library: Library, primitives: Primitives, out: Path, training: Training, body: Body, again: str
-) -> int:
+) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
     library.folder("perpetual")
     if launched() and int(os.environ["WORLD_SIZE"]) > 1:
@@ -67,11 +69,8 @@ def run(
         )  # fmt: skip
     if result is None or result.interrupted:
         where = "" if result is None or result.last is None else f" in {result.last.stage.name}"
-        tell(f"Stopped{where}; the training so far is saved. Go on with:")
-        tell(f"  {again}")
-        return 130
-    report(imitation, result, out)
-    return 0
+        return stopped(out, again, where)
+    return report(imitation, result, out)
 
 
 def begin(

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
+from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.callbacks import First, beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Body, Reading, Training
@@ -104,11 +105,17 @@ class Job:
             # A second Ctrl-C ends the present iteration too; all before it are saved.
             return RunResult(None, True, None)
 
-    def stopped(self, what: str) -> int:
-        """Says how to go on after Ctrl-C, and gives the exit code."""
-        tell(f"{what} Go on with:")
-        tell(f"  {self.again}")
-        return 130
+
+def stopped(run: Path, again: str, where: str = "") -> Answer:
+    """Says what Ctrl-C left in the run folder, and the command line that goes on with it."""
+    from poise.learn import LATEST
+
+    if (run / LATEST).exists():
+        tell(f"Stopped{where}; the training so far is saved. Go on with:")
+    else:
+        tell(f"Stopped{where} before there was anything to save. Begin again with:")
+    tell(f"  {again}")
+    return Answer({"again": again}, exit_code=INTERRUPTED)
 
 
 def command_line(verb: str, argv: Sequence[str]) -> str:

@@ -15,10 +15,11 @@ from poise.sim.drive import Drive
 class PDTargets:
     """Actions become target angles `u` of the PD servos (RFC Eq. 1).
 
-    mode: "additive" u = q_ref + scale * a (RFC Sec. 5, the reference of the NEXT frame);
-        "absolute" u = offset + scale * a (RFC Sec. 3).
-    scale: rad per unit of action, one for all hinges or `(n)`, see `range_scale`.
-    offset: `(n)` rad, used by "absolute" only (zeros if None, as in PHC).
+    Attributes:
+        mode: "additive" u = q_ref + scale * a (RFC Sec. 5, the reference of the NEXT frame); "absolute"
+            u = offset + scale * a (RFC Sec. 3).
+        scale: rad per unit of action, one for all hinges or `(n)`, see `range_scale`.
+        offset: `(n)` rad, used by "absolute" only (zeros if None, as in PHC).
     """
 
     mode: str = "additive"
@@ -38,7 +39,7 @@ class PDTargets:
         drive.ctrl.add_(target if base is None else target + base.to(target.device))
 
     def action(self, target: Tensor, q_ref_next: Tensor) -> Tensor:
-        """The actions `(N, n)` whose targets are `target (N, n)` rad: the inverse of `apply`."""
+        """The actions `(N, n)` that give the targets `target (N, n)` rad: the inverse of `apply`."""
         base = q_ref_next if self.mode == "additive" else self.offset
         return (target if base is None else target - base) / self.scale
 
@@ -46,7 +47,7 @@ class PDTargets:
 def range_scale(ranges: Tensor) -> Tensor:
     """Rad per unit of absolute action, `(n)` of joint ranges `(n, 2)` rad: min(1.2 max |limit|, pi).
 
-    PHC's code has it so, with a policy whose actions are not bounded; its knees have 5.
+    PHC's code has it so, with a policy of unbounded actions; its knees have 5.
     """
     return (1.2 * ranges.abs().amax(-1)).clamp_max(torch.pi)
 
@@ -70,8 +71,12 @@ def stable_pd_torque(
     Args:
         mass: `(..., nv, nv)` joint-space inertia M with a six-dimensional root first.
         bias: `(..., nv)` Coriolis, centrifugal and gravity forces C.
-        kp, kd: `(n)` gains. q: `(..., n)` hinge angles. qvel: `(..., nv)`. target: `(..., n)` rad.
-        dt: physics step in s. limit: `(n)` N m, torques are clipped after the implicit solve.
+        kp, kd: `(n)` gains.
+        q: `(..., n)` hinge angles.
+        qvel: `(..., nv)`.
+        target: `(..., n)` rad.
+        dt: physics step in s.
+        limit: `(n)` N m, torques are clipped after the implicit solve.
     """
     n, nv = kp.shape[-1], qvel.shape[-1]
     zeros = qvel.new_zeros(*qvel.shape[:-1], nv - n)

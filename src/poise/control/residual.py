@@ -19,10 +19,13 @@ from poise.spatial import heading_quat, quat_rotate
 
 
 class Wrench(NamedTuple):
-    """What was applied. M bodies (one for the implicit form).
+    """What was applied. M bodies (one for the implicit form), world axes.
 
-    force `(N, M, 3)` N and torque `(N, M, 3)` N m in world axes, at `point (N, M, 3)` m, world.
-    body: `M` rows of the humanoid's table.
+    Attributes:
+        force: `(N, M, 3)` N.
+        torque: `(N, M, 3)` N m.
+        point: `(N, M, 3)` m, where the force acts.
+        body: `M` rows of the humanoid's table.
     """
 
     force: Tensor
@@ -95,7 +98,11 @@ class ImplicitResidual:
 
     Action (6): force in the root's heading frame and torque in the root's own frame, in units of
     the limits; held over the control step.
-    limit_n: N. limit_nm: N m. k_r: weight in the regularizer exp(-k_r |a|^2).
+
+    Attributes:
+        limit_n: N.
+        limit_nm: N m.
+        k_r: weight in the regularizer exp(-k_r |a|^2).
     """
 
     limit_n: float = 100.0
@@ -140,7 +147,15 @@ class ExplicitResidual:
     """RFC-Explicit: a wrench at a learned contact point on each chosen body (Eqs. 2 and 3).
 
     Action (9 per body): contact point e (m), force and torque xi in units of the limits, all in the
-    body's own frame. bodies: rows of the humanoid's table. reach_m: bound on |e|.
+    body's own frame.
+
+    Attributes:
+        bodies: rows of the humanoid's table.
+        limit_n: N.
+        limit_nm: N m.
+        k_f: weight of the wrench in the regularizer.
+        k_cp: weight of the contact point in the regularizer.
+        reach_m: m, bound on |e|.
     """
 
     bodies: tuple[int, ...] = (0,)

@@ -24,8 +24,10 @@ class HelpSchedule(Protocol):
         """The scale from now on.
 
         Args:
-            scale: the present one. steps: control steps that each world has made. success: the share
-                of recent episodes that did not end by failure, in [0, 1]; NaN when none has ended yet.
+            scale: the present one.
+            steps: control steps that each world has made.
+            success: the share of recent episodes that did not end by failure, in [0, 1]; NaN when
+                none has ended yet.
         """
         ...
 
@@ -37,7 +39,11 @@ class LinearHelp:
     S_r = S_init - alpha (i - i_start) between i_start and i_end. The paper's iterations are control
     steps here; its S_init 220, alpha 0.1, i_start 100, i_end 1300 of 50,000 samples end at scale 0.45.
 
-    start, stop: control steps of each world. final: the scale at and after `stop`.
+    Attributes:
+        start: control steps of each environment at which the scale begins to fall.
+        stop: control steps of each environment at which it has fallen.
+        final: the scale at and after `stop`.
+        every: control steps between two decisions.
     """
 
     start: int
@@ -62,10 +68,17 @@ class LinearHelp:
 class SuccessHelp:
     """Less help while episodes succeed, more when they fail.
 
-    lower_at: success from which the scale is multiplied by `factor`; exploration fails many episodes
-    that the policy itself would not: where it succeeds from 97 % of the starts, training shows 0.65.
-    raise_at: success under which it is divided by it. smallest: under this scale the help ends (it
-    becomes `final`); a policy that then fails gets this much back. final: never less than this.
+    Exploration fails many episodes that the policy itself would not: where the policy succeeds from
+    97 % of the starts, training shows 0.65.
+
+    Attributes:
+        lower_at: success from which the scale is multiplied by `factor`.
+        raise_at: success under which the scale is divided by it.
+        factor: below 1.
+        smallest: under this scale the help ends (it becomes `final`); a policy that then fails gets
+            this much back.
+        final: never less than this.
+        every: control steps between two decisions.
     """
 
     lower_at: float = 0.5

@@ -136,9 +136,8 @@ def recovery_card(
             before the trials goes on standing on its last frame. It waits for the fallen as in training.
         near, held: m and s, see the module. seed: of falls and directions, other ones than in training.
         at_once: trials that are simulated side by side.
-        ways: leads the policy back by them (`env.recovery.controller`), where the task is for that; by
-        default it is
-            told a point.
+        recovery_clips: what the policy is led back by (`env.goals.led`), where the task is for that; by
+            default it is told a point.
 
     Raises:
         PoiseError: a kind that there is not, a clip that there is not, or a task without recovery.

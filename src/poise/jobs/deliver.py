@@ -92,6 +92,8 @@ def deliver(
     curve: dict[str, np.ndarray],
     motion: Path | None = None,
     hold: bool = True,
+    source: Clip | None = None,
+    said: tuple[str, ...] = (),
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`.
 
@@ -104,6 +106,8 @@ def deliver(
         hold: standing feet are held to the spot (`kin.hold_feet`): contacts of a simulation are soft,
             so soles creep, rock and sink by millimetres. Score and report show the simulation itself;
             what holding did stands in them as well.
+        source: see `make_report`.
+        said: sentences that the report begins with.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
@@ -114,8 +118,8 @@ def deliver(
         write_clip(clip, paths[name])
     paths["score"] = write_score(done.card, out / "score.json")
     paths["report"] = out / "report.html"
-    report = make_report(imitation, replace(evaluation, card=done.card), curve)
-    write_report(replace(report, notes=(*report.notes, *done.notes)), paths["report"])
+    report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
+    write_report(replace(report, notes=(*said, *report.notes, *done.notes)), paths["report"])
     return Delivery(paths, done.card, done.notes)
 
 
@@ -154,12 +158,20 @@ def _sentences(found: dict[str, Any]) -> list[str]:
     ]
 
 
-def make_report(imitation: Imitation, evaluation: Evaluation, curve: dict[str, np.ndarray]) -> Report:
-    """The report page of the first clip's episode from its first frame."""
+def make_report(
+    imitation: Imitation,
+    evaluation: Evaluation,
+    curve: dict[str, np.ndarray],
+    source: Clip | None = None,
+) -> Report:
+    """The report page of the first clip's episode from its first frame.
+
+    source: the clip as its file holds it, where the library's is one that was moved onto another body.
+    """
     recording, r = evaluation.recordings[0], evaluation.rollouts
     row, frames = recording.row, len(recording.qpos)
     pos, ref = r.pos[row, :frames].numpy(), r.ref_pos[row, :frames].numpy()
-    table, source = imitation.humanoid.table, imitation.library.clips[recording.clip]
+    table, source = imitation.humanoid.table, source or imitation.library.clips[recording.clip]
     card = evaluation.card
     error = np.linalg.norm((pos - pos[:, :1]) - (ref - ref[:, :1]), axis=-1).mean(-1) * 1000
     low = lowest_height(table, r.pos[row, :frames], r.quat[row, :frames]).numpy()

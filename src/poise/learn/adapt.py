@@ -42,7 +42,7 @@ class Adaptation:
     so that predicting no contact at all also lowers the loss."""
     optimizer: Literal["sgd", "adam"] = "adam"
     batch: int = 128
-    """Sequences whose gradients are worked out at once; it changes memory and time alone."""
+    """Sequences of which gradients are computed at once; it changes memory and time alone."""
 
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
@@ -92,7 +92,7 @@ def adapt(
     to a large set as to the small one that they were chosen on.
 
     Args:
-        known: all sequences; of `config.batch` at a time the gradients are worked out, in order.
+        known: all sequences; the gradients of `config.batch` at a time are computed, in order.
         on_iteration: called with its number (from 1), the network so far and the mean loss before it.
 
     Raises:
@@ -143,7 +143,8 @@ def choose_iterations(
     config: Adaptation | None = None,
     most: int = 7,
 ) -> tuple[int, tuple[float, ...]]:
-    """The number of iterations, 0 to `most`, whose transitions score lowest on validation sequences.
+    """The number of iterations, 0 to `most`, after which transitions score lowest on validation
+    sequences.
 
     The paper reports the best iteration on the test set itself, which is tuning on test data; this is
     for sequences held out for choices. Returns the number and the scores of 0, 1, ... iterations.

@@ -1,6 +1,6 @@
 """Behaviour cloning with DAgger (Ross et al. 2011): a policy that acts as a teacher does.
 
-Round 0 is driven by the teacher with noise, so that the data hold ways back to the path. In each later
+Round 0 is driven by the teacher with noise, so that the data hold returns to the clip. In each later
 round the student drives most episodes itself, and the teacher says what it would have done there. The
 last round's returns teach a critic, so that reinforcement learning can go on at once.
 """
@@ -43,7 +43,7 @@ class CloneConfig:
     lr: float = 1e-3
     """Adam's step size; it falls to a tenth over each round's fit."""
     critic_steps: int = 32
-    """Control steps per environment whose returns teach the critic; 0 leaves it untrained."""
+    """Control steps per environment that teach the critic by their returns; 0 leaves it untrained."""
     critic_passes: int = 3
     """Times that the critic learns from them, with returns estimated anew."""
 
@@ -97,7 +97,7 @@ def clone(
         ppo: the network sizes, action noise sigma, discount and critic settings.
         on_round: called after each round; returning False ends the cloning there.
         start: the policy that is taught, of which a copy is made, such as a column or a composer of
-            `poise.learn.progressive`, whose frozen parts stay; by default a new perceptron.
+            `poise.learn.progressive` (frozen parts stay); by default a new perceptron.
 
     The same seed on the same environment gives the same bits. Numbers that are not finite raise a
     `TrainingError`.
@@ -219,7 +219,7 @@ def _gather(
         if count := int(done.sum()):
             lost = step.terminated if step.failed is None else step.failed
             ended, failed = ended + count, failed + int(lost.sum())
-            # Who drives is drawn per episode, so that errors of the student can grow.
+            # Teacher or student drives a whole episode, so that errors of the student can grow.
             taught[done] = drawn(count)
         obs = step.obs
     return obs, reward, failed / ended if ended else float("nan")

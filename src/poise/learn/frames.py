@@ -14,7 +14,14 @@ from poise.spatial import normalize
 
 
 class Windows(NamedTuple):
-    """A batch: root `(N, W, 3)`, rot `(N, W, J, 4)`, contact `(N, W, F)` 0 or 1, offsets `(N, J, 3)`."""
+    """A batch of N windows of W frames; metres, Z up.
+
+    Attributes:
+        root: `(N, W, 3)` m.
+        rot: `(N, W, J, 4)` wxyz, local.
+        contact: `(N, W, F)`, 0 or 1 of each foot joint.
+        offsets: `(N, J, 3)` m, bones.
+    """
 
     root: Tensor
     rot: Tensor
@@ -26,8 +33,14 @@ class Windows(NamedTuple):
 class FrameData:
     """All frames of a training set, one clip after another, float32; metres, Z up.
 
-    root `(F, 3)`, rot `(F, J, 4)` wxyz local, contact `(F, K)` of each foot joint, offsets `(C, J, 3)`
-    of each clip, first `(C + 1)` where clips begin. std `(J, 3)` m: the deviations that L2P divides by.
+    Attributes:
+        layout: of the skeleton.
+        root: `(F, 3)` m.
+        rot: `(F, J, 4)` wxyz, local.
+        contact: `(F, K)` of each foot joint.
+        offsets: `(C, J, 3)` m, bones of each clip.
+        first: `(C + 1)`, rows where clips begin.
+        std: `(J, 3)` m, the deviations that L2P divides by.
     """
 
     layout: Layout

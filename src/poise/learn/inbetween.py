@@ -74,8 +74,10 @@ class InbetweenTrainer:
 
     Args:
         objective: made for `steps` steps.
-        data: the training set. seed: of the windows that are drawn.
-        steps: of the whole training. block: steps between two reports.
+        data: the training set.
+        seed: of the windows that are drawn.
+        steps: of the whole training.
+        block: steps between two reports.
         ema: how much of the averaged weights stays at each step; early steps count less.
         stretch: of the windows' speed, see `Sampler`.
         metadata: JSON data that every checkpoint carries.

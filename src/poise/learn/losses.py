@@ -13,8 +13,14 @@ from poise.nets import gaussian_entropy, gaussian_kl, gaussian_log_prob
 
 
 class Drawn(NamedTuple):
-    """What the old policy drew, `(B, D)`, with its log-probability `(B,)`, mean `(B, D)` and log sigma,
-    `(D,)` where it is the same for all samples or `(B, D)`."""
+    """What the old policy drew.
+
+    Attributes:
+        action: `(B, D)`.
+        log_prob: `(B,)`, log-probability of the action.
+        mean: `(B, D)`.
+        log_std: log sigma, `(D,)` where it is the same for all samples or `(B, D)`.
+    """
 
     action: Tensor
     log_prob: Tensor

@@ -38,7 +38,8 @@ class MiningConfig:
     fade: float = 0.7
     """What an evaluation leaves of earlier failures with "floor"; 1 forgets none."""
     memory: int = 5
-    """Evaluations whose failures are the next primitive's clips with the union "recent"."""
+    """With the union "recent", clips that failed in so many last evaluations are the next
+    primitive's."""
     union: Union = "recent"
     """What the next primitive learns: clips that failed in any of the last `memory` evaluations (PHC's
     code), or in the last one (its paper)."""
@@ -75,8 +76,11 @@ class HardNegatives:
         base: `(C,)` odds without mining, such as the seconds of each clip; by default all the same, as
             in PHC's code.
 
-    Attributes (`(C,)` each): `member` bool, the clips of the present stage; `tried`, `failed` counts of
-    evaluations; `faded` failures of which old ones count less.
+    Attributes:
+        member: `(C,)` bool, the clips of the present stage.
+        tried: `(C,)`, number of evaluations.
+        failed: `(C,)`, number of failed evaluations.
+        faded: `(C,)`, failures of which old ones count less.
     """
 
     def __init__(self, clips: int, config: MiningConfig | None = None, base: Tensor | None = None):

@@ -29,11 +29,15 @@ KINDS = ("transformer", "rtn")
 class InbetweenModel:
     """A network ready to use.
 
-    names: joints, in order. offsets `(J, 3)` m: bones of the training set (the mean over its clips).
-    fps: frames per second. longest: frames of the longest gap it was trained for. past: frames before
-    the gap that it was trained with at most. meta: data set, seed, steps, how it was made.
-    example: tensors and JSON notes of a clip as `motion.pack` packs it, which shows how the skeleton
-    stands; None where clips of other skeletons are not to be brought onto it.
+    Attributes:
+        names: joints, in order.
+        offsets: `(J, 3)` m, bones of the training set (the mean over its clips).
+        fps: frames per second.
+        longest: frames of the longest gap it was trained for.
+        past: frames before the gap that it was trained with at most.
+        meta: data set, seed, steps, how it was made.
+        example: tensors and JSON notes of a clip as `motion.pack` packs it, which shows how the
+            skeleton stands; None where clips of other skeletons are not to be brought onto it.
     """
 
     kind: str

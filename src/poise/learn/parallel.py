@@ -237,8 +237,8 @@ def together(comm: Comm, error: type[PoiseError] = PoiseError) -> Iterator[None]
         if problem is not None:
             raise problem
         rank, text = next(((r, t) for r, t in enumerate(said) if t), (None, b""))
-        who = "another process" if rank is None else f"process {rank}"
-        raise error(f"{who} stopped" + (f" ({text.decode()})" if text else ""))
+        lost = "another process" if rank is None else f"process {rank}"
+        raise error(f"{lost} stopped" + (f" ({text.decode()})" if text else ""))
 
 
 def gather_state(comm: Comm, state: State) -> State:

@@ -24,9 +24,12 @@ from poise.settings import check_data
 class PolicyBundle:
     """A policy that acts on raw observations; it satisfies the `Policy` protocol.
 
-    norm: the observations' normaliser. policy: the Gaussian over actions.
-    shape: what rebuilds the networks (hidden, activation, obs_clip and, but for a single perceptron, its
-    kind with what `poise.learn.progressive` adds). meta: the checkpoint's data.
+    Attributes:
+        norm: the observations' normaliser.
+        policy: the Gaussian over actions.
+        shape: what rebuilds the networks (hidden, activation, obs_clip and, but for a single
+            perceptron, its kind with what `poise.learn.progressive` adds).
+        meta: the checkpoint's data.
     """
 
     norm: RunningNorm
@@ -47,7 +50,7 @@ class PolicyBundle:
         *,
         generator: torch.Generator,
     ) -> PolicyBundle:
-        """An untrained policy whose mean action is nearly 0."""
+        """An untrained policy with a mean action of nearly 0."""
         mean = MLP(num_obs, hidden, num_actions, activation, last_scale=0.1, generator=generator)
         shape = {"hidden": list(hidden), "activation": activation, "obs_clip": obs_clip}
         return cls(RunningNorm(num_obs, obs_clip), GaussianPolicy(mean, std, learn_std), shape)
@@ -169,10 +172,14 @@ class PolicyBundle:
 class WarmStart:
     """What reinforcement learning may start from.
 
-    policy: weights and observation statistics; one that is no plain perceptron, such as a column or a
-    composer of `poise.learn.progressive`, is itself what goes on learning, whatever sizes and action
-    noise the config has. critic: `PPO.state()` entries under "critic/" and
-    "return_norm/", or None for an untrained critic. samples, seconds: what it cost to make.
+    Attributes:
+        policy: weights and observation statistics; a policy that is no plain perceptron, such as a
+            column or a composer of `poise.learn.progressive`, goes on learning itself, whatever sizes
+            and action noise the config has.
+        critic: `PPO.state()` entries under "critic/" and "return_norm/", or None for an untrained
+            critic.
+        samples: control steps that it cost to make.
+        seconds: time that it cost to make.
     """
 
     policy: PolicyBundle

@@ -94,8 +94,11 @@ def compose(
 ) -> PolicyBundle:
     """All primitives frozen under an untrained composer; see `nets.Composer`.
 
-    PHC's paper: "product"; its code: "means" with "relu" or "silu". hidden: of the composer, by default
-    as the primitives'. joint: all learn together, from a fresh normaliser if there is no other.
+    PHC's paper takes "product", its code "means" with "relu" or "silu".
+
+    Args:
+        hidden: of the composer, by default as the primitives'.
+        joint: all learn together, from a fresh normaliser if there is no other.
     """
     net, log_std = _columns(bundle).copy(), primitive_log_std(bundle)
     hidden = net.hidden if hidden is None else hidden

@@ -25,8 +25,8 @@ class Step(NamedTuple):
     """`(N,)` bool, it was cut by a time-out: the value of `final_obs` is bootstrapped. Where both
     are set, `terminated` decides."""
     final_obs: Tensor
-    """`(N, O)` float32, observation of the last state before the automatic reset; rows whose
-    episode goes on may hold anything finite, such as `obs`."""
+    """`(N, O)` float32, observation of the last state before the automatic reset; rows of
+    episodes that go on may hold anything finite, such as `obs`."""
     log: Mapping[str, float]
     """Means over this step for the log (reward terms, errors, help), cheap to make. Keys keep
     their names all through a run; one that carries a reward term helps to name a faulty term."""
@@ -125,7 +125,7 @@ class Style(Protocol):
         ...
 
     def reward(self, task: Tensor) -> Tensor:
-        """The total reward `(T, N)` of the rollout, whose task reward is `task (T, N)`."""
+        """The total reward `(T, N)` of a rollout with the task reward `task (T, N)`."""
         ...
 
     def update(self) -> dict[str, float]:
@@ -149,7 +149,7 @@ class Teacher(Protocol):
     """
 
     def act(self, obs: Tensor) -> Tensor:
-        """Actions `(N, A)` for the environment as it stands now, whose observation is `obs (N, O)`."""
+        """Actions `(N, A)` for the environment as it stands now, with the observation `obs (N, O)`."""
         ...
 
 

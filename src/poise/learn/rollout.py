@@ -16,12 +16,16 @@ from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
 class Rollout:
     """One batch of experience: T steps by N rows, reused every iteration.
 
-    `obs (T+1, N, O)` normalised, the last row follows the last step; `action`, `mean (T, N, D)` as they
-    were drawn, `log_std (T, N, D)` or None where the deviation is the same in all states;
-    `log_prob`, `reward`, `value`, `next_value`, `advantage`, `returns (T, N)`; `terminated`,
-    `truncated (T, N)` bool. `cut_at (K,)` are the flat indices t N + n of the steps that were
-    truncated and `cut_obs (K, O)` the normalised observations that they reached. `terms` are the
-    means of the environment's log.
+    Attributes:
+        obs: `(T + 1, N, O)` normalised; the last row follows the last step.
+        action: `(T, N, D)` as it was drawn.
+        mean: `(T, N, D)` of the policy.
+        log_std: `(T, N, D)`, or None where the deviation is the same in all states.
+        log_prob, reward, value, next_value, advantage, returns: `(T, N)`.
+        terminated, truncated: `(T, N)` bool.
+        cut_at: `(K,)` flat indices t N + n of the steps that were truncated.
+        cut_obs: `(K, O)` normalised observations that these steps reached.
+        terms: means of the environment's log.
     """
 
     def __init__(self, horizon: int, num_envs: int, num_obs: int, num_drawn: int, device: torch.device):

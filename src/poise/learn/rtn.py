@@ -152,5 +152,5 @@ class RTNObjective:
         at = self.net.config.past - 1
         place = place_of(batch.root[:, at], batch.rot[:, at], self.net.layout.facing)
         root, rot = into_place(batch.root, batch.rot, place)
-        # One sign for a whole window, whose quaternions are continuous.
+        # One sign for a whole window, since its quaternions are continuous.
         return batch._replace(root=root, rot=rot * self.net.signs(rot[:, at]).unsqueeze(1))

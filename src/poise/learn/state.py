@@ -19,7 +19,7 @@ def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> State:
 
 
 def under(prefix: str, tensors: Mapping[str, Tensor]) -> State:
-    """The tensors whose names start with "prefix/", without it."""
+    """The tensors with names that start with "prefix/", without it."""
     start = f"{prefix}/"
     return {k[len(start) :]: v for k, v in tensors.items() if k.startswith(start)}
 

@@ -35,7 +35,7 @@ class ThreadedUpdate:
 
 
 def parts_of(index: Tensor, weights: int, processes: int) -> tuple[Tensor, ...]:
-    """A minibatch's rows in the parts whose gradients are computed apart, whoever computes them.
+    """A minibatch's rows in the parts of which gradients are computed apart, by whichever thread.
 
     So a sum is of the same numbers with one thread and with two. On a GPU, in one of several processes
     and of little work it is one part.

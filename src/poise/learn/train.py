@@ -96,7 +96,7 @@ class Trainer:
         character: identity of the body that is trained, such as a hash; a checkpoint of another
             one is refused.
         metadata: JSON data that every checkpoint carries, such as the recipe and the clips.
-        warm_start: a policy whose weights and observation statistics to start from, or a `WarmStart`
+        warm_start: a policy that gives the first weights and observation statistics, or a `WarmStart`
             that may bring a critic and counts what it cost; the action noise stays the config's. A
             column or a composer (`poise.learn.progressive`) is itself what learns, with its own noise.
         update_threads: with more than one, policy and critic are trained side by side, while the

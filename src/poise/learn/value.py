@@ -16,8 +16,10 @@ from poise.nets import MLP, RunningNorm
 class Value:
     """V(o): the discounted rewards that a policy is still to earn, as its critic predicts them.
 
-    policy: whose normaliser observations go through. state: entries of `PPO.state()` under "critic/" and
-    "return_norm/", of a critic with rectifiers or whichever `activation` it was trained with.
+    Args:
+        policy: its normaliser is applied to observations first.
+        state: entries of `PPO.state()` under "critic/" and "return_norm/".
+        activation: of the critic's hidden layers, as it was trained.
 
     Raises:
         PoiseError: entries are missing, or of other sizes.

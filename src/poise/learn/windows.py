@@ -30,7 +30,7 @@ class History:
         self.seen = (self.seen + 1).clamp_max(self.frames.shape[1])
 
     def full(self) -> Tensor:
-        """The rows `(n,)` whose episode has W frames."""
+        """The rows `(n,)` with an episode of at least W frames."""
         return (self.seen == self.frames.shape[1]).nonzero().squeeze(-1)
 
     def windows(self, rows: Tensor) -> Tensor:

@@ -19,11 +19,16 @@ from poise.spatial import GRAVITY
 class HelpAudit:
     """Help over the valid frames; zero wrenches give exactly zero.
 
-    force_mean_n, force_p95_n: mean and 95th percentile over frames of `sum_m ||F_m||`, N.
-    torque_mean_nm, torque_p95_nm: the same of `sum_m ||tau_m||`, N m.
-    work_j_per_s: mean over frames of `sum_m |F_m . v_m + tau_m . omega_m|`, J/s.
-    share_of_body_weight: `force_mean_n / (m g)`.
-    force_n, torque_nm, power_w: the per-frame values `(..., T)`.
+    Attributes:
+        force_mean_n: N, mean over frames of `sum_m ||F_m||`.
+        force_p95_n: N, its 95th percentile.
+        torque_mean_nm: N m, mean over frames of `sum_m ||tau_m||`.
+        torque_p95_nm: N m, its 95th percentile.
+        work_j_per_s: J/s, mean over frames of `sum_m |F_m . v_m + tau_m . omega_m|`.
+        share_of_body_weight: `force_mean_n / (m g)`.
+        force_n: `(..., T)` N, per frame.
+        torque_nm: `(..., T)` N m, per frame.
+        power_w: `(..., T)` W, per frame.
     """
 
     force_mean_n: float
@@ -52,9 +57,10 @@ def help_audit(
     Args:
         force, torque: N and N m, as applied (after clipping and the curriculum's scale).
         point_vel: m/s, velocity of the body at the point where the force acts.
-        ang_vel: rad/s, the body's angular velocity. Force and velocity must share one frame,
-            torque and angular velocity too (the world's, or the root's).
-        mass: kg, the whole character. mask: `(..., T)` bool, valid frames.
+        ang_vel: rad/s, the body's angular velocity. Force and velocity must share one frame, torque
+            and angular velocity too (the world's, or the root's).
+        mass: kg, the whole character.
+        mask: `(..., T)` bool, valid frames.
     """
     parts = (force, torque, point_vel, ang_vel)
     if any(p.shape != force.shape for p in parts) or force.ndim < 2 or force.shape[-1] != 3:

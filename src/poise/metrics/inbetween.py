@@ -51,8 +51,14 @@ def _cdf(power: Tensor) -> Tensor:
 
 
 class Physics(NamedTuple):
-    """fp_mm: mean of min(0, h) of the feet, mm, never above 0. fq, jq: share of foot and of all joints
-    below the ground. sm_mm: mean joint step, mm per frame at 30 Hz (compare with the truth's)."""
+    """Plausibility of filled frames, as Skeleton2Humanoid reports it.
+
+    Attributes:
+        fp_mm: mean of min(0, h) of the feet, mm, never above 0.
+        fq: share of foot joints below the ground.
+        jq: share of all joints below the ground.
+        sm_mm: mean joint step, mm per frame at 30 Hz (compare with the truth's).
+    """
 
     fp_mm: float
     fq: float

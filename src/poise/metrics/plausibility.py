@@ -29,7 +29,13 @@ BALLISTIC_WINDOW = 0.1
 
 
 class Penetration(NamedTuple):
-    """mean_mm over all valid frames, max_mm, and the share of frames below the ground, each `(...)`."""
+    """Depth under the ground, each `(...)`.
+
+    Attributes:
+        mean_mm: mean over all valid frames, mm.
+        max_mm: deepest, mm.
+        share: of the frames below the ground.
+    """
 
     mean_mm: Tensor
     max_mm: Tensor
@@ -169,7 +175,7 @@ def ballistic(
 
     A parabola is fitted to every window of `window` seconds (an odd number of frames, at least 3).
     Where its acceleration is -g within `tolerance` g, all frames of the window are in flight. The
-    fit tells a jump from a character that hovers, whose acceleration is near zero.
+    fit tells a jump from a character that hovers with an acceleration near zero.
     """
     half = max(1, int(window * fps / 2 + 1e-6))
     frames = com_height.shape[-1]

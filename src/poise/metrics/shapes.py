@@ -23,11 +23,13 @@ KINDS = {"sphere": SPHERE, "capsule": CAPSULE, "ellipsoid": ELLIPSOID, "cylinder
 class Shapes:
     """The G collision geoms of a character, in MuJoCo's conventions.
 
-    kind: `(G,)` int, `mjtGeom`: sphere 2, capsule 3, ellipsoid 4, cylinder 5, box 6.
-    size: `(G, 3)` m: radius; radius and half length along local Z (capsule, cylinder); half axes.
-    pos, quat: `(G, 3)` m and `(G, 4)` wxyz, the geom in its body's frame.
-    body: `(G,)` int, index of the geom's body along dim -2 of the body poses.
-    mass: `(G,)` kg, or None for one density throughout.
+    Attributes:
+        kind: `(G,)` int, `mjtGeom`: sphere 2, capsule 3, ellipsoid 4, cylinder 5, box 6.
+        size: `(G, 3)` m: radius; radius and half length along local Z (capsule, cylinder); half axes.
+        pos: `(G, 3)` m, place of the geom in its body's frame.
+        quat: `(G, 4)` wxyz, its rotation there.
+        body: `(G,)` int, index of the geom's body along dim -2 of the body poses.
+        mass: `(G,)` kg, or None for one density throughout.
     """
 
     kind: Tensor
@@ -81,8 +83,11 @@ class Shapes:
 class _Placed(NamedTuple):
     """Geoms in the world, one dtype.
 
-    centre: `(..., G, 3)` m. body: `(..., G, 4)` wxyz, their bodies' rotations. own: `(G, 4)` wxyz, their
-    own in their bodies. size: `(G, 3)` m.
+    Attributes:
+        centre: `(..., G, 3)` m.
+        body: `(..., G, 4)` wxyz, their bodies' rotations.
+        own: `(G, 4)` wxyz, their own in their bodies.
+        size: `(G, 3)` m.
     """
 
     centre: Tensor

@@ -55,8 +55,8 @@ def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
 def mpjpe_pa(pos: Tensor, ref: Tensor) -> Tensor:
     """MPJPE after the best similarity (rotation, translation, scale) per frame, mm; returns `(..., T)`.
 
-    Procrustes: with centred X, Y the rotation R of `Y^T X` (`spatial.best_rotation`), whose values are
-    S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
+    Procrustes: with centred X, Y the rotation R of `Y^T X` (`spatial.best_rotation`), with the singular
+    values S D, and `s = tr(S D) / ||X||^2` minimise `||s R x - y||^2`. Reflections are excluded.
     """
     _check_pair(pos, ref)
     x, y = pos.double(), ref.double()
@@ -95,9 +95,13 @@ def acceleration_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor
 class SuccessRule:
     """A named failure test; an episode succeeds when no frame fails.
 
-    measure: "mean" or "max" over bodies of `||p - p_ref||` must stay within `limit_m`;
-        "below_min": the root must not sink more than `limit_m` below the lowest reference root;
-        "below_ref": nor more than `limit_m` below the reference root of the same frame.
+    Attributes:
+        name: under which scores are reported.
+        measure: "mean" or "max": that of `||p - p_ref||` over bodies must stay within `limit_m`.
+            "below_min": the root must not sink more than `limit_m` below the lowest reference root.
+            "below_ref": nor more than `limit_m` below the reference root of the same frame.
+        limit_m: m.
+        source: the paper or code that uses it.
     """
 
     name: str
@@ -131,7 +135,12 @@ def success_rule(rule: str | SuccessRule) -> SuccessRule:
 
 
 class Outcome(NamedTuple):
-    """success: `(...)` bool. first_fail: `(...)` long, the first failing frame, -1 where none fails."""
+    """Whether and where episodes fail.
+
+    Attributes:
+        success: `(...)` bool.
+        first_fail: `(...)` long, the first failing frame, -1 where none fails.
+    """
 
     success: Tensor
     first_fail: Tensor

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
+from poise.motion.limits import check_rate
 from poise.motion.skeleton import Skeleton
 from poise.spatial import forward_kinematics
 
@@ -50,8 +51,7 @@ class Clip:
                 f"the clip has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2",
                 self.name,
             )
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise PoiseError(f"the frame rate must be above 0, got {self.fps}", self.name)
+        check_rate(self.fps, self.name)
         if not np.isfinite(self.root_pos).all():
             frame = int(np.argwhere(~np.isfinite(self.root_pos))[0][0])
             raise PoiseError(f"the root position is not finite at frame {frame}", self.name)

@@ -7,6 +7,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
+from poise.motion.limits import check_rate
 from poise.spatial import slerp
 
 
@@ -16,8 +17,7 @@ def resample(clip: Clip, fps: float) -> Clip:
     The last sample falls on or before the clip's last frame (within a hundredth of a frame, since
     files round their frame times).
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise PoiseError(f"the frame rate must be above 0, got {fps}", clip.name)
+    check_rate(fps, clip.name)
     count = int(np.floor(clip.seconds * fps + 1e-2)) + 1
     if count < 2:
         raise PoiseError(
@@ -26,13 +26,18 @@ def resample(clip: Clip, fps: float) -> Clip:
     at = np.minimum(np.arange(count) / fps * clip.fps, clip.frames - 1)
     low = np.minimum(np.floor(at + 1e-9).astype(int), clip.frames - 2)
     t = np.clip(at - low, 0.0, 1.0)
-    root_pos = clip.root_pos[low] * (1 - t[:, None]) + clip.root_pos[low + 1] * t[:, None]
+    return blended(clip, low, t).replaced(fps=float(fps))
+
+
+def blended(clip: Clip, low: np.ndarray, share: np.ndarray) -> Clip:
+    """Frames `(N)`, each the share `(N)` of the way from frame `low (N)` to the next one."""
+    root_pos = clip.root_pos[low] * (1 - share[:, None]) + clip.root_pos[low + 1] * share[:, None]
     rot = slerp(
         torch.tensor(clip.rot[low]),
         torch.tensor(clip.rot[low + 1]),
-        torch.tensor(t)[:, None].expand(-1, len(clip.skeleton)),
-    ).numpy()
-    return clip.replaced(root_pos=root_pos, rot=rot, fps=float(fps))
+        torch.tensor(share)[:, None].expand(-1, len(clip.skeleton)),
+    )
+    return clip.replaced(root_pos=root_pos, rot=rot.numpy())
 
 
 def trim(clip: Clip, start: int, stop: int | None = None) -> Clip:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.limits import check_rate
 from poise.motion.skeleton import Source
 
 
@@ -41,8 +42,7 @@ class Keypoints:
             if name in seen:
                 raise PoiseError(f"keypoint '{name}' appears twice", self.name)
             seen.add(name)
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise PoiseError(f"the frame rate must be above 0, got {self.fps}", self.name)
+        check_rate(self.fps, self.name)
         if np.isinf(positions).any():
             t, k, _ = np.argwhere(np.isinf(positions))[0]
             raise PoiseError(f"keypoint '{self.names[k]}' is infinite at frame {t}", self.name)

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.skeleton import Channel, Skeleton, Source
+from poise.motion.io.own.record import fitted
+from poise.motion.skeleton import Skeleton, Source
 
 
 def pack_clips(clips: Sequence[Clip]) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
@@ -50,21 +51,15 @@ def unpack_clips(tensors: Mapping[str, Tensor], notes: Sequence[Mapping[str, Any
 
 
 def _clip(tensors: Mapping[str, Tensor], note: Mapping[str, Any], i: int) -> Clip:
-    source = dict(note["source"])
-    source["channels"] = tuple(Channel(**_tuples(c)) for c in source["channels"])
+    def told(key: str, kind: Any) -> Any:
+        return fitted(note[key], kind)
+
     skeleton = Skeleton(
-        tuple(note["names"]),
-        tuple(note["parents"]),
+        told("names", tuple[str, ...]),
+        told("parents", tuple[int, ...]),
         tensors[f"{i}/offsets"].numpy(),
-        tuple((int(j), (float(v[0]), float(v[1]), float(v[2]))) for j, v in note["ends"]),
-        Source(**_tuples(source)),
+        told("ends", tuple[tuple[int, tuple[float, float, float]], ...]),
+        told("source", Source),
     )
     root_pos, rot = tensors[f"{i}/root_pos"].numpy(), tensors[f"{i}/rot"].numpy()
-    return Clip(skeleton, root_pos, rot, note["fps"], note["name"], note["cyclic"])
-
-
-def _tuples(value: Any) -> Any:
-    """Lists to tuples, all the way down, since JSON knows only lists."""
-    if isinstance(value, dict):
-        return {k: _tuples(v) for k, v in value.items()}
-    return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value
+    return Clip(skeleton, root_pos, rot, told("fps", float), told("name", str), told("cyclic", bool))

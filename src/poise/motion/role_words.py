@@ -1,4 +1,4 @@
-"""The words by which joints of human skeletons are named, and who names them so."""
+"""The words by which joints of human skeletons are named, by convention."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def _both(pattern: tuple[str, str], parts: str) -> frozenset[str]:
 
 _ARM, _UPLEG = "Shoulder Arm ForeArm Hand", "UpLeg Leg Foot"
 _SMPL_SIDED = "Hip Knee Ankle Foot Collar Shoulder Elbow Wrist"
-#: Names that mark who made a skeleton, without prefix such as "mixamorig:".
+#: Names that mark the maker of a skeleton, without prefix such as "mixamorig:".
 CONVENTIONS: dict[str, frozenset[str]] = {
     "Mixamo or MotionBuilder": _both(_SIDED, f"{_ARM} {_UPLEG} ToeBase")
     | {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -147,6 +146,10 @@ def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> R
     )
 
 
+#: A score, and (kind of part, joint) pairs.
+_Reading = tuple[float, tuple[tuple[str, int], ...]]
+
+
 class _Finder:
     """Collects roles; limbs first, since what they hang on tells pelvis and chest."""
 
@@ -237,19 +240,20 @@ class _Finder:
     def _read(
         self, line: tuple[int, ...], side: str, kinds: tuple[str, ...]
     ) -> tuple[float, dict[str, int]]:
-        @cache
-        def best(at: int, kind: int) -> tuple[float, tuple[tuple[str, int], ...]]:
-            if at == len(line) or kind == len(kinds):
-                return 0.0, ()
-            # Nearer the root wins among equals: of wrist and hand the wrist is the joint.
-            options = [best(at, kind + 1), best(at + 1, kind)]
-            own = self._score(line[at], side, kinds[kind])
-            if own > 0:
-                more, rest = best(at + 1, kind + 1)
-                options.insert(0, (own + more, ((kinds[kind], line[at]), *rest)))
-            return max(options, key=lambda o: o[0])
-
-        score, reading = best(0, 0)
+        # The best reading of the rest of the line, by the kind from which on it is read; leaf first.
+        below: list[_Reading] = [(0.0, ())] * (len(kinds) + 1)
+        for joint in reversed(line):
+            here: list[_Reading] = [(0.0, ())] * (len(kinds) + 1)
+            for k in reversed(range(len(kinds))):
+                # Nearer the root wins among equals: of wrist and hand the wrist is the joint.
+                options = [here[k + 1], below[k]]
+                own = self._score(joint, side, kinds[k])
+                if own > 0:
+                    more, rest = below[k + 1]
+                    options.insert(0, (own + more, ((kinds[k], joint), *rest)))
+                here[k] = max(options, key=lambda option: option[0])
+            below = here
+        score, reading = below[0]
         return score, dict(reading)
 
     def _carrier(self, *kinds: str) -> int | None:

@@ -153,11 +153,6 @@ class Skeleton:
                 out[j] = out[parent] + self.offsets[j]
         return out
 
-    def end_positions(self) -> np.ndarray:
-        """`(E, 3)` m, rest positions of the bone tips in `ends`."""
-        rest = self.rest_positions()
-        return np.array([rest[j] + np.array(v) for j, v in self.ends]).reshape(-1, 3)
-
     def with_source(self, **changes: object) -> Skeleton:
         """The same skeleton with fields of its `Source` replaced."""
         return replace(self, source=replace(self.source, **changes))  # type: ignore[arg-type]

@@ -57,8 +57,14 @@ class BetweenConfig:
 
 
 class Gap(NamedTuple):
-    """All frames `(N, T, ...)` in the place of the last frame before the first gap: root, rotation
-    matrices, contact logits `(N, T, F)`; known frames are the given ones."""
+    """All frames `(N, T, ...)`, in the place of the last frame before the first gap; known frames are
+    the given ones.
+
+    Attributes:
+        root: `(N, T, 3)` m.
+        mats: `(N, T, J, 3, 3)` local rotation matrices.
+        contact: `(N, T, F)` logits.
+    """
 
     root: Tensor
     mats: Tensor
@@ -66,8 +72,14 @@ class Gap(NamedTuple):
 
 
 class Dropout(NamedTuple):
-    """Channels that a training step leaves out of each layer's branches, the same in all frames of a
-    window, so that what is left does not tremble: their share, and the source of the draws."""
+    """Channels that a training step leaves out of each layer's branches.
+
+    They are the same in all frames of a window, so that what is left does not tremble.
+
+    Attributes:
+        share: of the channels.
+        generator: source of the draws.
+    """
 
     share: float
     generator: torch.Generator
@@ -79,7 +91,13 @@ class Dropout(NamedTuple):
 
 
 class Neighbours(NamedTuple):
-    """For every frame `(T)`: the nearest known frames before and after it, and the way between, 0..1."""
+    """The nearest known frames of every frame.
+
+    Attributes:
+        before: `(T)`, the nearest known frame before it.
+        after: `(T)`, the nearest known frame after it.
+        share: `(T)`, its place between them, 0 to 1.
+    """
 
     before: Tensor
     after: Tensor

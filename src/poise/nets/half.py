@@ -1,4 +1,4 @@
-"""Perceptrons whose hidden layers are multiplied in bfloat16: an update at half the cost."""
+"""Perceptrons with hidden layers multiplied in bfloat16: an update at half the cost."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def _activation(name: str) -> nn.Module:
 
 
 def bare_linear(num_in: int, num_out: int, bias: bool = True) -> nn.Linear:
-    """A layer whose weights are yet to be filled; nothing is drawn from the global generator.
+    """A layer with weights that are yet to be filled; nothing is drawn from the global generator.
 
     `nn.utils.skip_init` does the same by way of meta tensors, for which torch imports SymPy: half a
     second for a program that only runs a policy.

@@ -49,9 +49,9 @@ def product_of_gaussians(weight: Tensor, mean: Tensor, log_std: Tensor) -> tuple
 class Composer(GaussianPolicy):
     """Chooses from state to state how much each of K primitives acts.
 
-    combine "product" (PHC's paper): PPO draws actions from the `product_of_gaussians`, whose sigma
-    follows from the weights. "means" (PHC's code): PPO draws the K weights, with noise of their own,
-    and the action is sum_k(w_k mu_k).
+    combine "product" (PHC's paper): PPO draws actions from the `product_of_gaussians`, with a sigma
+    that follows from the weights. "means" (PHC's code): PPO draws the K weights, with noise of their
+    own, and the action is sum_k(w_k mu_k).
 
     Args:
         primitives: the columns; they are frozen unless `joint`.
@@ -93,7 +93,7 @@ class Composer(GaussianPolicy):
         if joint and combine == "means":
             raise PoiseError(
                 "primitives cannot learn while their means are only weighed",
-                hint="Combine them as a product, whose actions are drawn",
+                hint="Combine them as a product, from which actions are drawn",
             )
         if log_std.shape != (count, primitives.num_out):
             want = (count, primitives.num_out)

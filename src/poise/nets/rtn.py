@@ -83,8 +83,13 @@ def noise_scale(tta: Tensor) -> Tensor:
 
 
 class Steps(NamedTuple):
-    """What the network said, in the place of the last frame seen: root `(N, L, 3)`, unit rot
-    `(N, L, J, 4)`, contact `(N, L, F)`."""
+    """What the network said, in the place of the last frame seen.
+
+    Attributes:
+        root: `(N, L, 3)` m.
+        rot: `(N, L, J, 4)` wxyz, unit.
+        contact: `(N, L, F)`.
+    """
 
     root: Tensor
     rot: Tensor
@@ -95,7 +100,8 @@ class RTN(nn.Module):
     """The generator; see the module's text.
 
     Args:
-        layout: the skeleton. generator: source of the first weights.
+        layout: the skeleton.
+        generator: source of the first weights.
     """
 
     velocity_std: Tensor
@@ -216,7 +222,8 @@ class Critic(nn.Module):
     """A sliding critic: a window of frames at a time, the mean over windows (LSGAN).
 
     Args:
-        channels: of one frame. window: 2 frames for the short, 10 for the long one.
+        channels: of one frame.
+        window: 2 frames for the short, 10 for the long one.
     """
 
     def __init__(self, channels: int, window: int, *, generator: torch.Generator):
@@ -229,7 +236,7 @@ class Critic(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """`(N, T, channels)` to one number per sequence `(N)`."""
-        # A convolution over time whose kernel is the window.
+        # A convolution over time with the window as its kernel.
         windows = frames.unfold(1, self.window, 1).flatten(2)
         return self.layers(windows).squeeze(-1).mean(1)
 

@@ -21,7 +21,13 @@ from poise.spatial import (
 
 @dataclass(frozen=True)
 class Layout:
-    """What a network must know of a skeleton: parents, foot joints, the root's local heading axis."""
+    """What a network must know of a skeleton.
+
+    Attributes:
+        parents: of the joints, -1 for the root.
+        feet: foot joints.
+        facing: the root's local heading axis.
+    """
 
     parents: tuple[int, ...]
     feet: tuple[int, ...]
@@ -36,9 +42,12 @@ class Layout:
 class Known(NamedTuple):
     """What a transition may be made from; metres, Z up, rotations wxyz local to the parent.
 
-    past_root `(N, P, 3)`, past_rot `(N, P, J, 4)`: at least one frame that was seen.
-    target_root `(N, 3)`, target_rot `(N, J, 4)`: the one keyframe after the gap.
-    offsets `(N, J, 3)`: bones.
+    Attributes:
+        past_root: `(N, P, 3)`, at least one frame that was seen.
+        past_rot: `(N, P, J, 4)`, the same frames.
+        target_root: `(N, 3)`, the one keyframe after the gap.
+        target_rot: `(N, J, 4)`, the same keyframe.
+        offsets: `(N, J, 3)`, bones.
     """
 
     past_root: Tensor
@@ -49,8 +58,14 @@ class Known(NamedTuple):
 
 
 class Filled(NamedTuple):
-    """A transition: root `(N, L, 3)` m, rot `(N, L, J, 4)` wxyz with signs that go on from the last
-    frame that was seen, contact `(N, L, F)` probability of each foot joint, pos `(N, L, J, 3)` m."""
+    """A transition.
+
+    Attributes:
+        root: `(N, L, 3)` m.
+        rot: `(N, L, J, 4)` wxyz, with signs that go on from the last frame that was seen.
+        contact: `(N, L, F)`, probability of each foot joint.
+        pos: `(N, L, J, 3)` m.
+    """
 
     root: Tensor
     rot: Tensor
@@ -76,7 +91,12 @@ class TransitionNet(Protocol):
 
 
 class Place(NamedTuple):
-    """Where a window stood: xy `(N, 1, 3)` of the last known root, heading `(N, 1, 4)`."""
+    """Where a window stood.
+
+    Attributes:
+        xy: `(N, 1, 3)` m, of the last known root.
+        heading: `(N, 1, 4)` wxyz.
+    """
 
     xy: Tensor
     heading: Tensor

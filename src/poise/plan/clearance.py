@@ -54,9 +54,12 @@ class TouchPoints:
 class ClearanceRule:
     """How far moving parts are lifted off the floor.
 
-    height_m: the lowest a moving point may be. slow, fast: m/s over the floor; a point slower than
-    `slow` stands and is left alone, one faster than `fast` gets the whole height, with a ramp between.
-    smooth: half width, in frames, of the window over which the lift is blended.
+    Attributes:
+        height_m: m, the lowest a moving point may be.
+        slow: m/s over the floor; a slower point stands and is left alone.
+        fast: m/s over the floor; a faster point gets the whole height, with a ramp between.
+        smooth: half width, in frames, of the window over which the lift is blended.
+        sweeps: repetitions of the solution.
     """
 
     height_m: float = 0.03

@@ -26,11 +26,18 @@ from poise.spatial import heading_quat, quat_conj, quat_mul, quat_rotate, quat_r
 class ExpertConfig:
     """How the expert pulls the root along.
 
-    frequency: rad/s and damping: ratio of the root's spring, stiffness m w^2 and damping 2 z m w for a
-    character of mass m, so that heavy and light ones follow alike; turn_frequency, turn_damping: the
-    same about the root's axes with the body's moment of inertia.
-    lead: which moment of a control step the joint targets are taken from, 0 its begin, 1 its end.
-    contacts: which points may carry weight in the inverse dynamics. clear: how swinging feet are lifted.
+    The root's spring has the stiffness m w^2 and the damping 2 z m w for a character of mass m, so that
+    heavy and light characters follow alike; about the root's axes the moment of inertia takes the
+    place of m.
+
+    Attributes:
+        frequency: rad/s, w of the root's place.
+        damping: z, ratio of critical damping of the root's place.
+        turn_frequency: rad/s, w about the root's axes.
+        turn_damping: z about the root's axes.
+        lead: place in a control step from which the joint targets are taken, 0 its begin, 1 its end.
+        contacts: which points may carry weight in the inverse dynamics.
+        clear: how swinging feet are lifted.
     """
 
     frequency: float = 5.0
@@ -46,10 +53,13 @@ class ExpertConfig:
 class Plan:
     """Inverse dynamics of every step of a reference; row r leads from frame r to the next.
 
-    torque `(F, n)` N m per hinge; force_h `(F, 3)` N, root residual in the reference root's heading
-    frame at the step's begin; torque_b `(F, 3)` N m, in the root's axes; lift `(F, n)` rad, added to the
-    frame's hinge angles so that swinging feet clear the floor; float32.
-    parts: what was solved, clip by clip.
+    Attributes:
+        torque: `(F, n)` N m per hinge.
+        force_h: `(F, 3)` N, root residual in the reference root's heading frame at the step's begin.
+        torque_b: `(F, 3)` N m, in the root's axes.
+        lift: `(F, n)` rad, added to the frame's hinge angles so that swinging feet clear the floor;
+            float32.
+        parts: what was solved, clip by clip.
     """
 
     torque: Tensor

@@ -22,11 +22,14 @@ from poise.spatial import GRAVITY
 class ContactRule:
     """Which points of the body may press against the floor, and how willingly.
 
-    height_m: a point below it may be in contact. speed: m/s, a faster point is not (it slides or is
-    about to leave). friction: sliding coefficient, None for the model's own. effort: price of a contact
-    force against a root residual of the same size, both in body weights; it chooses among equal
-    answers the one that spreads the load on the lowest and slowest points.
-    lever_m: a residual of 1 N m counts as much as one of `1 / lever_m` N.
+    Attributes:
+        height_m: a point below it may be in contact.
+        speed: m/s, a faster point is not (it slides or is about to leave).
+        friction: sliding coefficient, None for the model's own.
+        effort: price of a contact force against a root residual of the same size, both in body weights;
+            it chooses among equal answers the one that spreads the load on the lowest and slowest
+            points.
+        lever_m: a residual of 1 N m counts as much as one of `1 / lever_m` N.
     """
 
     height_m: float = 0.06
@@ -38,13 +41,17 @@ class ContactRule:
 
 @dataclass(frozen=True, eq=False)
 class InverseDynamics:
-    """What T moments of a motion need; float64.
+    """What T instants of a motion need; float64.
 
-    torque `(T, n)` N m of each hinge's actuator, on top of the joints' own damping.
-    root_force `(T, 3)` N, world axes, at the root's origin, and root_torque `(T, 3)` N m, in the root's
-    axes: the part that neither torques nor floor can give. contact_force `(T, P, 3)` N on the body,
-    world axes, at contact_point `(T, P, 3)` m, world; zero where a point is free.
-    contact_body `(P,)`: rows of the humanoid's table.
+    Root force and torque are the part that neither joint torques nor the floor can give.
+
+    Attributes:
+        torque: `(T, n)` N m of each hinge's actuator, on top of the joints' own damping.
+        root_force: `(T, 3)` N, world axes, at the root's origin.
+        root_torque: `(T, 3)` N m, in the root's axes.
+        contact_force: `(T, P, 3)` N on the body, world axes; zero where a point is free.
+        contact_point: `(T, P, 3)` m, world, where the forces act.
+        contact_body: `(P,)`, rows of the humanoid's table.
     """
 
     torque: np.ndarray
@@ -85,7 +92,7 @@ def inverse_dynamics(
     qacc: np.ndarray,
     rule: ContactRule | None = None,
 ) -> InverseDynamics:
-    """Torques, floor forces and the remaining root wrench of T moments, each on its own.
+    """Torques, floor forces and the remaining root wrench of T instants, each on its own.
 
         b = M q'' + c - passive;   min |b_root - (J^T f)_root|^2 + effort^2 |f|^2
         over f in the pyramids |f_x| + |f_y| <= mu f_z;   tau = b_hinges - (J^T f)_hinges

@@ -22,9 +22,14 @@ from poise.sim.tangent import difference, displaced
 class LinearModel:
     """The linear model of F control steps.
 
-    a `(F, 2 nv, 2 nv)` and b `(F, 2 nv, nu + 6)`, float32: how the tangent state after the step
-    (`difference` of positions, then velocities) depends on that before it, and on the action, which is
-    targets and then a wrench on the root in units of its own. qpos, qvel: where the steps lead, float64.
+    The tangent state is `difference` of positions, then velocities; an action is targets, then a wrench
+    on the root in units of its own.
+
+    Attributes:
+        a: `(F, 2 nv, 2 nv)` float32, how the tangent state after the step depends on that before it.
+        b: `(F, 2 nv, nu + 6)` float32, how it depends on the action.
+        qpos: `(F, nq)` float64, where the steps lead.
+        qvel: `(F, nv)` float64, the velocities there.
     """
 
     a: np.ndarray
@@ -33,7 +38,7 @@ class LinearModel:
     qvel: Tensor
 
 
-def slopes(
+def linearise(
     backend: CpuBackend,
     qpos: Tensor,
     qvel: Tensor,
@@ -46,9 +51,11 @@ def slopes(
 
     Args:
         backend: lends its worlds, of which it needs one for every difference, 2 (2 nv + nu + 6) + 1.
-        qpos `(F, nq)`, qvel `(F, nv)`: the states.
-        action `(F, nu + 6)`: targets (rad), then the root's wrench (force in world axes, torque in the
-            root's own) in units of wrench_unit `(6)` N and N m.
+        qpos: `(F, nq)`, the states.
+        qvel: `(F, nv)`, their velocities.
+        action: `(F, nu + 6)`, targets (rad), then the root's wrench (force in world axes, torque in the
+            root's own) in units of wrench_unit.
+        wrench_unit: `(6)` N and N m.
         substeps: physics steps of a control step.
         size: of the differences, rad; half of it in m, ten times of it in rad/s and m/s, five times in
             targets and units of the wrench.

@@ -13,9 +13,13 @@ from poise.errors import PoiseError
 class Regulator:
     """What to do at each of F rows when the state is off by d: change the action by k + K d.
 
-    feedback K `(F, m, n)` and forward k `(F, m)`, zero in last rows. value `(F, n, n)` P and slope
-    `(F, n)` p: what is still to pay from the row on is d^T P d / 2 + p^T d more than with d = 0 and
-    no change. All float32 but the slope.
+    From a row on d^T P d / 2 + p^T d more is to pay than with d = 0 and no change.
+
+    Attributes:
+        feedback: `(F, m, n)` float32, K; zero in last rows.
+        forward: `(F, m)` float32, k; zero in last rows.
+        value: `(F, n, n)` float32, P.
+        slope: `(F, n)` float64, p.
     """
 
     feedback: np.ndarray
@@ -44,11 +48,15 @@ def regulate(
     (Giftthaler et al. 2018), each over 2; damping keeps a step short where the linear model is poor.
 
     Args:
-        a `(F, n, n)`, b `(F, n, m)`: what the next state depends on; last rows have none.
-        gap `(F, n)`: by how much a step misses the next row's state.
-        error `(F, n)`: of the rows' states. effort `(F, m)`: of their actions.
-        state_price `(n)`, action_price `(F, m)`: diagonals of Q and R.
-        lengths `(C,)`: rows of each motion, which follow one another. damping `(F,)`.
+        a: `(F, n, n)`, how the next state depends on the state; last rows have none.
+        b: `(F, n, m)`, how it depends on the action.
+        gap: `(F, n)`, by how much a step misses the next row's state.
+        error: `(F, n)`, of the rows' states.
+        effort: `(F, m)`, of their actions.
+        state_price: `(n)`, diagonal of Q.
+        action_price: `(F, m)`, diagonal of R.
+        lengths: `(C,)` rows of each motion; the motions follow one another.
+        damping: `(F,)`, none by default.
 
     Raises:
         PoiseError: the lengths do not add up to the rows.
@@ -63,7 +71,7 @@ def regulate(
         np.zeros((rows, m, n), np.float32), np.zeros((rows, m), np.float32),
         np.zeros((rows, n, n), np.float32), np.zeros((rows, n)),
     )  # fmt: skip
-    # Long ones first, so that those that have a j-th row from the end are the first few.
+    # Long motions first, so that the motions with a j-th row from the end are the first few.
     order = np.argsort(-lengths, kind="stable")
     size, start = lengths[order], (np.cumsum(lengths) - lengths)[order]
     last = start + size - 1

@@ -1,9 +1,9 @@
-"""A motion that a policy loses is looked for: many characters try, and those that come near it go on.
+"""Sampling-based control: many characters try a motion that a policy loses, and the best states go on.
 
-Sampling-based control (SAMCON, Liu et al. 2010) with a trained policy in place of the open-loop
-trajectory: each character acts as the policy plus an offset, held for some steps; then the best of them
-are kept and stand where all begin the next try. What is found is one simulation from the first frame to
-the last, without help, and the actions that repeat it.
+SAMCON (Liu et al. 2010) with a trained policy in place of the open-loop trajectory: each character
+acts as the policy plus an offset, held for some steps; then the best states are kept, and all
+characters begin the next try from copies of them. The result is one simulation from the first frame
+to the last, without help, and the actions that repeat it.
 """
 
 from __future__ import annotations
@@ -24,23 +24,29 @@ from poise.metrics import mpjpe_global
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """How a motion is looked for.
+    """How sampling-based control tries a motion.
 
-    characters: that try at once. brood: tries from each state that is kept, of which the first is the
-    policy's own. hold: control steps that an offset lasts. least, most: rad, between which the
-    deviations of a character's offsets are drawn, evenly in their logarithm. memory: what earlier
-    errors weigh, from one choice to the next. distance: what 1 m of mean distance costs beside the
-    imitation reward, where there is no estimate of what is to come. retries: how often it is
-    looked for anew where nobody comes through, each time from farther back by `hold * back` steps.
-    rounds: how often the whole motion is looked for, each time about what was found before, with half
-    the deviations.
+    Attributes:
+        characters: number of characters that try at once.
+        samples_per_state: number of tries from each kept state; the first of them is the policy's own.
+        hold_steps: control steps for which an offset is held.
+        noise_range: (low, high) rad, between which the deviation of a character's offsets is drawn,
+            evenly in its logarithm.
+        memory: factor from one choice to the next with which earlier costs count, 0 to 1.
+        distance: cost of 1 m of mean distance beside the imitation reward, where no value function
+            estimates what is to come.
+        rounds: how often the whole motion is sampled, each time about the last result with half the
+            deviation.
+        retries: how often a place is tried again where no character comes through, each time from
+            `hold_steps * back` steps farther back.
+        back: choices of offsets by which each retry goes farther back.
+        seed: seed of all draws.
     """
 
     characters: int = 512
     samples_per_state: int = 4
-    hold: int = 4
-    least: float = 0.03
-    most: float = 0.3
+    hold_steps: int = 4
+    noise_range: tuple[float, float] = (0.03, 0.3)
     memory: float = 0.7
     distance: float = 2.0
     rounds: int = 1
@@ -52,19 +58,24 @@ class SamplingConfig:
         if self.samples_per_state < 2 or self.characters < 2 * self.samples_per_state:
             what = f"got {self.characters} characters, {self.samples_per_state} from each state"
             raise PoiseError(what, "SamplingConfig", "Take 8 or more, 2 or more from each")
-        counts, spread = (self.hold, self.rounds, self.back), 0 < self.least <= self.most
+        counts, spread = (
+            (self.hold_steps, self.rounds, self.back),
+            0 < self.noise_range[0] <= self.noise_range[1],
+        )
         if min(counts) < 1 or self.retries < 0 or not spread:
-            what = "hold, rounds, back, least and most must be positive, and least the smaller one"
+            what = "hold_steps, rounds, back and noise_range must be positive, and noise_range must rise"
             raise PoiseError(what, "SamplingConfig")
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingResult:
-    """What a search came to.
+    """What sampling-based control came to.
 
-    actions: `(T, A)`, which repeat it from the first frame. reached: how many of those there were before
-    the motion was lost; all where it was not. error_mm: mean distance of the bodies up to there. tries:
-    control steps that all characters made.
+    Attributes:
+        actions: `(T, A)`, which repeat the motion from the first frame.
+        reached: number of actions before the motion was lost; all where it was not.
+        error_mm: mean distance of the bodies up to there, mm.
+        tries: control steps that all characters made.
     """
 
     actions: Tensor
@@ -80,7 +91,14 @@ class SamplingResult:
 
 @dataclass(eq=False)
 class _Kept:
-    """The states that were kept before a choice of offsets: of the worlds, with what led there."""
+    """The K states that were kept before a choice of offsets.
+
+    Attributes:
+        sim: `(K, S)` snapshots of the worlds.
+        obs: `(K, O)` their observations.
+        cost: `(K,)` discounted cost so far.
+        error: `(K,)` m, sum over the steps of the mean distance of the bodies.
+    """
 
     sim: Tensor
     obs: Tensor
@@ -90,8 +108,13 @@ class _Kept:
 
 @dataclass(eq=False)
 class _Choice:
-    """What led from some kept states to the next: actions, what they are more than the policy's,
-    `(k, K, A)`, and parents `(K,)`."""
+    """What led from some kept states to the next.
+
+    Attributes:
+        actions: `(k, K, A)`.
+        offsets: `(k, K, A)`, what the actions are more than the policy's.
+        parent: `(K,)` the kept state that each began from.
+    """
 
     actions: Tensor
     offsets: Tensor
@@ -99,13 +122,16 @@ class _Choice:
 
 
 class SamplingControl:
-    """Looks for a motion along one clip of an environment's reference.
+    """Tries one clip of an environment's reference from its first frame to its last.
 
     Args:
         env: without automatic restarts and guard, with the rewards of the task; its `num_envs` worlds
             are the characters.
-        policy: acts on its observations. value: of observations `(N, O)` what the policy is still to
-            earn, `(N,)`; None goes by rewards and distances so far. clip: its index.
+        policy: acts on its observations.
+        config: see `SamplingConfig`.
+        value: the return `(N,)` that the policy is still to earn, of observations `(N, O)`; None goes
+            by rewards and distances so far.
+        clip: index of the clip.
     """
 
     def __init__(
@@ -125,7 +151,7 @@ class SamplingControl:
         self.offsets = torch.zeros(self.last, env.num_actions)
 
     def run(self, show: Callable[[int, int], None] | None = None) -> SamplingResult:
-        """Searches from the first frame to the last. show: is told of steps done and all steps."""
+        """Samples from the first frame to the last. show: is told of steps done and all steps."""
         rounds, best = self.config.rounds, None
         for k in range(rounds):
             told = show and (lambda done, steps, k=k: show(k * steps + done, rounds * steps))
@@ -155,8 +181,8 @@ class SamplingControl:
                 path.append(choice)
                 now = after
                 continue
-            # Nobody came through: from farther back each time, unless it is another place.
-            if done > wall + c.hold * c.back:
+            # No character came through: from farther back each time, unless it is another place.
+            if done > wall + c.hold_steps * c.back:
                 failures = 0
             wall, failures = max(wall, done), failures + 1
             came = max(came, (done, list(path), now), key=lambda x: x[0])
@@ -186,7 +212,7 @@ class SamplingControl:
         drawn, lost = self._drawn(n), torch.zeros(n, dtype=torch.bool)
         made: list[Tensor] = []
         given: list[Tensor] = []
-        for step in range(done, min(done + c.hold, self.last)):
+        for step in range(done, min(done + c.hold_steps, self.last)):
             given.append(self.offsets[step] + drawn)
             made.append(self.policy.act(obs) + given[-1])
             obs = env.step(made[-1]).final_obs
@@ -214,7 +240,8 @@ class SamplingControl:
         """`(N, A)` rad; none for the first try from each state."""
         c = self.config
         spread = torch.rand(count, 1, generator=self.rng)
-        size = c.least * (c.most / c.least) ** spread
+        low, high = c.noise_range
+        size = low * (high / low) ** spread
         size[: self.states] = 0.0
         out = self.scale * size * torch.randn(count, self.env.num_actions, generator=self.rng)
         out[:, self.env.hinges :] = 0.0

@@ -1,4 +1,5 @@
-"""Rollouts of motions cut into stretches, each with every step of a search; the best is kept."""
+"""Rollouts of motions cut into shooting segments, each with every step size of a line search; the
+best is kept."""
 
 from __future__ import annotations
 
@@ -22,11 +23,19 @@ AWFUL, LOST = 1e4, 1e9
 
 
 @dataclass(eq=False)
-class Stretch:
-    """Rows of some motions, one after another: their path, which is changed, and what it is judged by.
+class Segments:
+    """Rows of some motions, one after another: their trajectory, which is changed, and what judges it.
 
-    qpos, qvel, action: the path. rest: actions of no effort. ahead: hinge angles of the reference's next
-    rows. ref_qpos, ref_qvel: the reference. share: of the help at each row. last: it ends a motion.
+    Attributes:
+        qpos: `(F, nq)`, positions of the trajectory.
+        qvel: `(F, nv)`, its velocities.
+        action: `(F, nu + 6)`, its actions, see `linear_model.linearise`.
+        rest: `(F, nu + 6)`, actions of no effort.
+        ahead: `(F, nu)` rad, hinge angles of the reference's next rows.
+        ref_qpos: `(F, nq)`, positions of the reference.
+        ref_qvel: `(F, nv)`, its velocities.
+        share: `(F,)`, share of the help at each row.
+        last: `(F,)` bool, whether the row ends a motion.
     """
 
     qpos: Tensor
@@ -40,10 +49,11 @@ class Stretch:
     last: np.ndarray
 
 
-def stretches(lengths: np.ndarray, size: int, shift: int) -> np.ndarray:
-    """`(S, 2)` first row and end of stretches of about `size` steps; first ones have `shift` of them.
+def segments(lengths: np.ndarray, size: int, shift: int) -> np.ndarray:
+    """`(S, 2)` first row and end of segments of about `size` steps; the first of a motion has `shift`
+    of them.
 
-    The end of a stretch is the row where the next begins, or the last of its motion.
+    The end of a segment is the row where the next begins, or the last of its motion.
     """
     out, at = [], 0
     for length in lengths.tolist():
@@ -58,7 +68,7 @@ def stretches(lengths: np.ndarray, size: int, shift: int) -> np.ndarray:
 @torch.no_grad()
 def best_steps(
     model: mujoco.MjModel,
-    path: Stretch,
+    path: Segments,
     gains: Regulator,
     cut: np.ndarray,
     steps: Sequence[float],
@@ -66,10 +76,10 @@ def best_steps(
     prices: tuple[np.ndarray, float],
     drive: tuple[Tensor, int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rolls all stretches `cut (S, 2)` out with all steps at once, and keeps the best of each in `path`.
+    """Rolls all segments `cut (S, 2)` out with all steps at once, and keeps the best of each in `path`.
 
     A rollout acts by u = u_path + step k + K d and pays what `regulate` minimises, with the value
-    function for where it ends. A stretch ends beside the next one's beginning: the gap is for the next
+    function for where it ends. A segment ends beside the next one's beginning: the gap is for the next
     iteration to close.
 
     Args:
@@ -132,7 +142,7 @@ def best_steps(
     pick = best * count + torch.arange(count)
     for s, w in enumerate(pick.tolist()):
         a, b = cut[s]
-        # The last row of a motion belongs to its last stretch.
+        # The last row of a motion belongs to its last segment.
         end = b + int(path.last[b])
         path.qpos[a:end], path.qvel[a:end] = qs[: end - a, w], vs[: end - a, w]
         path.action[a:b] = us[: b - a, w]

@@ -1,13 +1,13 @@
-"""Paths: for every clip a motion near it that physics allows without help, and feedback to stay on it.
+"""Trajectory optimisation: a motion near each clip that physics allows without help, with feedback.
 
 An expert that needs no residual force. It is found by iLQR along all clips at once (Tassa et al. 2012),
 with three things that the motion of a human on stiff contacts asks for:
 
 - the linear model is taken over differences of about a tenth of a radian (`plan.linear_model`);
-- at first a wrench on the root may help, whose price rises wherever the character is near its reference:
-  the curriculum of residual forces (Skeleton2Humanoid Eq. 9), for each stretch of a motion by itself;
-- the step is chosen for each stretch of some seconds by itself, among rollouts that are made side by
-  side (multiple shooting), since one hard moment must not hold up a minute of motion.
+- at first a wrench on the root may help; its price rises wherever the character is near its reference:
+  the curriculum of residual forces (Skeleton2Humanoid Eq. 9), for each shooting segment by itself;
+- the step is chosen for each segment of some seconds by itself, among rollouts that are made side by
+  side (multiple shooting), since one hard motion bin must not hold up a minute of motion.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from torch import Tensor
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.plan.expert import make_plan
-from poise.plan.linear_model import slopes
+from poise.plan.linear_model import linearise
 from poise.plan.lqr import Regulator, regulate
-from poise.plan.shooting import Stretch, best_steps, stretches
+from poise.plan.shooting import Segments, best_steps, segments
 from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
 from poise.sim import CpuBackend, SimConfig, difference
 
-#: Worlds that work out slopes, and rows whose linear model is kept at once (35 kB each).
+#: Worlds that compute differences, and rows of which a linear model is kept at once (35 kB each).
 WORLDS, ROWS = 4096, 4000
 #: Damping never leaves these.
 DAMPING = (1e-3, 30.0)
 
 
 class TrajectoryOptimizer:
-    """The search for paths of all clips, an iteration at a time.
+    """Optimises the trajectories of all clips, an iteration at a time.
 
     Raises:
         PoiseError: clips of several bodies.
@@ -45,7 +45,7 @@ class TrajectoryOptimizer:
         self, reference: Reference, sim: SimConfig, config: TrajOptConfig | None = None, threads: int = 0
     ):
         if len(reference.bodies) > 1:
-            raise PoiseError("paths are searched for one body", hint="Train without body shapes")
+            raise PoiseError("trajectories are optimised for one body", hint="Train without body shapes")
         self.reference, self.config, self.sim = reference, config or TrajOptConfig(), sim
         self.threads, model = threads, reference.humanoid.model
         self.model, self.joints = model, model.nu
@@ -95,8 +95,8 @@ class TrajectoryOptimizer:
         free = float((self.share <= self.config.least).mean())
         return TrajOptStats(self.iteration, float(off), float(force), free, self.seconds)
 
-    def paths(self) -> Trajectories:
-        """The paths as they are now, with feedback that uses no wrench."""
+    def trajectories(self) -> Trajectories:
+        """The trajectories as they are now, with feedback that uses no wrench."""
         frames, n = self.reference.frames, 2 * self.model.nv
         feedback = torch.zeros(frames, self.joints, n)
         worlds = self._worlds()
@@ -164,7 +164,7 @@ class TrajectoryOptimizer:
         moving = torch.from_numpy(np.flatnonzero(~self.last[own]))
         r = rows[moving]
         how = (self.unit, self.sim.substeps, size)
-        linear = slopes(worlds, self.qpos[r], self.qvel[r], self.action[r], *how)
+        linear = linearise(worlds, self.qpos[r], self.qvel[r], self.action[r], *how)
         n, m = 2 * self.model.nv, self.action.shape[1] if helped else self.joints
         a, b = np.zeros((len(own), n, n), np.float32), np.zeros((len(own), n, m), np.float32)
         a[moving], b[moving] = linear.a, linear.b[:, :, :m]
@@ -183,14 +183,14 @@ class TrajectoryOptimizer:
         c, rows, lengths = self.config, self._rows(clips), self.lengths[clips]
         gains = self._regulate(rows, lengths, worlds, c.size(self.iteration), helped=True)
         # Borders are elsewhere every other time, so that what jumps there can close.
-        size = round(c.stretch_s * self.sim.control_hz)
-        cut = stretches(lengths, size, size // 2 if self.iteration % 2 else 0)
+        size = round(c.segment_s * self.sim.control_hz)
+        cut = segments(lengths, size, size // 2 if self.iteration % 2 else 0)
         own = rows.numpy()
-        here = Stretch(
+        here = Segments(
             self.qpos[rows], self.qvel[rows], self.action[rows], self.rest[rows], self.ahead[rows],
             self.reference.qpos[rows], self.reference.qvel[rows], self.share[own], self.last[own],
         )  # fmt: skip
-        # From the reference itself a first step may lead far away and still be the way.
+        # From the reference itself a first step may lead far away and still be right.
         lost = c.lost if self.iteration else 9.0
         prices = self.price, 1.0 / c.effort**2
         drive = self.unit, self.sim.substeps, self.threads

@@ -1,4 +1,4 @@
-"""What a search for paths is told, what it finds, and what its iterations come to."""
+"""Settings, results and statistics of trajectory optimisation."""
 
 from __future__ import annotations
 
@@ -12,25 +12,38 @@ from poise.plan.expert import ExpertConfig
 
 @dataclass(frozen=True)
 class TrajOptConfig:
-    """How paths are searched.
+    """How trajectories are optimised.
 
-    iterations: of the search; 0 searches none. sizes: rad, of the differences in the first and in the
-    last iteration, see `plan.linear_model`. stretch_s: seconds of which each chooses its own step.
-    place_m, turn, joint: errors that cost 1, of the root's place in m and attitude and of a joint in
-    rad; speed, spin, joint_speed: of their velocities. effort: rad of a joint's target, likewise.
-    help_n, help_nm: the wrench that costs 1 at first. less: what is left of that after an iteration
-    on stretches whose mean error cost is below `good`; more comes back above `bad`, up to the whole.
-    least: the share that help ends at, which is next to nothing; paths themselves are without.
-    astray: cost from which on a stretch begins again on its reference, with the help of three
-    iterations ago.
-    steps: of which the best is taken. lost: error of a whole body, in units of what costs 1, beyond
-    which a step is no choice. blur: the feedback of a frame is the mean over so many frames before
-    and after it: from frame to frame it jumps, which a network learns last.
+    Attributes:
+        iterations: number of iterations; 0 optimises nothing.
+        sizes: rad, of the differences in the first and in the last iteration, see `plan.linear_model`.
+        segment_s: seconds of a shooting segment; each segment chooses its own step.
+        place_m: m, error of the root's place that costs 1.
+        turn: rad, error of the root's attitude that costs 1.
+        joint: rad, error of a joint that costs 1.
+        speed: m/s, error of the root's velocity that costs 1.
+        spin: rad/s, error of the root's angular velocity that costs 1.
+        joint_speed: rad/s, error of a joint's velocity that costs 1.
+        effort: rad, deviation of a joint's target that costs 1.
+        help_n: N, force on the root that costs 1 at first.
+        help_nm: N m, torque on the root that costs 1 at first.
+        less: factor on the help after an iteration in segments with a mean error cost below `good`.
+        least: share at which the help ends, next to nothing; the trajectories themselves are without
+            help.
+        good: mean error cost of a segment below which its help becomes less.
+        bad: mean error cost of a segment above which its help comes back, up to the whole.
+        astray: mean error cost from which on a segment begins again on its reference, with the help
+            of three iterations ago.
+        steps: step sizes of the line search, of which the best is taken.
+        lost: error of a whole body, in units of what costs 1, beyond which a step is no choice.
+        blur: the feedback of a frame is the mean over so many frames before and after it; from frame to
+            frame it jumps, which a network learns last.
+        plan: the scripted expert with which it begins.
     """
 
     iterations: int = 11
     sizes: tuple[float, float] = (0.1, 0.065)
-    stretch_s: float = 2.0
+    segment_s: float = 2.0
     place_m: float = 0.3
     turn: float = 0.4
     joint: float = 0.5
@@ -51,25 +64,31 @@ class TrajOptConfig:
     plan: ExpertConfig = field(default_factory=ExpertConfig)
 
     def __post_init__(self) -> None:
-        if self.iterations < 0 or not 0 < self.less < 1 or min(*self.sizes, self.stretch_s) <= 0:
-            what = "iterations must not be negative, less lie in (0, 1), sizes and stretch_s be above 0"
+        if self.iterations < 0 or not 0 < self.less < 1 or min(*self.sizes, self.segment_s) <= 0:
+            what = "iterations must not be negative, less lie in (0, 1), sizes and segment_s be above 0"
             raise PoiseError(what, "TrajOptConfig")
         if 0.0 not in self.steps:
-            raise PoiseError("one of the steps must be 0, with which a path stays", "TrajOptConfig")
+            raise PoiseError(
+                "one of the steps must be 0, with which a trajectory stays", "TrajOptConfig"
+            )
 
     def size(self, iteration: int) -> float:
-        """Of the differences, falling geometrically."""
+        """Size of the differences at an iteration, rad; it falls geometrically."""
         first, last = self.sizes
         return first * (last / first) ** min(1.0, iteration / max(1, self.iterations - 1))
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """One path per clip; row r stands where row r of the reference does.
+    """One optimised trajectory per clip; row r stands where row r of the reference does.
 
-    qpos `(F, nq)`, qvel `(F, nv)`, float64. target `(F, n)` rad and feedback `(F, n, 2 nv)`: servo
-    targets, and how they change with the deviation (`sim.difference`, then velocities); float32.
-    price `(2 nv)`: what the squares of deviations cost in the search.
+    Attributes:
+        qpos: `(F, nq)` float64.
+        qvel: `(F, nv)` float64.
+        target: `(F, n)` rad float32, servo targets.
+        feedback: `(F, n, 2 nv)` float32, how the targets change with the deviation (`sim.difference`,
+            then velocities).
+        price: `(2 nv)`, what the squares of deviations cost in the optimisation.
     """
 
     qpos: Tensor
@@ -83,8 +102,12 @@ class Trajectories:
 class TrajOptStats:
     """What an iteration came to, over all frames.
 
-    error_m: mean distance of the root from the reference. help_n: mean force that still helps.
-    unhelped: share of the frames where help has ended. seconds: of all iterations.
+    Attributes:
+        iteration: its number, from 1.
+        error_m: mean distance of the root from the reference, m.
+        help_n: mean force that still helps, N.
+        unhelped: share of the frames where help has ended.
+        seconds: of all iterations so far.
     """
 
     iteration: int

@@ -21,13 +21,18 @@ SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL
 class SimConfig:
     """How finely and by which rules the physics runs.
 
-    rate_hz: physics steps per second. control_hz: control steps per second; a control step
-        must be a whole number of physics steps.
-    integrator: "discrete" (implicit in actuator stiffness, damping and contacts: MuJoCo's
-        form of stable PD, Tan et al. 2011), "implicitfast" or "euler". With the first two, put
-        the PD damping into the joints and not into the actuators: a saturated actuator loses
-        its implicit derivative and chatters.
-    solver, cone, iterations, ls_iterations, tolerance: MuJoCo's constraint solver options.
+    Attributes:
+        rate_hz: physics steps per second.
+        control_hz: control steps per second; a control step must be a whole number of physics steps.
+        integrator: "discrete" (implicit in actuator stiffness, damping and contacts: MuJoCo's form of
+            stable PD, Tan et al. 2011), "implicitfast" or "euler". With the first two, put the PD
+            damping into the joints
+            and not into the actuators: a saturated actuator loses its implicit derivative and chatters.
+        solver: MuJoCo's constraint solver.
+        cone: friction cones, "pyramidal" or "elliptic".
+        iterations: the solver's most iterations.
+        ls_iterations: its most line search iterations.
+        tolerance: at which it stops.
     """
 
     rate_hz: float = 60.0

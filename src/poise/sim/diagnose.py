@@ -17,9 +17,12 @@ _ROTARY = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 class Cause:
     """What went bad: a MuJoCo quantity, where, and its value.
 
-    quantity: "qvel", "qpos", "qacc", "ctrl", "qfrc_applied" or "xfrc_applied". part: joint, body
-    or actuator by name. value: the bad number (NaN allowed), in `unit`. substep: the physics
-    step after which it was seen, from 1; 0 means before the first, so it was put in from outside.
+    Attributes:
+        quantity: "qvel", "qpos", "qacc", "ctrl", "qfrc_applied" or "xfrc_applied".
+        part: joint, body or actuator by name.
+        value: the bad number (NaN allowed), in `unit`.
+        substep: the physics step after which it was seen, from 1; 0 means before the first, so it was
+            put in from outside.
     """
 
     quantity: str

@@ -19,13 +19,14 @@ class Drive:
     they combine freely. `clear()` comes at the start of a control step; the values are then
     held over its physics steps. On the CPU the tensors are views of the simulator's own state.
 
-    ctrl: `(N, nu)`, actuator inputs (rad for a position actuator on a hinge, N or Nm for a motor).
-    qfrc_applied: `(N, nv)`, generalized force in joint coordinates (Nm for a hinge). A free
-        joint's six numbers are the force (N, world axes, acting at the body's origin `xpos`) and
-        then the torque (Nm, in the BODY's axes), since MuJoCo's free-joint angular velocity is
-        in the body's axes.
-    xfrc_applied: `(N, nbody, 6)`, force (N, world axes, acting at the body's inertial centre
-        `xipos`), then torque (Nm, world axes).
+    Attributes:
+        ctrl: `(N, nu)`, actuator inputs (rad for a position actuator on a hinge, N or Nm for a motor).
+        qfrc_applied: `(N, nv)`, generalized force in joint coordinates (Nm for a hinge). A free joint's
+            six numbers are the force (N, world axes, acting at the body's origin `xpos`) and then the
+            torque (Nm, in the BODY's axes), since MuJoCo's free-joint angular velocity is in the body's
+            axes.
+        xfrc_applied: `(N, nbody, 6)`, force (N, world axes, acting at the body's inertial centre
+            `xipos`), then torque (Nm, world axes).
     """
 
     ctrl: Tensor

@@ -27,9 +27,12 @@ _HUGE = 1e10  # MuJoCo's mjMAXVAL, above which it calls a position bad.
 class Failure:
     """One world that went bad.
 
-    env: the world. step: the guard's count of control steps, from 0. where: what the
-    environment's callback said of it (clip and frame). cause: what was found. dump: the file
-    that `replay_dump` reads, or None.
+    Attributes:
+        env: the world.
+        step: the guard's count of control steps, from 0.
+        where: what the environment's callback said of it (clip and frame).
+        cause: what was found.
+        dump: the file that `replay_dump` reads, or None.
     """
 
     env: int
@@ -155,9 +158,14 @@ class NanGuard:
 class Replay:
     """A failing step, run again.
 
-    description: what happened, in a sentence. cause: the same in parts. exact: the replay ended
-    in the recorded state bit for bit. model, data: the world before the failing step, to look
-    at. nstep: its number of physics steps. info: the notes saved with it (environment, step, seed).
+    Attributes:
+        description: what happened, in a sentence.
+        cause: the same in parts.
+        exact: whether the replay ended in the recorded state bit for bit.
+        model: of the world.
+        data: the world before the failing step, to look at.
+        nstep: its number of physics steps.
+        info: the notes saved with it (environment, step, seed).
     """
 
     description: str

@@ -266,8 +266,8 @@ class WarpBackend:
     def _steps(self, nstep: int) -> None:
         """nstep times: forces and integration, then positions and velocities of the new state.
 
-        Whoever enters finds positions and velocities current, so that this costs no more than
-        mujoco_warp's own `step` and leaves nothing a step behind.
+        Positions and velocities are current on entry, so that this costs no more than mujoco_warp's own
+        `step` and leaves nothing a step behind.
         """
         for _ in range(nstep):
             self._mjw.step2(self._shared.m, self._live)

@@ -19,7 +19,7 @@ _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 class WarpModel:
-    """A model on the current Warp device; `m` is mujoco_warp's, whose fields may differ by world."""
+    """A model on the current Warp device; `m` is mujoco_warp's; its fields may differ by world."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, deterministic: bool) -> None:
         self._wp, mjw = load_warp()
@@ -55,7 +55,7 @@ class WarpModel:
         new = self._wp.empty((self._num_envs, *old.shape[1:]), dtype=old.dtype, device=old.device)
         view = self._wp.to_torch(new)
         view.copy_(self._wp.to_torch(old).expand_as(view))
-        new._is_batched = True  # mujoco_warp's own mark for arrays whose first axis is the world.
+        new._is_batched = True  # mujoco_warp's own mark for arrays with the world as first axis.
         setattr(*self._place(field), new)
         self.expanded[field] = view
         return view
@@ -93,7 +93,7 @@ class WarpModel:
         return (self.m.opt, field[4:]) if field.startswith("opt.") else (self.m, field)
 
     def _shared_array(self, field: str) -> Any | None:
-        """Warp's array of a field whose first axis is the world, or None."""
+        """Warp's array of a field with the world as first axis, or None."""
         array: Any = getattr(*self._place(field), None)
         if not isinstance(array, self._wp.array) or not array.ndim:
             return None

@@ -17,7 +17,7 @@ _G = mujoco.mjtGeom
 #: The most points at which a geom of this kind touches a plane.
 _POINTS = {int(_G.mjGEOM_SPHERE): 1, int(_G.mjGEOM_CAPSULE): 2, int(_G.mjGEOM_ELLIPSOID): 1}
 _CORNERS = 4
-#: Kinds whose mutual contacts are found by the general convex search, which needs scratch memory.
+#: Kinds of which mutual contacts are found by the general convex search, which needs scratch memory.
 _CONVEX = (int(_G.mjGEOM_BOX), int(_G.mjGEOM_CYLINDER), int(_G.mjGEOM_ELLIPSOID), int(_G.mjGEOM_MESH))
 #: Scratch bytes of that search per candidate and iteration (its polytope's faces and corners).
 _CONVEX_BYTES = 200
@@ -37,7 +37,7 @@ def load_warp() -> tuple[ModuleType, ModuleType]:
         ) from error
     check_versions(metadata.version("mujoco-warp"), mujoco.__version__)
     if warp.config.log_level == warp.LOG_INFO:
-        # Its start-up notes belong to nobody's output; warnings still come through.
+        # Its start-up notes are kept out of all output; warnings still come through.
         warp.config.log_level = warp.LOG_WARNING
     return warp, mujoco_warp
 
@@ -108,9 +108,10 @@ def check_driver(
 class Capacity:
     """How much room a world gets; Warp allocates all of it beforehand.
 
-    contacts: contact points and candidate pairs per world, on average over the worlds.
-    rows: constraint rows per world, a limit for each single world.
-    convex: contacts per world that need the general convex search, on average.
+    Attributes:
+        contacts: contact points and candidate pairs per world, on average over the worlds.
+        rows: constraint rows per world, a limit for each single world.
+        convex: contacts per world that need the general convex search, on average.
     """
 
     contacts: int

@@ -37,7 +37,7 @@ def shortest_arc(a: Tensor, b: Tensor) -> Tensor:
 
 
 def frame_quat(axis: Tensor, normal: Tensor) -> Tensor:
-    """wxyz of the frame whose x lies along `axis (..., 3)` and whose z is `normal` made square to it.
+    """wxyz of the frame with x along `axis (..., 3)` and z along `normal` made square to it.
 
     Two such frames of one bone, at rest and now, give its rotation: now * rest^-1. Where `normal` is
     parallel to `axis`, some axis across is taken.

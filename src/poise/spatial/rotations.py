@@ -34,7 +34,7 @@ _PRODUCT = (
     (0, 0, 1, 0), (0, 0, 0, -1), (-1, 0, 0, 0), (0, 1, 0, 0),
     (0, 0, 0, 1), (0, 0, 1, 0), (0, -1, 0, 0), (-1, 0, 0, 0),
 )  # fmt: skip
-#: The same for the product with a's conjugate, whose x, y and z are the other way round.
+#: The same for the product with a's conjugate: its x, y and z are the other way round.
 _BETWEEN = _PRODUCT[:4] + tuple(tuple(-x for x in row) for row in _PRODUCT[4:])
 #: Row 4 i + j holds what q_i q_j adds to the first two columns of the rotation matrix.
 _SIXD = (
@@ -123,7 +123,7 @@ def quat_to_rotvec(q: Tensor) -> Tensor:
 
 
 def quat_to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrices `(..., 3, 3)` whose columns are the local axes in the parent frame."""
+    """Rotation matrices `(..., 3, 3)` with the local axes in the parent frame as columns."""
     w, x, y, z = q.unbind(-1)
     rows = (
         torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),

@@ -1,4 +1,4 @@
-"""Motions turned about the vertical: coordinates whose first seven are a root's place and rotation."""
+"""Motions turned about the vertical: coordinates that begin with a root's place and rotation."""
 
 from __future__ import annotations
 

@@ -26,9 +26,12 @@ _INT16 = 32767
 class Shape:
     """One rigid geom of a body, in MuJoCo's conventions.
 
-    body: index into `Report.bodies`. kind: "capsule", "box" or "sphere".
-    size: m; capsule (radius, half length, 0) along local z, box half sizes, sphere (radius, 0, 0).
-    pos, quat: m and wxyz, the geom's place in the body's frame.
+    Attributes:
+        body: index into `Report.bodies`.
+        kind: "capsule", "box" or "sphere".
+        size: m; capsule (radius, half length, 0) along local z, box half sizes, sphere (radius, 0, 0).
+        pos: m, the geom's place in the body's frame.
+        quat: wxyz, its rotation there.
     """
 
     body: int
@@ -40,7 +43,13 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One character's motion: `pos (T, B, 3)` m world body positions, `quat (T, B, 4)` wxyz."""
+    """One character's motion.
+
+    Attributes:
+        name: shown in the legend.
+        pos: `(T, B, 3)` m, world positions of the bodies.
+        quat: `(T, B, 4)` wxyz, their rotations.
+    """
 
     name: str
     pos: np.ndarray
@@ -51,12 +60,23 @@ class Track:
 class Report:
     """Everything one report page shows; optional parts may be None or empty.
 
-    bodies: B names, the root first. fps: frames per second of every per-frame array.
-    force, torque: `(T, 3)` N and N m, the residual wrench on the root in the world's axes.
-    error_mm, error_global_mm: `(T,)` mm, mean joint error, root-relative and global.
-    contacts: `(T, 2)` bool, left and right foot on the ground.
-    score: the content of score.json. curve: columns of the learning curve, e.g. samples, seconds,
-        reward. notes: sentences on what was guessed, repaired or limited. facts: name to text.
+    Attributes:
+        title: heading of the page.
+        subtitle: line below it.
+        shapes: geoms of the bodies.
+        bodies: B names, the root first.
+        reference: the clip on the body.
+        simulated: the simulation.
+        fps: frames per second of every per-frame array.
+        force: `(T, 3)` N, residual force on the root in the world's axes.
+        torque: `(T, 3)` N m, residual torque on the root in the world's axes.
+        error_mm: `(T,)` mm, mean joint error relative to the root.
+        error_global_mm: `(T,)` mm, mean joint error in the world.
+        contacts: `(T, 2)` bool, left and right foot on the ground.
+        score: the content of score.json.
+        curve: columns of the learning curve, e.g. samples, seconds, reward.
+        notes: sentences on what was guessed, repaired or limited.
+        facts: name to text.
     """
 
     title: str

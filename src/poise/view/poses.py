@@ -25,9 +25,12 @@ _SIZE, _STEP, _LEFT, _TOP, _GAP = 110.0, 74.0, 62.0, 58.0, 34.0
 
 @dataclass(frozen=True)
 class PoseRow:
-    """One row: joints `(T, J, 3)` m of a motion, and of another that lies grey beneath it.
+    """One row of poses.
 
-    name: of the row. ghost: the same joints, or None.
+    Attributes:
+        name: of the row.
+        pos: `(T, J, 3)` m, joints of a motion.
+        ghost: `(T, J, 3)` m, joints of another motion, drawn grey beneath it, or None.
     """
 
     name: str
@@ -51,8 +54,9 @@ def pose_rows(
     at one moment is seen apart.
 
     Args:
-        frames: the moments shown. side: rad, azimuth of the direction that points right; by default the
-            one along which the first row's joints move most about its root, as seen from beside a walk.
+        frames: the moments shown.
+        side: rad, azimuth of the direction that points right; by default the one along which the
+            first row's joints move most about its root, as seen from beside a walk.
         path: also writes the SVG there.
 
     Raises:

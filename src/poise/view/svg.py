@@ -115,11 +115,14 @@ def line_plot(
 ) -> str:
     """Lines over a shared x axis as one SVG text.
 
-    series: `(name, x, y)`, or `(name, x, y, (low, high))` with a shaded band, or the five flat;
-        gaps where NaN.
-    path: where to write the file too. zero: let the y axis include 0.
-    right: label and factor of a second y axis, right value = factor times left value.
-    top: label and function of a second x axis. inline: for a page that brings style and heading.
+    Args:
+        series: `(name, x, y)`, or `(name, x, y, (low, high))` with a shaded band, or the five flat; gaps
+            where NaN.
+        path: where to write the file too.
+        zero: let the y axis include 0.
+        right: label and factor of a second y axis, right value = factor times left value.
+        top: label and function of a second x axis.
+        inline: for a page that brings style and heading.
     """
     lines = [_split(entry) for entry in series]
     xs = [x for _, x, *_ in lines]

@@ -14,8 +14,13 @@ LEVELS = ("good", "fair", "poor")
 class Grade:
     """One judged figure.
 
-    level: "good", "fair", "poor" or "unknown". value: the figure in words with its unit.
-    rule: the thresholds in words. counts: whether it decides the overall verdict.
+    Attributes:
+        name: what is judged.
+        value: the figure in words with its unit.
+        level: "good", "fair", "poor" or "unknown".
+        rule: the thresholds in words.
+        detail: a remark.
+        counts: whether it decides the overall verdict.
     """
 
     name: str

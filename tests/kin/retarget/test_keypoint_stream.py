@@ -17,7 +17,7 @@ from poise.kin.retarget.keypoint_stream import FadingFilter, KeypointStream, Str
 from poise.motion import Clip, read_clip, resample, trim
 from poise.motion.io.points.raw import assemble_points
 from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions as Options
 from poise.motion.keypoints import Keypoints
 from poise.motion.points import fit_clip
 from toy_human import swing

@@ -35,4 +35,4 @@ def find_paths(
         save_checkpoint(path, search.state(), {"kind": "paths", "clips": names})
         if tell.path is not None:
             tell.path(stats, config.trajopt.iterations)
-    return search.paths()
+    return search.trajectories()

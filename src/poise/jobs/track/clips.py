@@ -17,7 +17,7 @@ from poise.jobs.track.points import points_of
 from poise.jobs.track.policy import Tracker
 from poise.jobs.track.tracking import TrackConfig, Tracked, track
 from poise.motion import Clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
 from poise.plan import SamplingConfig
 from poise.settings import changed
@@ -48,7 +48,7 @@ def track_clip(
     config = changed(config or TrackConfig(), settings)
     given = clip if isinstance(clip, Keypoints) else clip_of(clip)
     if isinstance(clip, str | Path) and isinstance(given, Clip):
-        given = points_of(given, Options()) or given
+        given = points_of(given, ReadOptions()) or given
     if not isinstance(policy, Tracker):
         policy = (policy if isinstance(policy, Run) else open_run(policy)).tracker
     if search:

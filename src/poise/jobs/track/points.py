@@ -24,7 +24,7 @@ from poise.motion.io.points.c3d import c3d_points
 from poise.motion.io.points.csv import csv_points
 from poise.motion.io.points.raw import RawPoints, assemble_points
 from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions as Options
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing
 from poise.motion.points import FitConfig, fit_clip

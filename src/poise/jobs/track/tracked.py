@@ -113,7 +113,11 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
         raise PoiseError(f"{count} characters make {count} files", motion, "Give a folder as -o")
     other = placed.moved is not None
     inner = out / "body.bvh" if other and count == 1 else motion
-    done = deliver(t.imitation, t.evaluation, out, {}, inner, hold)
+    said = tuple(
+        f"The character failed at {seconds:.1f} s" + (f" (character {k + 1})." if count > 1 else ".")
+        for k, seconds in t.failures
+    )
+    done = deliver(t.imitation, t.evaluation, out, {}, inner, hold, placed.source, said)
     if not other:
         return done
     paths: dict[str, Path] = {}

@@ -44,10 +44,11 @@ def find_guesses(clip: Clip) -> list[Guess]:
     support = support_of(clip, anatomy)
     why = dict(source.evidence)
     unit = _UNITS.get(source.unit_m, f"{source.unit_m:.6g} m")
+    made = "The clip was made in code" if source.path is None else "The format itself states it"
     return [
-        Guess("up", source.up_axis, why.get("up", "The clip was made in code"), "--up Y|Z"),
+        Guess("up", source.up_axis, why.get("up", made), "--up Y|Z"),
         Guess("unit", source.unit_m, why.get("unit", f"The clip is in {unit}"), "--unit METRES"),
-        _rate(clip, support, why.get("fps", "The clip was made in code")),
+        _rate(clip, support, why.get("fps", made)),
         _rest(clip, anatomy),
         _sides(clip, anatomy),
         _feet(clip, anatomy),

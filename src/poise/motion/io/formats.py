@@ -37,7 +37,7 @@ from poise.motion.io.points import (
     refuse_folder,
     refuse_openpose,
 )
-from poise.motion.io.raw import Options, check_options
+from poise.motion.io.raw import ReadOptions, check_options
 from poise.motion.io.text import read_head, shown
 from poise.motion.io.usd import pxr_package, read_usd, write_usd
 
@@ -52,7 +52,7 @@ class Reader:
     name: str
     suffixes: tuple[str, ...]
     looks_like: Callable[[bytes], bool]
-    read: Callable[[Path, Options], Clip]
+    read: Callable[[Path, ReadOptions], Clip]
     asks: bool = False
 
 
@@ -86,7 +86,7 @@ def _looks_like_usd(head: bytes) -> bool:
     return head.startswith((b"PXR-USDC", b"#usda"))
 
 
-def _refuse_asf(path: Path, options: Options) -> Clip:
+def _refuse_asf(path: Path, options: ReadOptions) -> Clip:
     raise PoiseError(
         "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
     )
@@ -156,7 +156,7 @@ def read_clip(
     """
     path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
-    options = Options(
+    options = ReadOptions(
         asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz
     )
     check_options(options)

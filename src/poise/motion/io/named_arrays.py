@@ -1,4 +1,4 @@
-"""NumPy archives and pickles: what they hold decides who reads them."""
+"""NumPy archives and pickles: what they hold decides how they are read."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from poise.motion.io.numpy import (
     read_smpl,
     write_amass,
 )
-from poise.motion.io.numpy.arrays import NPY_MAGIC, Archive, first_member, npy_header
-from poise.motion.io.numpy.pickles import ASK, load_restricted
+from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header
+from poise.motion.io.numpy.pickles import load_restricted, loads_restricted
 from poise.motion.io.own import read_poise_npz, write_poise_npz
 from poise.motion.io.own.npz import MARK
 from poise.motion.io.points import is_mdm, is_points, read_mdm, read_points_arrays
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import listed, shown
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Named arrays that are a motion: what they are called, how they are known, who reads them."""
+    """Named arrays that are a motion: what they are called, how they are known, what reads them."""
 
     name: str
     holds: Callable[[Mapping[str, Any]], bool]
-    read: Callable[[Mapping[str, Any], Path, Options], Clip]
+    read: Callable[[Mapping[str, Any], Path, ReadOptions], Clip]
 
 
 def _is_qpos(data: Mapping[str, Any]) -> bool:
     return any(k in data for k in ("qpos", "dof_pos", "joint_pos", "dof"))
 
 
-def _refuse_qpos(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def _refuse_qpos(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     raise PoiseError(
         "it holds the joint angles of a robot (qpos), which mean nothing without the robot's model",
         path,
@@ -70,12 +70,12 @@ def looks_like_pickle(head: bytes) -> bool:
     return head.startswith(NPY_MAGIC) or (head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05")
 
 
-def read_npz(path: Path, options: Options) -> Clip:
+def read_npz(path: Path, options: ReadOptions) -> Clip:
     """The clip in a `.npz`, by the names of its arrays."""
-    return _read(Archive(path, options.allow_pickle), path, options)
+    return _read(Archive(path, loads_restricted if options.allow_pickle else None), path, options)
 
 
-def read_pickled(path: Path, options: Options) -> Clip:
+def read_pickled(path: Path, options: ReadOptions) -> Clip:
     """The clip in a `.pkl` or `.npy` of pickled arrays, which must be asked for."""
     with path.open("rb") as file:
         if file.read(len(NPY_MAGIC)) == NPY_MAGIC:
@@ -92,7 +92,7 @@ def read_pickled(path: Path, options: Options) -> Clip:
     return _read(load_restricted(path), path, options)
 
 
-def _read(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def _read(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     for kind in KINDS:
         if kind.holds(data):
             return kind.read(data, path, options)

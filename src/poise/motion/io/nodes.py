@@ -10,7 +10,7 @@ import torch
 
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import guess_unit, guess_up
-from poise.motion.io.raw import Options, vectors_from_z_up
+from poise.motion.io.raw import ReadOptions, vectors_from_z_up
 from poise.motion.io.text import shown
 from poise.motion.skeleton import Skeleton
 from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
@@ -211,7 +211,7 @@ def checked_unit(
     names: Sequence[str],
     parents: Sequence[int],
     bones: Bones,
-    options: Options,
+    options: ReadOptions,
     path: object,
     notes: list[str],
 ) -> float:

@@ -20,12 +20,13 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS, listed
+from poise.motion.limits import check_poses, check_rate
 from poise.motion.skeleton import Channel, Skeleton, Source
 from poise.spatial import forward_kinematics, normalize, unwrap_quats
 
 
 @dataclass(frozen=True)
-class Options:
+class ReadOptions:
     """What the caller states instead of leaving it to a guess; None where it is not stated."""
 
     skeleton: Path | None = None
@@ -92,9 +93,11 @@ def quats_from_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
     return np.concatenate((q[..., :1], vectors_from_z_up(q[..., 1:], up_axis)), -1)
 
 
-def check_options(options: Options) -> None:
+def check_options(options: ReadOptions) -> None:
     """Refuses overrides that make no sense."""
-    stated = (("unit", options.unit_m), ("fps", options.fps), ("smooth", options.smooth_hz))
+    stated = (("unit", options.unit_m), ("smooth", options.smooth_hz))
+    if options.fps is not None:
+        check_rate(options.fps, "--fps")
     for name, value in stated:
         if value is not None and not (np.isfinite(value) and value > 0):
             raise PoiseError(f"--{name} must be above 0, got {value}")
@@ -102,9 +105,11 @@ def check_options(options: Options) -> None:
         raise PoiseError(f"--up must be Y or Z, got '{options.up_axis}'")
 
 
-def assemble(raw: RawMotion, options: Options) -> Clip:
+def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
     """The clip in metres, Z up, with every guess and repair in its source's notes."""
     _check(raw)
+    check_rate(float(options.fps or raw.fps), raw.path)
+    check_poses(len(raw.rot), len(raw.names), raw.path)
     notes = list(raw.notes)
     whole = len(raw.rot)
     raw = _drop_rest_frames(raw, notes)
@@ -138,7 +143,7 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
             frame_time=raw.frame_time,
             travel_joint=raw.travel_joint,
             notes=tuple(notes),
-            evidence=_evidence(raw, options, up, unit),
+            evidence=evidence(options, up, unit, _rate(raw)),
             mended=tuple(mended),
             extra=raw.extra,
         ),
@@ -146,20 +151,23 @@ def assemble(raw: RawMotion, options: Options) -> Clip:
     return Clip(skeleton, root_pos, quats_to_z_up(rot, axis), fps, raw.path.stem, raw.cyclic)
 
 
-def _evidence(raw: RawMotion, options: Options, up: Guess, unit: Guess) -> tuple[tuple[str, str], ...]:
+#: Why a value is what it is, where nothing was guessed.
+BY_FORMAT = "The format itself states it"
+
+
+def evidence(options: ReadOptions, up: Guess, unit: Guess, rate: str) -> tuple[tuple[str, str], ...]:
     """Why the vertical, the unit and the frame rate are what they are, one sentence each."""
-    by_format = "The format itself states it"
-    if options.fps is not None:
-        rate = "Stated with --fps"
-    elif raw.frame_time is not None:
-        rate = f"The file's frame time is {raw.frame_time:.6g} s"
-    else:
-        rate = next((n for n in raw.notes if "frame rate" in n), by_format)
     return (
-        ("up", "Stated with --up" if options.up_axis else up.note or by_format),
-        ("unit", "Stated with --unit" if options.unit_m else unit.note or by_format),
-        ("fps", rate),
+        ("up", "Stated with --up" if options.up_axis else up.note or BY_FORMAT),
+        ("unit", "Stated with --unit" if options.unit_m else unit.note or BY_FORMAT),
+        ("fps", "Stated with --fps" if options.fps is not None else rate),
     )
+
+
+def _rate(raw: RawMotion) -> str:
+    if raw.frame_time is not None:
+        return f"The file's frame time is {raw.frame_time:.6g} s"
+    return next((n for n in raw.notes if "frame rate" in n), BY_FORMAT)
 
 
 def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[float, float, float]:
@@ -189,7 +197,7 @@ def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
     return replace(raw, root_pos=raw.root_pos[count:], rot=raw.rot[count:])
 
 
-def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: Options) -> tuple[Guess, Guess]:
+def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple[Guess, Guess]:
     """The vertical and the metres per unit, stated or guessed, each with its evidence."""
     at = sampled(len(rot))
     offsets = torch.tensor(raw.offsets)

@@ -15,8 +15,6 @@ from poise.errors import PoiseError
 
 MAX_FILE_BYTES = 512 << 20
 """Larger files are refused before they are read (22 joints at 30 Hz: about seven hours)."""
-MAX_JSON_BYTES = 128 << 20
-"""The same for JSON, which needs far more memory than its text."""
 MAX_SKELETON_BYTES = 16 << 20
 """The same for ASF skeletons, which hold no motion."""
 MAX_LINES = 10_000_000
@@ -27,6 +25,8 @@ MAX_HEADER_WORDS = 1_000_000
 """More words than this before the motion starts are refused."""
 MAX_JOINTS = 2000
 """Skeletons with more joints are refused."""
+MAX_NAME = 200
+"""Joints and keypoints with longer names are refused."""
 MAX_VALUE = 1e8
 """Numbers larger than this, in any unit, are taken for damage."""
 CUT_OFF = "The file seems cut off"
@@ -70,6 +70,15 @@ def read_head(path: Path, size: int = 4096) -> bytes:
     try:
         with path.open("rb") as file:
             return file.read(size)
+    except OSError as error:
+        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+
+
+def read_binary(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """All bytes of a file of any kind, after `check_file`."""
+    check_file(path, limit)
+    try:
+        return path.read_bytes()
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
 
@@ -135,9 +144,9 @@ def decode(line: bytes, path: Path, number: int) -> str:
         ) from None
 
 
-def shown(token: bytes | str) -> str:
+def shown(token: object) -> str:
     """A token for an error message: printable and short."""
-    text = token.decode("utf-8", "replace") if isinstance(token, bytes) else token
+    text = token.decode("utf-8", "replace") if isinstance(token, bytes) else str(token)
     text = "".join(c if c.isprintable() else "?" for c in text)
     return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from poise.motion.points.labels import SIDES
@@ -221,24 +222,10 @@ def steady_twist(shown: Tensor, fps: float) -> Tensor:
     right = right + prior * torch.tensor([1.0, 0.0], dtype=shown.dtype)
     diagonal = weight + prior + between * 2.0
     diagonal[0], diagonal[-1] = diagonal[0] - between, diagonal[-1] - between
-    z = _tridiagonal(diagonal.numpy(), -between, right.numpy())
+    # The upper band, whose first number stands outside the matrix; a single frame has none.
+    bands = np.stack((np.full(len(diagonal), -between), diagonal.numpy()))
+    z = solveh_banded(bands[-len(diagonal) :], right.numpy())
     return torch.atan2(torch.tensor(z[:, 1]), torch.tensor(z[:, 0]))
-
-
-def _tridiagonal(diagonal: np.ndarray, off: float, right: np.ndarray) -> np.ndarray:
-    """x `(T, C)` of the symmetric tridiagonal system with constant off-diagonal `off` (Thomas)."""
-    count = len(diagonal)
-    upper, x = [0.0] * count, [(0.0, 0.0)] * count
-    d, r = diagonal.tolist(), right.tolist()
-    u, a, b = 0.0, 0.0, 0.0
-    for t in range(count):
-        pivot = d[t] - off * u
-        a, b = (r[t][0] - off * a) / pivot, (r[t][1] - off * b) / pivot
-        u = off / pivot
-        upper[t], x[t] = u, (a, b)
-    for t in range(count - 2, -1, -1):
-        x[t] = (x[t][0] - upper[t] * x[t + 1][0], x[t][1] - upper[t] * x[t + 1][1])
-    return np.array(x)
 
 
 def hold_lengths(

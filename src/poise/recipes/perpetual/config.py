@@ -305,6 +305,7 @@ MIGRATION = Migration(
         "hard_starts": "adaptive_sampling",
         "hard_over": "adaptive_over",
         "paths": "trajopt",
+        "trajopt.stretch_s": "trajopt.segment_s",
         "recovering.ways": "recovering.demonstrations",
         "recovering.way_share": "recovering.demonstration_share",
     },

@@ -11,7 +11,7 @@ import torch
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
 from poise.motion.io.acclaim.asf import ROTATIONS, TRAVEL, AsfFile, fixed_axes_quat, parse_asf
-from poise.motion.io.raw import Options, RawMotion, assemble
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import (
     CUT_OFF,
     append_numbers,
@@ -56,7 +56,7 @@ def find_skeleton(path: Path) -> tuple[Path, str | None]:
     )
 
 
-def read_amc(path: Path, options: Options) -> Clip:
+def read_amc(path: Path, options: ReadOptions) -> Clip:
     """An AMC clip on its ASF skeleton: 120 Hz, Y up, the unit from the ASF's `length`."""
     notes: list[str] = []
     skeleton = options.skeleton

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,12 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.io.raw import Options, RawMotion, assemble
-from poise.motion.io.text import CUT_OFF, MAX_JSON_BYTES, MAX_VALUE, at_line, read_bytes
+from poise.motion.edits import blended
+from poise.motion.io.json import MAX_JSON_BYTES, json_object
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
+from poise.motion.io.text import MAX_VALUE, read_bytes
 from poise.motion.skeleton import Channel
-from poise.spatial import axis_angle_to_quat, slerp
+from poise.spatial import axis_angle_to_quat
 
 COLUMNS = 44
 """Frame duration, root position, root quaternion, then the joints below."""
@@ -52,7 +53,7 @@ def _humanoid() -> list[tuple[str, str | None, tuple[float, float, float], int]]
     return rows
 
 
-def read_deepmimic(path: Path, options: Options) -> Clip:
+def read_deepmimic(path: Path, options: ReadOptions) -> Clip:
     """A DeepMimic clip: metres, Y up; `Loop: wrap` makes it cyclic.
 
     Quaternions off unit length are normalised and told; where frame durations differ by more
@@ -98,20 +99,8 @@ def read_deepmimic(path: Path, options: Options) -> Clip:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(read_bytes(path, MAX_JSON_BYTES).decode("utf-8"))
-    except UnicodeDecodeError as error:
-        line = error.object.count(b"\n", 0, error.start) + 1
-        raise PoiseError("this is not UTF-8 text", at_line(path, line), "Save it as UTF-8") from None
-    except json.JSONDecodeError as error:
-        raise PoiseError(
-            f"this is not valid JSON ({error.msg})",
-            at_line(path, error.lineno),
-            CUT_OFF,
-        ) from None
-    except (RecursionError, ValueError):
-        raise PoiseError("this is not valid JSON", path) from None
-    if not isinstance(data, dict) or not isinstance(data.get("Frames"), list):
+    data = json_object(read_bytes(path, MAX_JSON_BYTES), path)
+    if not isinstance(data.get("Frames"), list):
         raise PoiseError("the JSON has no list named 'Frames'", path, "DeepMimic files need one")
     return data
 
@@ -195,10 +184,4 @@ def _even(clip: Clip, times: np.ndarray, path: Path) -> Clip:
     wanted = np.minimum(np.arange(count) / clip.fps, at[-1])
     low = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, clip.frames - 2)
     t = np.clip((wanted - at[low]) / times[low], 0.0, 1.0)
-    rot = slerp(
-        torch.tensor(clip.rot[low]),
-        torch.tensor(clip.rot[low + 1]),
-        torch.tensor(t)[:, None].expand(-1, len(clip.skeleton)),
-    ).numpy()
-    root_pos = clip.root_pos[low] * (1 - t[:, None]) + clip.root_pos[low + 1] * t[:, None]
-    return clip.replaced(root_pos=root_pos, rot=rot)
+    return blended(clip, low, t)

@@ -17,7 +17,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import numeric, refuse_bad, require
-from poise.motion.io.raw import Options, RawMotion, assemble
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import CUT_OFF, append_numbers, at_line, decode, listed, read_bytes, shown
 from poise.motion.skeleton import Channel
 from poise.spatial import axis_angle_to_quat, quat_mul
@@ -84,7 +84,7 @@ def looks_like_mot(head: bytes) -> bool:
     return b"endheader" in head.lower() and all(k.encode() in head for k in _LEGS)
 
 
-def read_mot(path: Path, options: Options) -> Clip:
+def read_mot(path: Path, options: ReadOptions) -> Clip:
     """A clip from an OpenSim `.mot`: joint angles in degrees or radians as its header says.
 
     Raises:
@@ -122,7 +122,7 @@ def read_mot(path: Path, options: Options) -> Clip:
     return _clip(turns, 1.0 / step, path, options, [])
 
 
-def read_loco(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_loco(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """A clip from LocoMuJoCo's arrays `q_NAME (T,)` rad or m of its full humanoid.
 
     The frame rate follows from the velocities `dq_NAME`; pelvis heights that are relative to the
@@ -176,7 +176,7 @@ def _rate(
 
 
 def _clip(
-    turns: Mapping[str, np.ndarray], fps: float, path: Path, options: Options, notes: list[str]
+    turns: Mapping[str, np.ndarray], fps: float, path: Path, options: ReadOptions, notes: list[str]
 ) -> Clip:
     frames = {len(v) for v in turns.values()}
     if len(frames) != 1:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ROOT = 7
@@ -18,7 +18,7 @@ def looks_like_robot(head: bytes) -> bool:
     return head.startswith(HDF5_MAGIC) or _rows(head) is not None
 
 
-def refuse_robot(path: Path, options: Options) -> Clip:
+def refuse_robot(path: Path, options: ReadOptions) -> Clip:
     """Says what the file holds and why it is not read."""
     with path.open("rb") as file:
         head = file.read(1 << 16)

@@ -13,6 +13,7 @@ from poise.motion.io.text import (
     CUT_OFF,
     MAX_HEADER_WORDS,
     MAX_JOINTS,
+    MAX_NAME,
     MAX_VALUE,
     append_numbers,
     at_line,
@@ -104,7 +105,7 @@ class _Tokens:
         while not self.done() and self.words[self.at][1] == line and self.words[self.at][0] not in "{}":
             words.append(self.next("a joint name"))
         name = " ".join(words)
-        if not name or not name.isprintable() or len(name) > 200:
+        if not name or not name.isprintable() or len(name) > MAX_NAME:
             what = "a joint has no name" if not name else f"{shown(name)} is no joint name"
             raise PoiseError(what, at_line(self.path, line))
         return name

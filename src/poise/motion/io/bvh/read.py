@@ -10,12 +10,12 @@ import torch
 from poise.motion.clip import Clip
 from poise.motion.io.bvh.file import BvhFile, parse_bvh
 from poise.motion.io.bvh.places import resolve_places
-from poise.motion.io.raw import Options, RawMotion, assemble, zero_length_note
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble, zero_length_note
 from poise.motion.skeleton import Channel
 from poise.spatial import euler_to_quat
 
 
-def read_bvh(path: Path, options: Options) -> Clip:
+def read_bvh(path: Path, options: ReadOptions) -> Clip:
     """A BVH clip.
 
     A joint's position channels replace its OFFSET, the root's too (LAFAN1 writes the first

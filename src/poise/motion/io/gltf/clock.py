@@ -10,9 +10,7 @@ from poise.errors import PoiseError
 from poise.motion.io.gltf.file import GltfFile
 from poise.motion.io.gltf.tracks import Take, Track
 from poise.motion.io.text import MAX_VALUE
-
-MAX_POSES = 20_000_000
-"""Animations that would need more frames times joints are refused."""
+from poise.motion.limits import check_poses
 
 _SLOW_HZ = 12.0
 _USUAL_HZ = 30.0
@@ -32,6 +30,8 @@ def clock(
     The rate is the stated one, that which Poise wrote beside the keys, or the most common spacing
     of the keys. Times that are a key up to float32 noise become that key exactly.
     """
+    if not tracks:
+        raise PoiseError("the animation moves no joint of the figure", file.path)
     inputs = {id(t.times): t.times for t in tracks}.values()
     start, end = min(t[0] for t in inputs), max(t[-1] for t in inputs)
     if end <= start:
@@ -46,12 +46,7 @@ def clock(
     # Times are float32 numbers; the last frame may lie that much before its place.
     noise = 2 * float(np.spacing(np.float32(max(abs(start), abs(end)))))
     count = int(np.floor((end - start + noise) * rate + 0.02)) + 1
-    if count * len(tracks) > MAX_POSES:
-        raise PoiseError(
-            f"{end - start:.6g} s at {rate:.6g} frames per second are {count} frames, too many to read",
-            file.path,
-            "State a lower rate with --fps, or cut it shorter",
-        )
+    check_poses(count, len(tracks), file.path)
     when = start + np.arange(count) / rate
     keys = np.unique(np.concatenate(list(inputs)))
     near = np.clip(np.searchsorted(keys, when), 1, max(1, len(keys) - 1))

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import struct
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote
 
 from poise.errors import PoiseError
-from poise.motion.io.text import CUT_OFF, MAX_FILE_BYTES, MAX_JSON_BYTES, check_file, shown
-
-if TYPE_CHECKING:
-    from pygltflib import GLTF2
+from poise.motion.io.json import json_object
+from poise.motion.io.text import CUT_OFF, MAX_FILE_BYTES, read_binary, shown
 
 MAGIC = b"glTF"
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
+JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
 MAX_OBJECTS = 100_000
 """Documents with more nodes or accessors than this are refused."""
 MAX_CHANNELS = 10_000
@@ -37,13 +34,12 @@ _DATA_URI = "data:"
 class GltfFile:
     """A parsed document with its buffers, which are fetched when they are first needed.
 
-    doc: pygltflib's dataclasses of `_PARTS`. uris: each buffer's address, None for the GLB's own.
+    doc: the JSON, whose `_PARTS` are lists of objects for certain; what these hold is not checked.
     blob: the GLB's binary chunk.
     """
 
     path: Path
-    doc: GLTF2
-    uris: list[str | None]
+    doc: dict[str, Any]
     blob: bytes | None
     _buffers: dict[int, bytes] = field(default_factory=dict)
     _read: int = 0
@@ -65,10 +61,9 @@ class GltfFile:
         return self._buffers[index]
 
     def _load(self, index: int) -> bytes:
-        length = self.doc.buffers[index].byteLength
-        uri = self.uris[index]
+        length, uri = (self.doc["buffers"][index].get(key) for key in ("byteLength", "uri"))
         if type(length) is not int or not 0 < length <= MAX_FILE_BYTES:
-            raise PoiseError(f"buffer {index} states a length of {shown(str(length))} bytes", self.path)
+            raise PoiseError(f"buffer {index} states a length of {shown(length)} bytes", self.path)
         if uri is None:
             if index != 0 or self.blob is None:
                 raise PoiseError(f"buffer {index} has neither an address nor a GLB chunk", self.path)
@@ -76,7 +71,7 @@ class GltfFile:
         elif uri.startswith(_DATA_URI):
             data = _embedded(uri, index, self.path)
         else:
-            data = _beside(uri, index, self.path).read_bytes()
+            data = read_binary(_beside(uri, index, self.path))
         if len(data) < length:
             raise PoiseError(
                 f"buffer {index} has {len(data)} bytes, but the document states {length}",
@@ -92,18 +87,14 @@ def load_gltf(path: Path) -> GltfFile:
     Raises:
         PoiseError: bad container, broken JSON, an unknown version, too many objects.
     """
-    check_file(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+    data = read_binary(path)
     text, blob = _chunks(data, path) if data[:4] == MAGIC else (data, None)
-    if len(text) > MAX_JSON_BYTES:
-        raise PoiseError(f"the JSON has {len(text) / 1e6:.0f} MB, more than Poise reads", path)
-    content = _parse(text, path)
-    _check_version(content, path)
-    uris = _check_parts(content, path)
-    return GltfFile(path, _typed(content, path), uris, blob)
+    if text.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
+        raise PoiseError("this is no glTF: it starts with neither 'glTF' nor '{'", path)
+    doc = json_object(text, path)
+    _check_version(doc, path)
+    _check_parts(doc, path)
+    return GltfFile(path, doc, blob)
 
 
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
@@ -126,29 +117,11 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
             raise PoiseError(
                 f"the chunk at byte {at} states {length} bytes, but {left} are left", path, CUT_OFF
             )
-        if at == 12 and kind != _JSON:
+        if at == 12 and kind != JSON_CHUNK:
             raise PoiseError("the first chunk of the GLB is not JSON", path)
         found.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
-    return found[_JSON], found.get(_BIN)
-
-
-def _parse(text: bytes, path: Path) -> dict[str, Any]:
-    if text.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
-        raise PoiseError("this is no glTF: it starts with neither 'glTF' nor '{'", path)
-    try:
-        content = json.loads(text.removeprefix(b"\xef\xbb\xbf").decode("utf-8"))
-    except UnicodeDecodeError:
-        raise PoiseError("the JSON is not UTF-8 text", path) from None
-    except json.JSONDecodeError as error:
-        raise PoiseError(
-            f"the JSON is not valid ({error.msg}, line {error.lineno})", path, CUT_OFF
-        ) from None
-    except (RecursionError, ValueError):
-        raise PoiseError("the JSON is not valid", path) from None
-    if not isinstance(content, dict):
-        raise PoiseError("the JSON holds no glTF document", path)
-    return content
+    return found[JSON_CHUNK], found.get(BIN_CHUNK)
 
 
 def _check_version(content: dict[str, Any], path: Path) -> None:
@@ -160,73 +133,38 @@ def _check_version(content: dict[str, Any], path: Path) -> None:
         raise PoiseError(f"this is glTF version {shown(version)}", path, "Export it as glTF 2.0")
 
 
-def _check_parts(content: dict[str, Any], path: Path) -> list[str | None]:
-    """Refuses parts that are no lists of objects; returns the buffers' addresses, taken out."""
+def _check_parts(content: dict[str, Any], path: Path) -> None:
+    """Refuses parts that are no lists of objects or hold too many; absent ones are empty."""
     for part in _PARTS:
-        items = content.setdefault(part, [])
-        if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-            raise PoiseError(f"'{part}' is not a list of objects", path)
-        if len(items) > MAX_OBJECTS:
-            raise PoiseError(
-                f"'{part}' has {len(items)} entries, more than the {MAX_OBJECTS} allowed", path
-            )
+        _check_list(content, part, f"'{part}'", MAX_OBJECTS, path)
     for i, animation in enumerate(content["animations"]):
         for part in ("channels", "samplers"):
-            held = animation.setdefault(part, [])
-            if not isinstance(held, list):
-                raise PoiseError(f"the {part} of animation {i} are no list", path)
-            if len(held) > MAX_CHANNELS:
-                raise PoiseError(
-                    f"animation {i} has {len(held)} {part}, more than the {MAX_CHANNELS} allowed", path
-                )
-    uris = [buffer.pop("uri", None) for buffer in content["buffers"]]
-    for i, uri in enumerate(uris):
-        if uri is not None and not isinstance(uri, str):
+            _check_list(animation, part, f"'{part}' of animation {i}", MAX_CHANNELS, path)
+        for channel in animation["channels"]:
+            _check_object(channel, "target", path)
+    for accessor in content["accessors"]:
+        sparse = _check_object(accessor, "sparse", path)
+        for part in ("indices", "values"):
+            _check_object(sparse, part, path)
+    for i, buffer in enumerate(content["buffers"]):
+        if not isinstance(buffer.get("uri"), str | None):
             raise PoiseError(f"the address of buffer {i} is no text", path)
-    return uris
 
 
-def _typed(content: dict[str, Any], path: Path) -> GLTF2:
-    """The parts as pygltflib's dataclasses, filled here: its own decoder takes 0.5 ms per object."""
-    import pygltflib as gl
-
-    inner: dict[type, dict[str, type]] = {
-        gl.Accessor: {"sparse": gl.Sparse},
-        gl.Sparse: {"indices": gl.AccessorSparseIndices, "values": gl.AccessorSparseValues},
-        gl.Animation: {"channels": gl.AnimationChannel, "samplers": gl.AnimationSampler},
-        gl.AnimationChannel: {"target": gl.AnimationChannelTarget},
-    }
-    kinds: dict[str, type] = {
-        "nodes": gl.Node,
-        "skins": gl.Skin,
-        "scenes": gl.Scene,
-        "animations": gl.Animation,
-        "accessors": gl.Accessor,
-        "bufferViews": gl.BufferView,
-        "buffers": gl.Buffer,
-    }
-    known = {kind: {f.name for f in fields(kind)} for kind in (*kinds.values(), *_values(inner))}
-
-    def built(kind: type, value: Any, what: str) -> Any:
-        if not isinstance(value, dict):
-            raise PoiseError(f"{what} is no object, as glTF demands", path)
-        out = kind(**{key: v for key, v in value.items() if key in known[kind]})
-        for key, part in inner.get(kind, {}).items():
-            held = value.get(key)
-            if isinstance(held, list):
-                setattr(out, key, [built(part, v, f"an entry of '{key}'") for v in held])
-            elif held is not None:
-                setattr(out, key, built(part, held, f"'{key}'"))
-        return out
-
-    doc = gl.GLTF2()
-    for part in _PARTS:
-        setattr(doc, part, [built(kinds[part], v, f"an entry of '{part}'") for v in content[part]])
-    return doc
+def _check_list(holder: dict[str, Any], key: str, what: str, most: int, path: Path) -> None:
+    items = holder.setdefault(key, [])
+    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+        raise PoiseError(f"{what} is not a list of objects", path)
+    if len(items) > most:
+        raise PoiseError(f"{what} has {len(items)} entries, more than the {most} allowed", path)
 
 
-def _values(inner: dict[type, dict[str, type]]) -> list[type]:
-    return [kind for parts in inner.values() for kind in parts.values()]
+def _check_object(holder: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
+    """The object under a key, empty where there is none."""
+    value = holder.get(key)
+    if not isinstance(value, dict | None):
+        raise PoiseError(f"'{key}' is no object, as glTF demands", path)
+    return value or {}
 
 
 def _embedded(uri: str, index: int, path: Path) -> bytes:
@@ -264,5 +202,4 @@ def _beside(uri: str, index: int, path: Path) -> Path:
         raise PoiseError(
             f"its buffer file {shown(name)} is missing", path, "Put the buffer beside the file"
         )
-    check_file(target)
     return target

@@ -14,12 +14,12 @@ from poise.motion.io.gltf.file import GltfFile, load_gltf
 from poise.motion.io.gltf.tracks import Take, choose_take
 from poise.motion.io.gltf.tree import Tree, choose_joints, read_tree
 from poise.motion.io.nodes import base_of, checked_unit, even, rigid_bones, unique_names
-from poise.motion.io.raw import Options, RawMotion, assemble
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 
 _EVEN_SCALE = 1e-2
 
 
-def read_gltf(path: Path, options: Options) -> Clip:
+def read_gltf(path: Path, options: ReadOptions) -> Clip:
     """A glTF 2.0 clip (.glb, .gltf).
 
     Local node rotations are the clip's local rotations. The transforms of nodes above the root
@@ -55,7 +55,7 @@ def _without_still_roots(tree: Tree, joints: list[int], take: Take, moving: set[
 
 
 def _raw_motion(
-    file: GltfFile, tree: Tree, take: Take, joints: list[int], options: Options, notes: list[str]
+    file: GltfFile, tree: Tree, take: Take, joints: list[int], options: ReadOptions, notes: list[str]
 ) -> RawMotion:
     above = tree.line(joints[0])[:-1]
     used = [
@@ -141,7 +141,7 @@ def _ends(file: GltfFile, joints: list[int]) -> tuple[tuple[int, tuple[float, fl
     """Bone tips that Poise wrote beside the nodes, in file units."""
     out: list[tuple[int, tuple[float, float, float]]] = []
     for j, node in enumerate(joints):
-        extras = file.doc.nodes[node].extras
+        extras = file.doc["nodes"][node].get("extras")
         tips = extras.get("poise_ends") if isinstance(extras, dict) else None
         for tip in tips if isinstance(tips, list) else []:
             if isinstance(tip, list) and len(tip) == 3 and all(type(x) in (int, float) for x in tip):

@@ -89,8 +89,8 @@ class Take:
 
 def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]) -> Take:
     """The animation of that name or number (from 0), or else the longest that moves nodes."""
-    animations = file.doc.animations
-    names = [str(a.name or f"animation {i}") for i, a in enumerate(animations)]
+    animations = file.doc["animations"]
+    names = [str(a.get("name") or f"animation {i}") for i, a in enumerate(animations)]
     numbered = [f"{i} {shown(name)}" for i, name in enumerate(names)]
     if not animations:
         raise PoiseError("the file holds no animation", file.path, "Export it with its animation")
@@ -121,17 +121,17 @@ def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]
 
 def _channels(file: GltfFile, tree: Tree, index: int) -> Iterator[tuple[str, int, str, Any]]:
     """What to call it, node, path and sampler of each channel that moves, turns or scales a node."""
-    animation = file.doc.animations[index]
-    for c, channel in enumerate(animation.channels or []):
-        what = f"channel {c} of animation {shown(str(animation.name or index))}"
-        target = channel.target
-        path = None if target is None else target.path
+    animation = file.doc["animations"][index]
+    for c, channel in enumerate(animation["channels"]):
+        what = f"channel {c} of animation {shown(animation.get('name') or index)}"
+        target = channel.get("target") or {}
+        path, node = target.get("path"), target.get("node")
         # Channels without a node belong to extensions; weights move no joint.
-        if target is None or target.node is None or not isinstance(path, str) or path not in _KINDS:
+        if node is None or not isinstance(path, str) or path not in _KINDS:
             continue
-        node = index_of(target.node, tree.names, f"the target of {what}", file)
-        samplers = animation.samplers or []
-        yield what, node, path, samplers[index_of(channel.sampler, samplers, what, file)]
+        node = index_of(node, tree.names, f"the target of {what}", file)
+        samplers = animation["samplers"]
+        yield what, node, path, samplers[index_of(channel.get("sampler"), samplers, what, file)]
 
 
 def _span(file: GltfFile, tree: Tree, index: int, known: dict[int, np.ndarray]) -> float:
@@ -139,7 +139,7 @@ def _span(file: GltfFile, tree: Tree, index: int, known: dict[int, np.ndarray]) 
     first, last = np.inf, -1.0
     for what, _, path, sampler in _channels(file, tree, index):
         if path != "scale":
-            times = _key_times(file, sampler.input, what, known)
+            times = _key_times(file, sampler.get("input"), what, known)
             first, last = min(first, times[0]), max(last, times[-1])
     return float(last - first) if last >= first else -1.0
 
@@ -148,20 +148,19 @@ def _take(file: GltfFile, tree: Tree, index: int, name: str) -> Take:
     tracks: dict[tuple[int, str], Track] = {}
     known: dict[int, np.ndarray] = {}
     for what, node, path, sampler in _channels(file, tree, index):
-        mode = sampler.interpolation or "LINEAR"
+        mode = sampler.get("interpolation") or "LINEAR"
         if mode not in _MODES:
-            raise PoiseError(f"{what} has the unknown interpolation {shown(str(mode))}", file.path)
-        times = _key_times(file, sampler.input, what, known)
-        values = read_accessor(file, sampler.output, _KINDS[path], f"the values of {what}")
+            raise PoiseError(f"{what} has the unknown interpolation {shown(mode)}", file.path)
+        times = _key_times(file, sampler.get("input"), what, known)
+        values = read_accessor(file, sampler.get("output"), _KINDS[path], f"the values of {what}")
         _check_values(values, times, mode, path, tree.names[node], file)
         if path == "rotation":
             values = _wxyz(values, mode, times, tree.names[node], file)
         if (node, path) in tracks:
             raise PoiseError(f"{what} moves the {path} of node '{tree.names[node]}' again", file.path)
         tracks[node, path] = Track(times, values, mode)
-    animation = file.doc.animations[index]
-    extras = animation.extras if isinstance(animation.extras, dict) else {}
-    own = extras.get("poise")
+    extras = file.doc["animations"][index].get("extras")
+    own = extras.get("poise") if isinstance(extras, dict) else None
     return Take(name, tracks, own if isinstance(own, dict) else {})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.io.gltf.accessor import index_of
 from poise.motion.io.gltf.file import GltfFile
-from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, shown
+from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.spatial import matrix_to_quat
 
 MAX_DEPTH = 1000
@@ -56,47 +57,34 @@ class Tree:
 
 def read_tree(file: GltfFile) -> Tree:
     """The node tree; cycles, nodes with two parents and unusable transforms are refused."""
-    nodes = file.doc.nodes
+    nodes = file.doc["nodes"]
     if not nodes:
         raise PoiseError("the file has no nodes, so there is nothing that could move", file.path)
-    names = [_name(node.name, i, file) for i, node in enumerate(nodes)]
+    names = [_name(node.get("name"), i, file) for i, node in enumerate(nodes)]
     parents, children, tops = _links(file, names)
-    place, turn, scale = (np.zeros((len(nodes), 3)), np.zeros((len(nodes), 4)), np.ones((len(nodes), 3)))
-    turn[:, 0] = 1.0
-    for i, node in enumerate(nodes):
-        where = f"{file.path}, node '{names[i]}'"
-        if node.matrix is not None:
-            place[i], turn[i], scale[i] = _decomposed(_vector(node.matrix, 16, "matrix", where), where)
-            continue
-        if node.translation is not None:
-            place[i] = _vector(node.translation, 3, "translation", where)
-        if node.scale is not None:
-            scale[i] = _vector(node.scale, 3, "scale", where)
-        if node.rotation is not None:
-            x, y, z, w = _vector(node.rotation, 4, "rotation", where)
-            norm = np.linalg.norm((w, x, y, z))
-            if norm < 1e-3:
-                raise PoiseError("its rotation is a quaternion of no length", where)
-            turn[i] = np.array((w, x, y, z)) / norm
-    solid = [node.mesh is not None or node.camera is not None for node in nodes]
+    moves = [
+        _transform(node, f"{file.path}, node '{name}'") for node, name in zip(nodes, names, strict=True)
+    ]
+    place, turn, scale = (np.array(part) for part in zip(*moves, strict=True))
+    solid = [node.get("mesh") is not None or node.get("camera") is not None for node in nodes]
     return Tree(names, parents, children, tops, place, turn, scale, solid)
 
 
 def _name(value: object, index: int, file: GltfFile) -> str:
     if value is None or value == "":
         return f"node_{index}"
-    if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
-        raise PoiseError(f"node {index} has the unusable name {shown(str(value))}", file.path)
+    if not isinstance(value, str) or len(value) > MAX_NAME or not value.isprintable():
+        raise PoiseError(f"node {index} has the unusable name {shown(value)}", file.path)
     return value
 
 
 def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]], list[int]]:
     """Parents, children and the scene root of each node."""
-    nodes = file.doc.nodes
+    nodes = file.doc["nodes"]
     parents = [-1] * len(nodes)
     children: list[list[int]] = []
     for i, node in enumerate(nodes):
-        below = node.children or []
+        below = node.get("children") or []
         if not isinstance(below, list):
             raise PoiseError(f"the children of node '{names[i]}' are no list", file.path)
         children.append([])
@@ -121,11 +109,28 @@ def _links(file: GltfFile, names: list[str]) -> tuple[list[int], list[list[int]]
     return parents, children, tops
 
 
-def _vector(value: object, size: int, what: str, where: str) -> np.ndarray:
+def _transform(node: dict[str, Any], where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A node's place `(3,)`, turn `(4,)` wxyz and scale `(3,)` against its parent."""
+    matrix = _vector(node, "matrix", 16, where)
+    if matrix is not None:
+        return _decomposed(matrix, where)
+    place, scale = (_vector(node, key, 3, where) for key in ("translation", "scale"))
+    turn = _vector(node, "rotation", 4, where)
+    turn = np.array([1.0, 0.0, 0.0, 0.0]) if turn is None else turn[[3, 0, 1, 2]]
+    norm = np.linalg.norm(turn)
+    if norm < 1e-3:
+        raise PoiseError("its rotation is a quaternion of no length", where)
+    return np.zeros(3) if place is None else place, turn / norm, np.ones(3) if scale is None else scale
+
+
+def _vector(node: dict[str, Any], key: str, size: int, where: str) -> np.ndarray | None:
+    value = node.get(key)
+    if value is None:
+        return None
     if not isinstance(value, list) or len(value) != size:
-        raise PoiseError(f"its {what} must have {size} numbers", where)
+        raise PoiseError(f"its {key} must have {size} numbers", where)
     if not all(type(x) in (int, float) and abs(x) <= MAX_VALUE for x in value):
-        raise PoiseError(f"its {what} holds something that is no usable number", where)
+        raise PoiseError(f"its {key} holds something that is no usable number", where)
     return np.array(value, dtype=np.float64)
 
 
@@ -156,15 +161,22 @@ def choose_joints(
         targeted: nodes with translation or rotation channels. moving: those whose channels vary.
     """
     skin = _skin_joints(tree, file, targeted)
-    wanted = set(skin) if skin else _biggest_tree(tree, targeted, notes)
+    wanted = set(skin) if skin else _biggest_tree(tree, targeted)
+    if not skin and wanted != targeted:
+        others = sorted(tree.names[n] for n in targeted - wanted)
+        notes.append(
+            f"{len(others)} animated nodes outside the figure were left out, such as '{others[0]}'"
+        )
     _check_count(len(wanted), file)
     for node in list(wanted):
         above = tree.line(node)[:-1]
         first = next((a for a in above if a in moving), None)
         if first is not None:
             wanted.add(first)
-    wanted = _one_tree(tree, wanted, notes)
-    lines = [tree.line(node) for node in wanted]
+    best = _biggest_tree(tree, wanted)
+    if best != wanted:
+        notes.append(f"{len(wanted - best)} joints that hang on no common node were left out")
+    lines = [tree.line(node) for node in best]
     depth = _shared_depth(lines)
     joints = {node for line in lines for node in line[depth - 1 :]}
     root = lines[0][depth - 1]
@@ -185,10 +197,11 @@ def _check_count(count: int, file: GltfFile) -> None:
 def _skin_joints(tree: Tree, file: GltfFile, targeted: set[int]) -> list[int]:
     """The joints of the most animated skin, then those of the skins that share joints with it."""
     skins: list[list[int]] = []
-    for i, skin in enumerate(file.doc.skins):
-        if not isinstance(skin.joints, list):
+    for i, skin in enumerate(file.doc["skins"]):
+        joints = skin.get("joints", [])
+        if not isinstance(joints, list):
             raise PoiseError(f"the joints of skin {i} are no list", file.path)
-        skins.append([index_of(j, tree.names, f"a joint of skin {i}", file) for j in skin.joints])
+        skins.append([index_of(j, tree.names, f"a joint of skin {i}", file) for j in joints])
     if not skins:
         return []
     out = max(skins, key=lambda joints: (len(targeted & set(joints)), len(joints)))
@@ -202,29 +215,12 @@ def _skin_joints(tree: Tree, file: GltfFile, targeted: set[int]) -> list[int]:
     return out
 
 
-def _biggest_tree(tree: Tree, targeted: set[int], notes: list[str]) -> set[int]:
-    """The targeted nodes under the scene root that has most of them (cameras have their own)."""
+def _biggest_tree(tree: Tree, nodes: set[int]) -> set[int]:
+    """Those of the nodes under the scene root that has most of them (cameras have their own)."""
     groups: dict[int, set[int]] = {}
-    for node in targeted:
+    for node in nodes:
         groups.setdefault(tree.tops[node], set()).add(node)
-    best = max(groups.values(), key=len)
-    others = sorted(tree.names[n] for n in targeted - best)
-    if others:
-        notes.append(
-            f"{len(others)} animated nodes outside the figure were left out, such as '{others[0]}'"
-        )
-    return best
-
-
-def _one_tree(tree: Tree, wanted: set[int], notes: list[str]) -> set[int]:
-    """The wanted nodes under the scene root that has most of them."""
-    groups: dict[int, set[int]] = {}
-    for node in wanted:
-        groups.setdefault(tree.tops[node], set()).add(node)
-    best = max(groups.values(), key=len)
-    if len(groups) > 1:
-        notes.append(f"{len(wanted) - len(best)} joints that hang on no common node were left out")
-    return best
+    return max(groups.values(), key=len)
 
 
 def _shared_depth(lines: Sequence[list[int]]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 
 from poise.motion.clip import Clip
 from poise.motion.io.figure import bone_figure
+from poise.motion.io.gltf.file import BIN_CHUNK, JSON_CHUNK, MAGIC
 from poise.motion.io.nodes import base_of, place_of_travel, tips_from_z_up
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
@@ -25,6 +27,7 @@ from poise.spatial import (
 )
 
 _FLOAT, _UBYTE, _USHORT = 5126, 5121, 5123
+_DTYPES = {_FLOAT: "<f4", _UBYTE: "<u1", _USHORT: "<u2"}
 _ARRAY = 34962
 _COLOUR = [0.85, 0.45, 0.15, 1.0]
 _IDENTITY = [1.0, 0.0, 0.0, 0.0]
@@ -63,14 +66,15 @@ def write_gltf(clip: Clip, path: str | Path) -> None:
     """
     path = Path(path)
     plan = _plan(clip)
-    document = _document(clip, plan)
+    document, blob = _document(clip, plan)
+    buffer: dict[str, Any] = {"byteLength": len(blob)}
+    document["buffers"] = [buffer]
     if path.suffix.lower() == ".gltf":
-        blob = bytes(document.binary_blob())
         text = base64.b64encode(blob).decode("ascii")
-        document.buffers[0].uri = f"data:application/octet-stream;base64,{text}"
-        write_whole(path, document.gltf_to_json() + "\n")
+        buffer["uri"] = f"data:application/octet-stream;base64,{text}"
+        write_whole(path, json.dumps(document, indent=2) + "\n")
     else:
-        write_whole(path, b"".join(document.save_to_bytes()))
+        write_whole(path, _glb(document, blob))
 
 
 def _plan(clip: Clip) -> _Plan:
@@ -121,13 +125,12 @@ def _kept(clip: Clip) -> dict[str, Any]:
     return kept if fits else {}
 
 
-class _Buffer:
-    """Collects accessors in one binary buffer, each aligned to four bytes."""
+class _Document:
+    """A glTF document and its one buffer, in which accessors stand aligned to four bytes."""
 
     def __init__(self) -> None:
-        from pygltflib import GLTF2
-
-        self.doc = GLTF2()
+        self.doc: dict[str, Any] = {"asset": {"version": "2.0", "generator": "Poise"}, "scene": 0}
+        self.doc |= {"nodes": [], "accessors": [], "bufferViews": []}
         self.data = bytearray()
 
     def add(
@@ -139,84 +142,66 @@ class _Buffer:
         bounds: bool = False,
     ) -> int:
         """Appends an accessor and returns its index; `bounds` states the smallest and largest."""
-        from pygltflib import Accessor, BufferView
-
-        dtype = {_FLOAT: "<f4", _UBYTE: "<u1", _USHORT: "<u2"}[component]
-        array = np.ascontiguousarray(values, dtype=dtype)
-        if dtype == "<f4":
+        array = np.ascontiguousarray(values, dtype=_DTYPES[component])
+        if component == _FLOAT:
             # Without -0, so that files of the same motion are the same.
             array = array + np.float32(0)
-        self.data += b"\0" * (-len(self.data) % 4)
-        view = BufferView(buffer=0, byteOffset=len(self.data), byteLength=array.nbytes, target=target)
-        self.data += array.tobytes()
-        flat = array.reshape(len(array), -1)
-        accessor = Accessor(
-            bufferView=len(self.doc.bufferViews), componentType=component, count=len(array), type=kind
-        )
+        index = len(self.doc["accessors"])
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
+        self.doc["bufferViews"].append(view if target is None else {**view, "target": target})
+        accessor = {"bufferView": index, "componentType": component, "count": len(array), "type": kind}
         if bounds:
-            accessor.min = [float(x) for x in flat.min(0)]
-            accessor.max = [float(x) for x in flat.max(0)]
-        self.doc.bufferViews.append(view)
-        self.doc.accessors.append(accessor)
-        return len(self.doc.accessors) - 1
+            flat = array.reshape(len(array), -1)
+            accessor |= {"min": flat.min(0).tolist(), "max": flat.max(0).tolist()}
+        self.doc["accessors"].append(accessor)
+        self.data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+        return index
 
 
-def _document(clip: Clip, plan: _Plan) -> Any:
-    from pygltflib import Asset, Buffer, Scene
-
-    out = _Buffer()
-    first = len(plan.above)
-    _add_nodes(out.doc, clip, plan)
-    _add_figure(out, clip, plan, first)
-    _add_animation(out, clip, plan, first)
-    doc = out.doc
-    doc.asset = Asset(version="2.0", generator="Poise")
-    doc.scene = 0
-    doc.scenes = [Scene(name=clip.name, nodes=[0, len(doc.nodes) - 1])]
-    out.data += b"\0" * (-len(out.data) % 4)
-    doc.buffers = [Buffer(byteLength=len(out.data))]
-    doc.set_binary_blob(bytes(out.data))
-    return doc
+def _document(clip: Clip, plan: _Plan) -> tuple[dict[str, Any], bytes]:
+    """The document, but for its buffer's place, and the buffer."""
+    out = _Document()
+    _add_nodes(out.doc["nodes"], clip, plan)
+    _add_figure(out, clip, plan)
+    _add_animation(out, clip, plan)
+    out.doc["scenes"] = [{"name": clip.name, "nodes": [0, len(out.doc["nodes"]) - 1]}]
+    return out.doc, bytes(out.data)
 
 
-def _xyzw(q: np.ndarray) -> list[float]:
-    return [float(x) + 0.0 for x in (q[1], q[2], q[3], q[0])]
+def _glb(document: dict[str, Any], blob: bytes) -> bytes:
+    """The GLB container: a header, the JSON chunk padded with spaces, the binary chunk."""
+    text = json.dumps(document, separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", MAGIC, 2, 28 + len(text) + len(blob))
+    chunks = [struct.pack("<II", len(d), k) + d for d, k in ((text, JSON_CHUNK), (blob, BIN_CHUNK))]
+    return head + b"".join(chunks)
 
 
 def _floats(v: np.ndarray) -> list[float]:
     return [float(x) + 0.0 for x in v]
 
 
-def _add_nodes(doc: Any, clip: Clip, plan: _Plan) -> None:
+def _add_nodes(nodes: list[dict[str, Any]], clip: Clip, plan: _Plan) -> None:
     """The static nodes above the root, each with the next as its only child, then the joints."""
-    from pygltflib import Node
-
     skeleton, first = clip.skeleton, len(plan.above)
     for i, (name, place, turn, scale) in enumerate(plan.above):
-        doc.nodes.append(
-            Node(
-                name=name,
-                translation=_floats(place),
-                rotation=_xyzw(turn),
-                scale=_floats(scale),
-                children=[i + 1],
-            )
-        )
+        nodes.append({**_node(name, place, turn), "scale": _floats(scale), "children": [i + 1]})
     tips: dict[int, list[list[float]]] = {}
     for j, tip in tips_from_z_up(skeleton, plan.axis, plan.unit_m):
         tips.setdefault(j, []).append(_floats(tip))
     for j, name in enumerate(skeleton.names):
-        node = Node(
-            name=name,
-            translation=_floats(plan.place[j]),
-            rotation=_xyzw(plan.rest[j]),
-            children=[first + c for c in skeleton.children(j)],
-        )
+        node = _node(name, plan.place[j], plan.rest[j])
+        if below := [first + c for c in skeleton.children(j)]:
+            node["children"] = below
         if plan.scale[j] != 1.0:
-            node.scale = [float(plan.scale[j])] * 3
+            node["scale"] = [float(plan.scale[j])] * 3
         if j in tips:
-            node.extras = {"poise_ends": tips[j]}
-        doc.nodes.append(node)
+            node["extras"] = {"poise_ends": tips[j]}
+        nodes.append(node)
+
+
+def _node(name: str, place: np.ndarray, turn: np.ndarray) -> dict[str, Any]:
+    return {"name": name, "translation": _floats(place), "rotation": _floats(turn[[1, 2, 3, 0]])}
 
 
 def _rest_matrices(clip: Clip, plan: _Plan) -> np.ndarray:
@@ -238,18 +223,17 @@ def _rest_matrices(clip: Clip, plan: _Plan) -> np.ndarray:
     return np.stack(out)
 
 
-def _add_figure(out: _Buffer, clip: Clip, plan: _Plan, first: int) -> None:
+def _add_figure(out: _Document, clip: Clip, plan: _Plan) -> None:
     """The skin, and a mesh whose vertices each follow one joint."""
-    from pygltflib import Attributes, Material, Mesh, Node, PbrMetallicRoughness, Primitive, Skin
-
+    first = len(plan.above)
     rest = _rest_matrices(clip, plan)
     inverse = np.linalg.inv(rest)
     inverse[:, 3] = (0.0, 0.0, 0.0, 1.0)
     joints = list(range(first, first + len(rest)))
-    skeleton, doc = clip.skeleton, out.doc
+    skeleton = clip.skeleton
     # Matrices are stored by columns.
     matrices = out.add(inverse.transpose(0, 2, 1).reshape(-1, 16), "MAT4")
-    doc.skins.append(Skin(name="Poise", joints=joints, skeleton=first, inverseBindMatrices=matrices))
+    skin = {"name": "Poise", "joints": joints, "skeleton": first, "inverseBindMatrices": matrices}
     tips = []
     for j, tip in tips_from_z_up(skeleton, plan.axis, plan.unit_m):
         # Tips are rigid parts of their joints and know no scale.
@@ -263,38 +247,39 @@ def _add_figure(out: _Buffer, clip: Clip, plan: _Plan, first: int) -> None:
     weights = np.zeros((len(owner), 4))
     weights[:, 0] = 1.0
     component = _UBYTE if len(rest) <= 256 else _USHORT
-    attributes = Attributes(
-        POSITION=out.add(points, "VEC3", target=_ARRAY, bounds=True),
-        NORMAL=out.add(normals, "VEC3", target=_ARRAY),
-        JOINTS_0=out.add(bound, "VEC4", component, _ARRAY),
-        WEIGHTS_0=out.add(weights, "VEC4", target=_ARRAY),
-    )
-    look = PbrMetallicRoughness(baseColorFactor=_COLOUR, metallicFactor=0.0, roughnessFactor=0.7)
-    doc.materials.append(Material(name="Poise", pbrMetallicRoughness=look))
-    doc.meshes.append(Mesh(name="Figure", primitives=[Primitive(attributes=attributes, material=0)]))
-    doc.nodes.append(Node(name="Figure", mesh=0, skin=0))
+    attributes = {
+        "POSITION": out.add(points, "VEC3", target=_ARRAY, bounds=True),
+        "NORMAL": out.add(normals, "VEC3", target=_ARRAY),
+        "JOINTS_0": out.add(bound, "VEC4", component, _ARRAY),
+        "WEIGHTS_0": out.add(weights, "VEC4", target=_ARRAY),
+    }
+    look = {"baseColorFactor": _COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    primitive = {"attributes": attributes, "material": 0}
+    out.doc["skins"] = [skin]
+    out.doc["materials"] = [{"name": "Poise", "pbrMetallicRoughness": look}]
+    out.doc["meshes"] = [{"name": "Figure", "primitives": [primitive]}]
+    out.doc["nodes"].append({"name": "Figure", "mesh": 0, "skin": 0})
 
 
-def _add_animation(out: _Buffer, clip: Clip, plan: _Plan, first: int) -> None:
+def _add_animation(out: _Document, clip: Clip, plan: _Plan) -> None:
     """One translation channel per joint that travels, one rotation channel per joint."""
-    from pygltflib import Animation, AnimationChannel, AnimationChannelTarget, AnimationSampler
-
     source = clip.skeleton.source
     step = 1.0 / clip.fps
     if source.frame_time and abs(source.frame_time * clip.fps - 1.0) < 1e-9:
         step = source.frame_time
     times = out.add(np.arange(clip.frames) * step, "SCALAR", bounds=True)
-    animation = Animation(name=plan.take)
-    animation.extras = {"poise": {"fps": clip.fps, "frame_time": step, "cyclic": clip.cyclic}}
+    channels: list[dict[str, Any]] = []
+    samplers: list[dict[str, Any]] = []
 
     def channel(joint: int, path: str, values: np.ndarray, kind: str) -> None:
-        sampler = AnimationSampler(input=times, output=out.add(values, kind), interpolation="LINEAR")
-        target = AnimationChannelTarget(node=first + joint, path=path)
-        animation.channels.append(AnimationChannel(sampler=len(animation.samplers), target=target))
-        animation.samplers.append(sampler)
+        target = {"node": len(plan.above) + joint, "path": path}
+        channels.append({"sampler": len(samplers), "target": target})
+        samplers.append({"input": times, "output": out.add(values, kind), "interpolation": "LINEAR"})
 
     for j, path in sorted(plan.paths.items()):
         channel(j, "translation", path, "VEC3")
     for j in range(len(clip.skeleton)):
         channel(j, "rotation", plan.turns[:, j][:, [1, 2, 3, 0]], "VEC4")
-    out.doc.animations.append(animation)
+    own = {"fps": clip.fps, "frame_time": step, "cyclic": clip.cyclic}
+    animation = {"name": plan.take, "channels": channels, "samplers": samplers}
+    out.doc["animations"] = [{**animation, "extras": {"poise": own}}]

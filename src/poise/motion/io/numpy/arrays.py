@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import math
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,12 @@ MAX_ARRAY_BYTES = 512 << 20
 MAX_KEYS = 4096
 """NumPy archives with more arrays are refused."""
 NPY_MAGIC = b"\x93NUMPY"
+ASK = "Read it with --allow-pickle (in Python: allow_pickle); no code in it will run"
+"""The hint of every refusal of a pickled file."""
 ZIP_MAGIC = b"PK\x03\x04"
+Unpickle = Callable[[bytes, str | Path], Any]
+"""Makes the value in a pickle's bytes; the second argument is the place that errors name."""
+
 _HEADER_BYTES = 1 << 16
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError)
 
@@ -52,7 +58,7 @@ def npy_header(file: IO[bytes], where: str | Path) -> Header:
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(file, _HEADER_BYTES)
     except _BAD_HEADER as error:
-        raise PoiseError(f"its NumPy header is damaged ({shown(str(error))})", where, CUT_OFF) from None
+        raise PoiseError(f"its NumPy header is damaged ({shown(error)})", where, CUT_OFF) from None
     if min(shape, default=0) < 0:
         raise PoiseError(f"its NumPy header states the shape {shape}", where, CUT_OFF)
     return Header(shape, dtype, fortran)
@@ -68,7 +74,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
                 raise PoiseError(f"the archive holds more than {MAX_KEYS} arrays", path)
             yield archive
     except _DAMAGE as error:
-        raise PoiseError(f"the NumPy archive is damaged ({shown(str(error))})", path, CUT_OFF) from None
+        raise PoiseError(f"the NumPy archive is damaged ({shown(error)})", path, CUT_OFF) from None
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror or error})", path) from None
 
@@ -76,15 +82,15 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 class Archive(Mapping[str, Any]):
     """The arrays of a `.npz`; each is read when it is asked for, within bounds.
 
-    Only the directory is read at first. Pickled members are read by `loads_restricted`, and only
-    with `allow_pickle`.
+    Only the directory is read at first. Pickled members are refused unless `unpickle` is given, such as
+    `loads_restricted`.
 
     Raises:
         PoiseError: naming the file and the array, for whatever is damaged, too large or pickled.
     """
 
-    def __init__(self, path: str | Path, allow_pickle: bool = False):
-        self.path, self._allow_pickle = Path(path), allow_pickle
+    def __init__(self, path: str | Path, unpickle: Unpickle | None = None):
+        self.path, self._unpickle = Path(path), unpickle
         with _opened(self.path) as archive:
             names = [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
         self._keys = tuple(dict.fromkeys(names))
@@ -107,24 +113,22 @@ class Archive(Mapping[str, Any]):
         if key not in self._keys:
             raise KeyError(key)
         with _opened(self.path) as archive, archive.open(f"{key}.npy") as file:
-            return read_npy(file, self._place(key), self._allow_pickle)
+            return read_npy(file, self._place(key), self._unpickle)
 
     def _place(self, key: str) -> str:
         return f"{self.path}, array {shown(key)}"
 
 
-def read_npy(file: IO[bytes], where: str | Path, allow_pickle: bool = False) -> Any:
-    """The array in a `.npy` stream; a pickled one as plain data, and only with `allow_pickle`."""
-    from poise.motion.io.numpy.pickles import ASK, loads_restricted
-
+def read_npy(file: IO[bytes], where: str | Path, unpickle: Unpickle | None = None) -> Any:
+    """The array in a `.npy` stream; a pickled one is what `unpickle` makes of it, if it is given."""
     header = npy_header(file, where)
     if header.dtype.hasobject:
-        if not allow_pickle:
+        if unpickle is None:
             raise PoiseError("it holds pickled objects", where, ASK)
         data = file.read(MAX_ARRAY_BYTES + 1)
         if len(data) > MAX_ARRAY_BYTES:
             raise PoiseError("it holds more pickled data than the limit", where)
-        return loads_restricted(data, where)
+        return unpickle(data, where)
     size = math.prod(header.shape) * header.dtype.itemsize
     if size > MAX_ARRAY_BYTES:
         raise PoiseError(
@@ -142,9 +146,18 @@ def read_npy(file: IO[bytes], where: str | Path, allow_pickle: bool = False) -> 
         )
     try:
         flat = np.frombuffer(data, header.dtype) if size else np.zeros(0, header.dtype)
+        if no_text(flat):
+            raise PoiseError("it holds characters that do not exist", where, CUT_OFF)
         return flat.reshape(header.shape, order="F" if header.fortran else "C")
     except ValueError:
         raise PoiseError(f"its shape {header.shape} makes no array", where, CUT_OFF) from None
+
+
+def no_text(flat: np.ndarray) -> bool:
+    """Whether an array `(N,)` of text holds characters above the last of Unicode, which break Python."""
+    if flat.dtype.kind != "U" or not flat.nbytes:
+        return False
+    return bool(flat.view(np.dtype("u4").newbyteorder(flat.dtype.byteorder)).max() > sys.maxunicode)  # type: ignore[arg-type]
 
 
 def first_member(head: bytes) -> bytes:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from poise.motion.io.numpy.arrays import no_text
+
 _KINDS = "biufcSU?"
 
 
@@ -56,7 +58,10 @@ def array_of(shape: Any, dtype: Dtype, fortran: Any, data: Any) -> Any:
     if len(raw) != count * kind.itemsize:
         raise ValueError(f"an array of shape {shape} has {len(raw)} bytes")
     order = "F" if fortran else "C"
-    return np.frombuffer(raw, kind).reshape(shape, order=order)
+    flat = np.frombuffer(raw, kind)
+    if no_text(flat):
+        raise ValueError("characters that do not exist")
+    return flat.reshape(shape, order=order)
 
 
 def _numeric(dtype: Dtype) -> np.dtype[Any]:
@@ -92,10 +97,15 @@ def _made_nothing() -> bytes:
     return b""
 
 
-def _made_dict(*args: Any) -> dict[Any, Any]:
-    pairs = args[0] if args else ()
-    # Keys of other kinds could take forever to hash.
-    return {k: v for k, v in pairs if isinstance(k, str | int | bytes)}
+def _made_dict(pairs: Any = ()) -> dict[Any, Any]:
+    return plain_dict([pair[0] for pair in pairs], [pair[1] for pair in pairs])
+
+
+def plain_dict(keys: list[Any], values: list[Any]) -> dict[Any, Any]:
+    """A dict whose keys are text, bytes or whole numbers: others could take for ever to hash."""
+    if not all(isinstance(key, str | int | bytes) for key in keys):
+        raise ValueError("a key is no text")
+    return dict(zip(keys, values, strict=True))
 
 
 CALLS: dict[str, Callable[..., Any]] = {

@@ -12,7 +12,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require
-from poise.motion.io.raw import Options, RawMotion, assemble
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_JOINTS, listed
 from poise.motion.skeleton import Channel
 from poise.spatial import quat_conj, quat_mul
@@ -26,7 +26,7 @@ def is_poselib(data: Mapping[str, Any]) -> bool:
     return "skeleton_tree" in data and "rotation" in data
 
 
-def read_poselib(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_poselib(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """A clip from a poselib dict: `rotation (T, J, 4)` xyzw, local or global as `is_local` says,
     `root_translation (T, 3)`, `fps`, `skeleton_tree`; metres, Z up.
 
@@ -60,8 +60,6 @@ def read_poselib(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
     refuse_bad(root_pos, "the root position", path)
     rot = _local(xyzw, parents, bool(data["is_local"]), names, path)
     fps = one_number(data, "fps", path)
-    if not 0 < fps <= 1e5:
-        raise PoiseError(f"fps is {fps:g}, which is no frame rate", path, "State it with --fps F")
     props = [n for n in names if n.lower() in _PROPS]
     note = f"Held things are kept as joints: {listed(props)}"
     raw = RawMotion(

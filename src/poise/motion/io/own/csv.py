@@ -20,7 +20,7 @@ from poise.motion.io.own.record import (
     source_from_json,
     source_to_json,
 )
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import (
     CUT_OFF,
     append_numbers,
@@ -31,6 +31,7 @@ from poise.motion.io.text import (
     shown,
     write_whole,
 )
+from poise.motion.limits import check_rate
 from poise.motion.skeleton import Skeleton
 
 VERSION = 1
@@ -85,7 +86,7 @@ def looks_like_csv(head: bytes) -> bool:
     return head.startswith(MARK.encode())
 
 
-def read_csv(path: Path, options: Options) -> Clip:
+def read_csv(path: Path, options: ReadOptions) -> Clip:
     """The clip in a CSV of Poise, exactly as it was written.
 
     Raises:
@@ -97,8 +98,7 @@ def read_csv(path: Path, options: Options) -> Clip:
     skeleton = _skeleton(header, path)
     order = _order(lines, first, skeleton, path)
     rate = number(header["fps"], _place(path, "fps"))
-    if not rate > 0:
-        raise PoiseError(f"the frame rate must be above 0, got {rate:g}", _place(path, "fps"))
+    check_rate(rate, path)
     table = _table(lines, first, order, path)
     _check_times(table[:, 0], rate, path)
     root_pos = table[:, 1:4]
@@ -151,9 +151,7 @@ def _skeleton(header: dict[str, str], path: Path) -> Skeleton:
         offsets = np.array(record["offsets"], dtype=np.float64).reshape(-1, 3)
         ends = np.array(record["ends"], dtype=np.float64).reshape(-1, 4)
     except (TypeError, ValueError, OverflowError) as error:
-        raise PoiseError(
-            f"the skeleton record is damaged ({shown(str(error))})", path, CUT_OFF
-        ) from None
+        raise PoiseError(f"the skeleton record is damaged ({shown(error)})", path, CUT_OFF) from None
     source = source_from_json(header["source"], path)
     if not np.isfinite(ends).all():
         raise PoiseError("the skeleton record holds an end that is not finite", path)

@@ -18,7 +18,7 @@ from poise.motion.io.own.record import (
     source_from_json,
     source_to_json,
 )
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import write_whole
 
 VERSION = 1
@@ -60,7 +60,7 @@ def write_poise_npz(clip: Clip, path: str | Path) -> None:
     write_whole(Path(path), npz_bytes(arrays))
 
 
-def read_poise_npz(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_poise_npz(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """The clip in Poise's own npz, exactly as it was written.
 
     Raises:

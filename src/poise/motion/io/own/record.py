@@ -12,7 +12,7 @@ import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import CUT_OFF, MAX_JOINTS, MAX_VALUE, shown
 from poise.motion.skeleton import Skeleton, Source
 
@@ -32,24 +32,24 @@ def source_from_json(text: str, path: Path) -> Source:
     Fields that this version does not know are left out, fields that are not there get defaults.
     """
     try:
-        return _fit(loads(text, path, "source"), Source)
+        return fitted(loads(text, path, "source"), Source)
     except (KeyError, TypeError, ValueError) as error:
         raise PoiseError(
-            f"the record of the clip's source is damaged ({shown(str(error))})", path, CUT_OFF
+            f"the record of the clip's source is damaged ({shown(error)})", path, CUT_OFF
         ) from None
 
 
-def _fit(value: Any, kind: Any) -> Any:
-    """JSON data as a value of the annotated type `kind`; anything else is a ValueError."""
+def fitted(value: Any, kind: Any) -> Any:
+    """JSON data as a value of the annotated type `kind`, where tuples are lists; else a ValueError."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is UnionType:
-        return None if value is None and NoneType in inner else _fit(value, inner[0])
-    if origin is tuple and isinstance(value, list):
+        return None if value is None and NoneType in inner else fitted(value, inner[0])
+    if origin is tuple and isinstance(value, list | tuple):
         kinds = [inner[0]] * len(value) if inner[-1] is ... else inner
-        return tuple(_fit(v, k) for v, k in zip(value, kinds, strict=True))
+        return tuple(fitted(v, k) for v, k in zip(value, kinds, strict=True))
     if is_dataclass(kind) and isinstance(value, dict):
         fields = get_type_hints(kind)
-        return kind(**{k: _fit(value[k], fields[k]) for k in fields if k in value})  # type: ignore[operator]
+        return kind(**{k: fitted(value[k], fields[k]) for k in fields if k in value})  # type: ignore[operator]
     if kind is float and type(value) in (int, float):
         return float(value)
     if type(value) is not kind:
@@ -66,7 +66,7 @@ def loads(text: str, path: Path, what: str) -> dict[str, Any]:
         if not isinstance(record, dict):
             raise ValueError("it is no JSON object")
     except (ValueError, RecursionError) as error:
-        raise PoiseError(f"the {what} record is damaged ({shown(str(error))})", path, CUT_OFF) from None
+        raise PoiseError(f"the {what} record is damaged ({shown(error)})", path, CUT_OFF) from None
     return record
 
 
@@ -125,7 +125,7 @@ def make_clip(
         raise PoiseError(error.what, path, error.hint) from None
 
 
-def refuse_overrides(options: Options, path: Path) -> None:
+def refuse_overrides(options: ReadOptions, path: Path) -> None:
     """Unit and vertical are stated in Poise's own files, so nothing may override them."""
     for flag, value in (("--unit", options.unit_m), ("--up", options.up_axis)):
         if value is not None:

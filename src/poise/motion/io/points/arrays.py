@@ -12,8 +12,9 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
 from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import MAX_JOINTS, shown
+from poise.motion.limits import check_rate
 
 HUMANML3D = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
@@ -29,12 +30,12 @@ def is_points(data: Mapping[str, Any]) -> bool:
     return "positions" in data and "names" in data and not {"rot", "rotations", "quats"} & set(data)
 
 
-def read_points_arrays(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_points_arrays(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """Keypoint arrays as the clip of a skeleton that is fitted to them."""
     return points_clip(array_points(data, path, options), options)
 
 
-def array_points(data: Mapping[str, Any], path: Path, options: Options | None = None) -> RawPoints:
+def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions | None = None) -> RawPoints:
     """`positions (T, K, 3)` (NaN where missing), `names (K)`, `fps`; optional `confidence (T, K)`,
     `unit_m` and `up_axis`.
 
@@ -56,8 +57,7 @@ def array_points(data: Mapping[str, Any], path: Path, options: Options | None = 
         if "fps" not in data:
             raise PoiseError("the arrays state no frame rate", path, "Add fps, or give --fps F")
         fps = one_number(data, "fps", path)
-        if not fps > 0:
-            raise PoiseError(f"fps must be above 0, got {fps:g}", path)
+        check_rate(fps, path)
     unit = one_number(data, "unit_m", path) if "unit_m" in data else None
     up = text_of(data["up_axis"]).upper() if "up_axis" in data else None
     if unit is not None and not unit > 0:
@@ -73,7 +73,7 @@ def is_mdm(data: Mapping[str, Any]) -> bool:
     return "motion" in data and "lengths" in data
 
 
-def read_mdm(data: Mapping[str, Any], path: Path, options: Options) -> Clip:
+def read_mdm(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     """One motion in the results of a motion diffusion model: the first, or number `options.take`."""
     take = options.take or "0"
     if not take.isdecimal():

@@ -14,7 +14,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.points.raw import RawPoints, points_clip
 from poise.motion.io.points.trc import UNITS_M
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import CUT_OFF, check_file, listed, shown
 
 _KEY = 0x50
@@ -52,7 +52,7 @@ def looks_like_c3d(head: bytes) -> bool:
     return 0 < points < 2048
 
 
-def read_c3d(path: Path, options: Options) -> Clip:
+def read_c3d(path: Path, options: ReadOptions) -> Clip:
     """A C3D file's labelled markers as the clip of a skeleton that is fitted to them."""
     return points_clip(c3d_points(path), options)
 
@@ -130,7 +130,7 @@ def _read_apart(path: Path, size: int) -> dict[str, np.ndarray]:
     Damaged files make the C++ library loop without end or take any memory, so it works under a limit of
     both and can be stopped.
     """
-    seconds = 60 + size / 1e6
+    seconds = 10 + size / 5e5
     command = [sys.executable, "-c", _READER, str(path.resolve()), str(int(4e9 + 40 * size))]
     try:
         done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)

@@ -24,7 +24,7 @@ from poise.motion.clip import Clip
 from poise.motion.io.points.cells import row_numbers
 from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
 from poise.motion.io.points.trc import UNITS_M
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import CUT_OFF, at_line, decode, listed, number, read_bytes, shown
 
 _COLUMN = re.compile(r"^(.+?)[_. :]?(?:pos[_.]?)?\(?([xyz])\)?$", re.IGNORECASE)
@@ -55,12 +55,12 @@ def looks_like_points_csv(head: bytes) -> bool:
     return sum((name, "y") in axes for name, axis in axes if axis == "x") >= 4
 
 
-def read_points_csv(path: Path, options: Options) -> Clip:
+def read_points_csv(path: Path, options: ReadOptions) -> Clip:
     """A table of keypoints as the clip of a skeleton that is fitted to them."""
     return points_clip(csv_points(path, options), options)
 
 
-def csv_points(path: Path, options: Options | None = None) -> RawPoints:
+def csv_points(path: Path, options: ReadOptions | None = None) -> RawPoints:
     """The points of a table in its own unit and axes.
 
     Raises:
@@ -70,7 +70,7 @@ def csv_points(path: Path, options: Options | None = None) -> RawPoints:
     stated: dict[str, str] = {}
     at = 0
     while at < len(lines) and (not lines[at].strip() or lines[at].lstrip()[0] == "#"):
-        stated.update(re.findall(r"(\w+)\s*[=:]\s*([^\s,;]+)", lines[at].lower()))
+        stated.update(re.findall(r"\b(\w{1,30})\s*[=:]\s*([^\s,;]+)", lines[at].lower()))
         at += 1
     if at == len(lines):
         raise PoiseError("the table has no header", path, CUT_OFF)
@@ -157,16 +157,13 @@ def _rows(lines: list[str], first: int, layout: _Layout, path: Path) -> np.ndarr
 
 
 def _rate(
-    table: np.ndarray, layout: _Layout, stated: dict[str, str], options: Options | None, path: Path
+    table: np.ndarray, layout: _Layout, stated: dict[str, str], options: ReadOptions | None, path: Path
 ) -> float:
     """Frames per second: stated by the caller, by the comment, or measured on the times."""
     if options is not None and options.fps is not None:
         return options.fps
     if "fps" in stated:
-        rate = number(stated["fps"], path.name)
-        if not rate > 0:
-            raise PoiseError(f"fps must be above 0, got {rate:g}", path)
-        return rate
+        return number(stated["fps"], path.name)
     if layout.time is None:
         raise PoiseError(
             "the table has neither times nor a frame rate", path, "State it with --fps FRAMES_PER_SECOND"

@@ -11,9 +11,10 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
-from poise.motion.io.raw import Options, vectors_to_z_up
-from poise.motion.io.text import MAX_JOINTS, MAX_VALUE
+from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
+from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
+from poise.motion.limits import check_poses, check_rate
 from poise.motion.points import FitConfig, fit_clip
 from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
@@ -48,7 +49,7 @@ _TREE |= {f"{s} {part}": above for s in SIDES for part, above in (("hip", "hips"
 _TREE |= {f"{s} knee": f"{s} hip" for s in SIDES} | {f"{s} ankle": f"{s} knee" for s in SIDES}
 
 
-def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
+def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     """Keypoints in metres, Z up, with every guess in the source's notes.
 
     Unit and vertical are guessed as for skeletons (`guess.py`), from the places of a body that the
@@ -58,6 +59,7 @@ def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
         PoiseError: too few frames, flat (2D) points, a person of no human size.
     """
     _check(raw)
+    check_rate(float(options.fps or raw.fps), raw.path)
     probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, _of(raw))
     bones = _body(probe)
     notes = list(raw.notes)
@@ -69,6 +71,8 @@ def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
         # Half a turn about X keeps left and right, which a mirror would not.
         positions = positions * (1.0, -1.0, -1.0)
         notes.append(f"The heads lie below the feet along {axis}: the points were turned over")
+    stated = f"The file has {raw.fps:.6g} frames per second"
+    rate = next((n for n in raw.notes if "frame rate" in n), stated)
     return Keypoints(
         raw.names,
         positions,
@@ -77,12 +81,12 @@ def assemble_points(raw: RawPoints, options: Options) -> Keypoints:
         raw.confidence,
         Source(
             format=raw.format, path=str(raw.path), unit_m=scale, up_axis=axis, notes=tuple(notes),
-            frame_time=1.0 / raw.fps,
+            frame_time=1.0 / raw.fps, evidence=evidence(options, up, unit, rate),
         ),
     )  # fmt: skip
 
 
-def points_clip(raw: RawPoints, options: Options) -> Clip:
+def points_clip(raw: RawPoints, options: ReadOptions) -> Clip:
     """The clip of a skeleton that follows the file's keypoints, see `fit_clip`."""
     return fit_clip(assemble_points(raw, options), FitConfig(smooth_hz=options.smooth_hz))
 
@@ -97,10 +101,16 @@ def _check(raw: RawPoints) -> None:
         raise PoiseError(
             f"it has {len(raw.names)} keypoints, more than the {MAX_JOINTS} allowed", raw.path
         )
+    longest = max(raw.names, key=len, default="")
+    if len(longest) > MAX_NAME:
+        raise PoiseError(
+            f"the keypoint {shown(longest)} has a name of {len(longest)} characters", raw.path
+        )
     if frames < 2:
         raise PoiseError(
             f"it has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2", raw.path
         )
+    check_poses(frames, len(raw.names), raw.path)
     known = raw.positions[~np.isnan(raw.positions).any(-1)]
     if not len(known):
         raise PoiseError("every keypoint is missing in every frame", raw.path)
@@ -146,7 +156,7 @@ def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
     return out
 
 
-def _unit(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw: RawPoints) -> Guess:
+def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
     names, parents, pos = bones
     height, how = body_height(names, parents, _offsets(parents, pos), pos)
     if not height > 0:
@@ -159,7 +169,7 @@ def _unit(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw:
     return guess_unit(height, how, None, raw.path)
 
 
-def _up(bones: tuple[list[str], list[int], np.ndarray], options: Options, raw: RawPoints) -> Guess:
+def _up(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
     names, _, pos = bones
     if options.up_axis is not None:
         return Guess(options.up_axis.upper())

@@ -8,7 +8,7 @@ from typing import NoReturn
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.points.raw import FLAT_HINT
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 
 
 def looks_like_openpose(head: bytes) -> bool:
@@ -16,7 +16,7 @@ def looks_like_openpose(head: bytes) -> bool:
     return head[:1] == b"{" and (b"pose_keypoints_2d" in head or b'"people"' in head[:200])
 
 
-def refuse_openpose(path: Path, options: Options) -> Clip:
+def refuse_openpose(path: Path, options: ReadOptions) -> Clip:
     """OpenPose's JSON holds the image coordinates of one frame of one camera."""
     raise PoiseError("it holds the 2D keypoints of one camera's image (OpenPose)", path, FLAT_HINT)
 

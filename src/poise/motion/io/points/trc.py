@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.points.cells import row_numbers
 from poise.motion.io.points.raw import RawPoints, points_clip
-from poise.motion.io.raw import Options
+from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import CUT_OFF, at_line, decode, number, read_bytes, shown
 
 UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -34,7 +35,7 @@ def looks_like_trc(head: bytes) -> bool:
     return head[:12].lower() == b"pathfiletype" or b"\ndatarate\t" in head[:2000].lower()
 
 
-def read_trc(path: Path, options: Options) -> Clip:
+def read_trc(path: Path, options: ReadOptions) -> Clip:
     """A TRC file as the clip of a skeleton that is fitted to its points.
 
     Rate and unit come from the header; the vertical is guessed. Blank cells are missing points.
@@ -88,7 +89,7 @@ def _header(lines: list[str], path: Path) -> _Header:
             "the labels of the points were expected: Frame#, Time, then one per point",
             at_line(path, _LABEL_LINE + 1),
         )
-    twice = next((n for i, n in enumerate(labels) if n in labels[:i]), None)
+    twice = next((name for name, count in Counter(labels).items() if count > 1), None)
     if twice is not None:
         raise PoiseError(f"keypoint {shown(twice)} appears twice", at_line(path, _LABEL_LINE + 1))
     stated = fields.get("nummarkers", "")

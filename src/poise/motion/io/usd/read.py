@@ -13,14 +13,13 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.nodes import base_of, checked_unit, rigid_bones, unique_names
-from poise.motion.io.raw import Options, RawMotion, assemble
+from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, check_file, listed, shown
+from poise.motion.limits import check_poses
 from poise.spatial import matrix_to_quat
 
-MAX_FRAMES = 2_000_000
-"""Motions that would need more frames are refused."""
-
 _EVEN_TIME = 0.01
+_DAMAGED = "It seems cut off or is no USD file"
 _SHEAR = 1e-3
 
 
@@ -37,7 +36,7 @@ def pxr_package() -> Any:
         ) from None
 
 
-def read_usd(path: Path, options: Options) -> Clip:
+def read_usd(path: Path, options: ReadOptions) -> Clip:
     """The first animated UsdSkel skeleton of a .usda, .usd or .usdc file.
 
     Unit and vertical are the stage's. The file must stand alone: layers, references and payloads
@@ -48,13 +47,23 @@ def read_usd(path: Path, options: Options) -> Clip:
     """
     pxr = pxr_package()
     check_file(path)
+    notes: list[str] = []
     try:
-        # Anonymous, so that a file that has changed is read anew.
-        layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path.resolve()))
-    except pxr.Tf.ErrorException:
-        layer = None
+        stage = _stage(pxr, path)
+        rig, query = _animated_skeleton(pxr, stage, path, notes)
+        raw = _raw_motion(pxr, stage, rig, query, path, options, notes)
+    except (pxr.Tf.ErrorException, UnicodeDecodeError):
+        raise PoiseError(
+            "USD cannot read the file", path, "It seems cut off or is no USD file"
+        ) from None
+    return assemble(raw, options)
+
+
+def _stage(pxr: Any, path: Path) -> Any:
+    # Anonymous, so that a file that has changed is read anew.
+    layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path.resolve()))
     if layer is None:
-        raise PoiseError("USD cannot read the file", path, "It seems cut off or is no USD file")
+        raise PoiseError("USD cannot read the file", path, _DAMAGED)
     others = sorted(set(layer.GetCompositionAssetDependencies()))
     if others:
         raise PoiseError(
@@ -62,10 +71,7 @@ def read_usd(path: Path, options: Options) -> Clip:
             path,
             "Flatten it into one file first: usdcat --flatten IN -o OUT",
         )
-    stage = pxr.Usd.Stage.Open(layer)
-    notes: list[str] = []
-    rig, query = _animated_skeleton(pxr, stage, path, notes)
-    return assemble(_raw_motion(pxr, stage, rig, query, path, options, notes), options)
+    return pxr.Usd.Stage.Open(layer)
 
 
 def _animated_skeleton(pxr: Any, stage: Any, path: Path, notes: list[str]) -> tuple[Any, Any]:
@@ -90,7 +96,7 @@ def _animated_skeleton(pxr: Any, stage: Any, path: Path, notes: list[str]) -> tu
 
 
 def _raw_motion(
-    pxr: Any, stage: Any, rig: Any, query: Any, path: Path, options: Options, notes: list[str]
+    pxr: Any, stage: Any, rig: Any, query: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> RawMotion:
     order = [str(j) for j in query.GetJointOrder()]
     parents = [int(p) for p in query.GetTopology().GetParentIndices()]
@@ -101,7 +107,7 @@ def _raw_motion(
     stated = [str(n) for n in rig.GetJointNamesAttr().Get() or []]
     given = stated if len(stated) == len(order) else [o.rsplit("/", 1)[-1] for o in order]
     names = unique_names(given, notes)
-    codes, fps = _codes(stage, query, options, path, notes)
+    codes, fps = _codes(stage, query, len(order), options, path, notes)
     local = np.stack([np.array(query.ComputeJointLocalTransforms(c)) for c in codes])
     above = np.array(pxr.UsdGeom.Xformable(rig).ComputeLocalToWorldTransform(codes[0]))
     top = [x[0] for x in _parts(above[None], f"{path}, the skeleton's own transform", codes)]
@@ -137,7 +143,7 @@ def _raw_motion(
 
 
 def _codes(
-    stage: Any, query: Any, options: Options, path: Path, notes: list[str]
+    stage: Any, query: Any, joints: int, options: ReadOptions, path: Path, notes: list[str]
 ) -> tuple[np.ndarray, float]:
     """The time codes `(T,)` at which the pose is read, and frames per second.
 
@@ -157,10 +163,10 @@ def _codes(
             f"The keys are not evenly spaced; they were read at {per_second / step:.6g} per second"
         )
     else:
+        check_poses(len(samples), joints, path)
         return samples, per_second / step
     count = int(np.floor((samples[-1] - samples[0]) / step + 1e-6)) + 1
-    if count > MAX_FRAMES:
-        raise PoiseError(f"the motion would need {count} frames, too many to read", path)
+    check_poses(count, joints, path)
     return samples[0] + step * np.arange(count), per_second / step
 
 

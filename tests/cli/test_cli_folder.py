@@ -1,0 +1,77 @@
+"""A folder as input: every file on its own, a table, and an exit code that says the worst."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_clips import deepmimic, put
+
+from poise.cli.answer import INTERRUPTED, LOST, Answer
+from poise.cli.folder import each
+from poise.cli.main import main
+from poise.motion import read_clip, trim, write_clip
+from toy_policy import WALK, toy_run
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two motions, one of them in a folder below, and a BVH file that is none."""
+    root = tmp_path / "clips"
+    (root / "deep").mkdir(parents=True)
+    write_clip(trim(read_clip(WALK), 0, 30), root / "walk.bvh")
+    put(root / "deep", "stand.txt", deepmimic())
+    put(root, "notes.md", "no motion")
+    put(root, "broken.bvh", "HIERARCHY\n")
+    return root
+
+
+def states(found: dict) -> dict[str, int]:
+    return {Path(f["inputs"][0]).stem: f["exit_code"] for f in found["result"]["files"]}
+
+
+def test_info_convert_and_doctor(folder: Path, tmp_path: Path, answered, capsys) -> None:
+    for argv in (("info", folder), ("doctor", folder)):
+        found = answered(*argv, code=2)
+        assert states(found) == {"walk": 0, "stand": 0, "broken": 2} and found["inputs"] == [str(folder)]
+    out = tmp_path / "out"
+    found = answered("convert", folder, "-o", out, "--to", "glb", code=2)
+    assert states(found) == {"walk": 0, "stand": 0, "broken": 2}
+    assert {p.name for p in out.iterdir()} == {"walk.glb", "deep-stand.glb"}
+    assert main(["convert", str(folder), str(tmp_path / "two"), "--to", "fbx"]) == 2
+    (folder / "broken.bvh").unlink()
+    assert main(["doctor", str(folder), "--fix", "-o", str(tmp_path / "mended")]) == 0
+    capsys.readouterr()
+    assert main(["convert", str(folder), str(out), "--to", "glb"]) == 2
+    said = capsys.readouterr()
+    assert "refused" in said.out and "--force" in said.out and "2 of 2  walk" in said.err
+
+
+def test_track_says_which_were_lost(folder: Path, tmp_path: Path, answered, capsys) -> None:
+    policy, out = toy_run(tmp_path / "run"), tmp_path / "out"
+    found = answered("track", folder, "--policy", policy, "-o", out, code=2)
+    assert states(found) == {"walk": LOST, "stand": 0, "broken": 2}
+    assert (out / "walk/score.json").exists() and (out / "deep-stand/report.html").exists()
+    assert not (out / "broken").exists()
+    (folder / "broken.bvh").unlink()
+    (folder / "deep/stand.txt").unlink()
+    capsys.readouterr()
+    assert main(["track", str(folder), "--policy", str(policy), "-o", str(out), "--force"]) == LOST
+    said = capsys.readouterr().out
+    assert "error mm" in said and "lost" in said and "walk" in said
+
+
+def test_ctrl_c_ends_the_folder(folder: Path) -> None:
+    def stopped(path: Path, name: str) -> Answer:
+        if name == "deep-stand":
+            raise KeyboardInterrupt
+        return Answer(outcome="done")
+
+    answer = each("info", (folder,), None, stopped)
+    assert answer.exit_code == INTERRUPTED and len(answer.result["files"]) == 1
+
+
+def test_what_takes_single_files_says_so(folder: Path, tmp_path: Path, refused) -> None:
+    (tmp_path / "empty").mkdir()
+    refused("imitate", folder, "-o", tmp_path / "out", words=("folder", "poise fleet"))
+    refused("info", tmp_path / "empty", words=("no motion file",))

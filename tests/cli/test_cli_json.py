@@ -1,0 +1,112 @@
+"""`--json` of every verb: one document of one schema, alone on stdout."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import poise
+from conftest import MINIATURE
+from poise.cli.answer import Answer, document, plain
+from poise.cli.main import VERBS, main
+from poise.errors import PoiseError
+from poise.motion import read_clip, trim, write_clip
+from toy_policy import WALK, toy_run
+
+KEYS = ("poise", "verb", "ok", "exit_code", "inputs", "outputs", "notes", "result", "error")
+
+
+def check(found: dict[str, Any]) -> None:
+    """The schema of docs/json.md."""
+    assert tuple(found) == KEYS and found["poise"] == poise.__version__ and found["verb"] in VERBS
+    assert isinstance(found["exit_code"], int) and found["ok"] == (found["exit_code"] == 0)
+    for path in (*found["inputs"], *found["outputs"].values()):
+        assert isinstance(path, str) and Path(path).exists()
+    assert all(isinstance(n, str) for n in found["notes"]) and all(map(str.isidentifier, KEYS))
+    if found["error"] is not None:
+        assert tuple(found["error"]) == ("what", "where", "hint") and found["error"]["what"]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("short") / "short.bvh"
+    write_clip(trim(read_clip(WALK), 0, 30), path)
+    return path
+
+
+def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple[list[Any], int]:
+    """A command line of the verb that needs seconds, and its exit code."""
+    few = ("--iterations", "1", "--envs", "16", "--threads", "1")
+    if verb == "track":
+        policy = toy_run(out / "policy")
+        return [short, "--policy", policy, "-o", out / "o", "--save-policy", out / "p.safetensors"], 3
+    given: dict[str, list[Any]] = {
+        "info": [short],
+        "convert": [short, out / "o.bvh"],
+        "retarget": [short, "--onto", WALK, "-o", out / "o.bvh"],
+        "body": [clip],
+        "imitate": [clip, "-o", out / "o", *MINIATURE],
+        "train": ["residual-force", clip, "-o", out / "o", *few],
+        "inbetween": [short, "--keyframes", "0 20", "-o", out / "o.bvh", "--adapt", "0"],
+        "fleet": [clip, "-o", out / "o", "--set", "iterations=1", "--set", "envs=16"],
+        "eval": [trained],
+        "play": [trained, "-o", out / "o.html"],
+        "doctor": [short, "--fix", "-o", out / "o.bvh"],
+    }
+    return given[verb], 0
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_answers_in_one_schema(
+    verb: str, short: Path, clip: Path, trained: Path, tmp_path: Path, answered: Callable[..., Any]
+) -> None:
+    argv, code = lines(verb, short, clip, trained, tmp_path)
+    found = answered(verb, *argv, code=code)
+    check(found)
+    assert found["error"] is None and isinstance(found["result"], dict)
+    assert len(found["inputs"]) >= 1 and bool(found["outputs"]) == (verb not in ("info", "body", "eval"))
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_errors_are_documents_too(verb: str, tmp_path: Path, answered: Callable[..., Any]) -> None:
+    found = answered(verb, "--no-such-option", code=2)
+    check(found)
+    assert f"poise {verb} --help" in found["error"]["hint"] and found["result"] is None
+    if verb not in ("train", "inbetween", "retarget", "doctor"):
+        more = ["-o", tmp_path / "o.bvh"] if verb in ("imitate", "track", "convert", "fleet") else []
+        found = answered(verb, tmp_path / "absent.bvh", *more, code=2)
+        assert found["inputs"] == [str(tmp_path / "absent.bvh")]
+        assert "absent.bvh" in found["error"]["where"]
+
+
+def test_faults_and_unknown_verbs(
+    short: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, answered
+) -> None:
+    assert main(["trak", "--json"]) == 2
+    assert "there is no command 'trak'" in json.loads(capsys.readouterr().out)["error"]["what"]
+
+    def broken(*_: object, **__: object) -> None:
+        print("a library prints")
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("poise.motion.io.read_clip", broken)
+    found = answered("info", short, code=1)
+    assert "ZeroDivisionError" in found["error"]["what"] and "fault of Poise" in found["error"]["hint"]
+
+
+def test_numbers_that_are_not_finite_are_null() -> None:
+    assert plain({"a": (float("nan"), Path("x"), [float("inf"), 1])}) == {"a": [None, "x", [None, 1]]}
+    check(document("info", [], Answer(exit_code=2), PoiseError("wrong", "here")))
+
+
+def test_the_page_documents_every_key_and_verb() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "json.md").read_text("utf-8")
+    assert tuple(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)[: len(KEYS)]) == KEYS
+    for verb in VERBS:
+        assert hasattr(import_module(f"poise.cli.{verb}").Options, "json") and f"`{verb}`" in page
