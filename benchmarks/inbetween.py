@@ -62,6 +62,7 @@ def settings(protocol: Protocol, net: str, seed: int, args: argparse.Namespace) 
     """One training: RTN transitions of 30 as published, or of all lengths with --rtn-longest."""
     config = Inbetween(
         net=net, name=protocol.name, final=protocol.final, validation=protocol.validation, seed=seed,
+        contacts="harvey",
         between=BetweenConfig(refine=args.refine),
     )  # fmt: skip
     rtn = dataclasses.replace(config.rtn, longest=args.rtn_longest)

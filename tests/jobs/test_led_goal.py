@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_demonstrations import PLAIN, lively
 from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
-from toy_library import tiny
+from toy_library import PLAIN, lively, tiny
 
 
 class Still:
@@ -47,10 +46,7 @@ class Puppets:
 
 
 def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) -> None:
-    env, own = (
-        made.bare().env(2, auto_reset=False, threads=1, help_scale=0.0, guard=False),
-        made.reference,
-    )
+    env, own = made.bare().env(2, None, False, 1, help_scale=0.0, guard=False), made.reference
     clip = torch.tensor([own.names.index("walk")] * 2)
     env.reset_to(clip, torch.zeros_like(clip))
     assert made.recovery_clips is not None
@@ -78,7 +74,7 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
 
 
 def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imitation) -> None:
-    env = made.bare().env(1, auto_reset=False, threads=1, help_scale=0.0, guard=False)
+    env = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
     zero = torch.zeros(1, dtype=torch.long)
     env.reset_to(zero, zero)
     assert made.recovery_clips is not None

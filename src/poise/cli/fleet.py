@@ -145,11 +145,10 @@ def _seeds(text: str) -> list[int]:
 def _check(job: FleetJob) -> None:
     """Refuses what `poise imitate` would refuse, before anything runs."""
     from poise.cli.imitate import Options as Imitate
+    from poise.cli.imitate import config_of
 
     # After -m poise imitate.
-    options = parse(Imitate, job.command[3:], "poise imitate")
-    options.training.check()
-    options.body.config()
+    config_of(parse(Imitate, job.command[3:], "poise imitate"))
 
 
 def _show(event: str, record: Record) -> None:

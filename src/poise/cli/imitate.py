@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.callbacks import first_delivery
-from poise.cli.options import Body, Flag, Reading, Training
+from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
 from poise.cli.output import may_deliver, places
 from poise.cli.progress import working
 from poise.cli.results import print_card
+from poise.cli.settings import given
 from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.recipes import ResidualForce
 
 
 @dataclass(frozen=True)
@@ -36,13 +40,30 @@ class Options:
     json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+def blank() -> Options:
+    """The options of a command line that only prints its settings."""
+    return Options(Path(), Path())
+
+
+def config_of(o: Options) -> ResidualForce:
+    """The recipe's settings, as the command line states them."""
+    o.training.check(o.recipe_settings)
+    from poise.recipes import ResidualForce
+
+    return o.training.settings("residual-force", ResidualForce(), o.body, given(o.recipe_settings))
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Trains, evaluates, delivers; Ctrl-C during training saves and evaluates nothing."""
     o = options
+    config = config_of(o)
+    if o.training.print_config:
+        return printed(config)
     if o.clip.is_dir():
         hint = "Give one clip, or all of them to poise fleet DIR -o OUT"
         raise PoiseError("is a folder", o.clip, hint)
@@ -53,7 +74,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     # A run that is not resumed is refused by `Job`, with or without --force: training takes hours.
     held = (out / "run" / RUN_FILE).exists()
     may_deliver(out, motion, o.force or held, o.clip)
-    job = Job((o.clip,), out, out / "run", o.training, o.body, o.reading, again)
+    job = Job((o.clip,), out, out / "run", o.training, config, o.reading, again)
     from poise.learn.parallel import joined
 
     with joined() as comm:

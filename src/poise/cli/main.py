@@ -110,10 +110,13 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     from poise.cli.parse import parse
 
     module = import_module(f"poise.cli.{verb}")
-    options = parse(module.Options, rest, f"poise {verb}")
-    inputs += inputs_of(options)
-    # What is imported now takes seconds.
-    tell(_begins(verb, inputs), "dim")
+    # Who asks for the settings alone need name no files.
+    blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
+    options = parse(module.Options, rest, f"poise {verb}", blank)
+    if blank is None:
+        inputs += inputs_of(options)
+        # What is imported now takes seconds.
+        tell(_begins(verb, inputs), "dim")
     _share_cores()
     answer = module.run(options, rest)
     notes(answer.notes)

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 from tyro.conf import UseAppendAction, arg
 
+from poise.cli.answer import Answer
+from poise.cli.settings import base_of, configured, derived, stated
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.body import BodyConfig
     from poise.motion import Clip
-    from poise.recipes import ResidualForce
+
+    Chosen: TypeAlias = Any
+else:
+    Chosen = derived(
+        "residual-force", "", "method", "help_limit", "help_start", "reward", "seed", "expert",
+        num_envs="envs",
+    )  # fmt: skip
+T = TypeVar("T")
 
 #: A switch; its help states no default, which the sentence tells.
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
-Method = Literal["rfc-implicit", "rfc-explicit", "deepmimic"]
-Reward = Literal["world", "local"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 
@@ -108,14 +117,22 @@ class Body:
     body: Annotated[Path | None, arg(metavar="FILE.xml", help_behavior_hint="")] = None
     """A body of your own in MJCF in place of a generated one; the clip is retargeted onto it."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")] = ()
-    """One value of the body, such as lfoot.kp=400 or thigh.torque=250."""
+    """One value of the body, such as lfoot.kp=400, or a setting of the recipe, such as ppo.gamma=0.97,
+    which can also be written as --ppo.gamma 0.97."""
+
+    def values(self, overrides: Sequence[str]) -> dict[str, Any]:
+        """What is stated, by the name of the setting. overrides: the values of the body in `set`."""
+        own = None if self.body is None else str(self.body)
+        all_of_them = [list(override(text)) for text in overrides]
+        said = {"mass_kg": self.mass, "mjcf": own, "overrides": all_of_them or None}
+        return {f"body.{name}": value for name, value in said.items() if value is not None}
 
     def config(self) -> BodyConfig:
         """The settings of the body generator."""
         from poise.body import BodyConfig
 
-        own = None if self.body is None else str(self.body)
-        return BodyConfig(mass_kg=self.mass, overrides=tuple(map(override, self.set)), mjcf=own)
+        values = self.values(self.set)
+        return configured(BodyConfig(), {k.partition(".")[2]: v for k, v in values.items()})
 
 
 def check_device(name: str) -> None:
@@ -141,58 +158,51 @@ def override(text: str) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class Training:
-    """How long and in which way is trained."""
+    """How long is trained, where, and by which settings."""
 
     minutes: Annotated[float, arg(metavar="M")] = 10.0
     """Training time in minutes, counted over all resumed runs."""
-    method: Annotated[Method, arg(metavar="NAME")] = "rfc-implicit"
-    """rfc-implicit and rfc-explicit help with a residual force, deepmimic does without."""
-    help_limit: Annotated[float, arg(metavar="NEWTONS")] = 0.0
-    """The most residual force that may be left at the end, and in N m its torque."""
-    help_start: Annotated[float, arg(metavar="NEWTONS")] = 100.0
-    """The most at the beginning; while episodes succeed it comes down to --help-limit."""
-    reward: Annotated[Reward, arg(metavar="NAME")] = "world"
-    """world asks for the place in the world, local only for the pose and the root's motion."""
-    seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of everything random."""
-    envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Characters simulated at once; the recipe's number by default, mostly 512."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Threads of the physics; 0 takes every core."""
     device: Device = "cpu"
     """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
     iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Stop after so many iterations as well; for tests."""
-    expert: Flag = True
-    """Start from nothing; by default a scripted expert (inverse dynamics) is cloned first."""
     resume: Flag = False
     """Go on with the run that is in the folder."""
+    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Settings to begin with in place of the recipe's defaults, such as paper."""
+    config: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="")] = None
+    """A file of settings, as --print-config prints them."""
+    print_config: Flag = False
+    """Print all settings as TOML and do nothing."""
 
-    def check(self) -> None:
+    def check(self, chosen: Any) -> None:
         """Refuses numbers that make no sense, before anything is read or made."""
         if not (self.minutes > 0 and math.isfinite(self.minutes)):
             raise PoiseError(f"--minutes must be above 0, got {self.minutes:g}")
-        for name, value in (("limit", self.help_limit), ("start", self.help_start)):
-            if not (value >= 0 and math.isfinite(value)):
+        for name, value in (("limit", chosen.help_limit), ("start", chosen.help_start)):
+            if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise PoiseError(f"--help-{name} must be a number of at least 0 newtons, got {value:g}")
-        least = {"envs": 1, "threads": 0, "iterations": 1, "seed": 0}
-        for name, low in least.items():
-            value = getattr(self, name)
+        numbers = {"envs": chosen.num_envs, "seed": chosen.seed}
+        numbers |= {"threads": self.threads, "iterations": self.iterations}
+        for name, value in numbers.items():
+            low = 0 if name in ("threads", "seed") else 1
             if value is not None and not low <= value < 2**31:
                 raise PoiseError(f"--{name} must be a whole number of at least {low}, got {value}")
         check_device(self.device)
 
-    def config(self, body: Body) -> ResidualForce:
-        """The recipe's settings."""
-        from poise.recipes import ResidualForce
+    def settings(self, recipe: str, default: T, body: Body, values: Mapping[str, Any]) -> T:
+        """The settings of a run: `default`, a preset or a file, then what the command line states."""
+        verb = "imitate" if recipe == "residual-force" else f"train {recipe}"
+        base = base_of(recipe, default, self.preset, self.config, verb)
+        more, overrides = stated(body.set, type(base))
+        return configured(base, {**body.values(overrides), **values, **more})
 
-        config = ResidualForce(
-            method=self.method,
-            help_limit=self.help_limit,
-            help_start=self.help_start,
-            reward=self.reward,
-            seed=self.seed,
-            expert=self.expert,
-            body=body.config(),
-        )
-        return config if self.envs is None else replace(config, num_envs=self.envs)
+
+def printed(config: Any) -> Answer:
+    """What --print-config answers."""
+    from poise.settings import to_data, to_toml
+
+    sys.stdout.write(to_toml(config))
+    return Answer(to_data(config))

@@ -1,69 +1,112 @@
-"""Command lines become frozen dataclasses; a mistake becomes one sentence."""
+"""Command lines become frozen dataclasses; a mistake becomes one sentence.
+
+What tyro refuses comes as an event (`tyro._errors`), which names the option and the value; the module is
+private to tyro, so a test names the version with which it was tried. An event that is not known here
+becomes a general sentence.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import re
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 
-from poise.errors import PoiseError
+from poise.cli.settings import dotted
+from poise.errors import PoiseError, did_you_mean
 
 T = TypeVar("T")
 _CONFIG = (tyro.conf.FlagCreatePairsOff,)
+#: The version of tyro whose events were tried.
+TRIED = "1.0.17"
+_KINDS = {"INT": "a whole number", "FLOAT": "a number"}
 
 
-def parse(options: type[T], argv: Sequence[str], prog: str) -> T:
-    """The options that `argv` states.
+def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = None) -> T:
+    """The options that `argv` states; default: what is not stated, where that differs from the class's.
 
     Raises:
         PoiseError: what tyro refused, in one sentence.
         SystemExit: with code 0, after the help text was printed.
     """
-    refused = io.StringIO()
+
+    def refuse(event: Any) -> NoReturn:
+        what, hint = sentence(event, options, prog)
+        raise PoiseError(what, hint=f"{hint}See {prog} --help")
+
     try:
-        with contextlib.redirect_stderr(refused):
-            return tyro.cli(options, prog=prog, args=list(argv), config=_CONFIG)
+        with _told(refuse), contextlib.redirect_stderr(io.StringIO()):
+            made = tyro.cli(options, prog=prog, args=dotted(argv), config=_CONFIG, default=default)
+        assert made is not None
+        return made
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        what, near = sentence(refused.getvalue(), prog)
-        hint = f"Did you mean {near}? " if near else ""
-        raise PoiseError(what, hint=f"{hint}See {prog} --help") from None
+        what = "the command line was not understood"
+        raise PoiseError(what, hint=f"See {prog} --help") from None
 
 
-def sentence(boxed: str, prog: str) -> tuple[str, str]:
-    """What tyro's frame says, in one line, and the nearest option if it names one."""
-    plain = re.sub(r"\x1b\[[0-9;]*m", "", boxed)
-    # The frame is drawn with lines, and its title stands in them; where the terminal's encoding is
-    # not UTF-8 there are only rules, and the title is a section of its own.
-    sections: list[list[str]] = [[]]
-    for row in plain.splitlines():
-        line = row.rstrip().strip("│").rstrip()
-        if line.startswith(("╭", "╰")) or not line.strip("─- "):
-            sections.append([])
+def _told(refuse: Any) -> contextlib.AbstractContextManager[None]:
+    """Has tyro call `refuse` with what it refuses."""
+    try:
+        from tyro._errors import on_parse_error
+    except ImportError:
+        return contextlib.nullcontext()
+    return on_parse_error(refuse)
+
+
+def sentence(event: Any, options: type, prog: str) -> tuple[str, str]:
+    """What tyro's event says, in one line, and a hint on the nearest option or the choices."""
+    argument = getattr(event, "argument", None)
+    name = _name(argument) if argument is not None else ""
+    match type(event).__name__:
+        case "MissingArgs":
+            named = [_name(a.arg, metavar=True) for a in event.missing_arguments]
+            return f"{prog} needs {' and '.join(named)}", ""
+        case "UnrecognizedArgs":
+            return _unknown(event.tokens, options)
+        case "InvalidChoice":
+            known = sorted({*event.choices} - {"None"})
+            return f"{name} cannot be '{event.value}'", f"{did_you_mean(event.value, known)}. "
+        case "BadValue":
+            return f"{name} needs a value", ""
+        case "InstantiationFailure" if argument is not None:
+            kind = str(argument.field.type_stripped)
+            kind = next((v for k, v in _KINDS.items() if k.lower() in kind), "another value")
+            got = re.search(r"'([^']*)'\]?$", event.message)
+            return f"{name} needs {kind}" + (f", got '{got[1]}'" if got else ""), ""
+        case "InstantiationFailure":
+            return event.message, ""
+        case _:
+            return "the command line was not understood", ""
+
+
+def _name(argument: Any, metavar: bool = False) -> str:
+    """An argument as it is written: "--fps", with its metavar "-o DIR|FILE", by its place "CLIP"."""
+    if argument.is_positional():
+        return str(argument.lowered.metavar)
+    flags = sorted(argument.lowered.name_or_flags, key=len)
+    return f"{flags[0]} {argument.lowered.metavar}" if metavar else flags[-1]
+
+
+def _unknown(tokens: Sequence[str], options: type) -> tuple[str, str]:
+    """What is no option, and the option that it is near to."""
+    flags = [t.partition("=")[0] for t in tokens if t.startswith("-")]
+    if not flags:
+        return f"{' '.join(tokens)} is one argument too many", ""
+    near = did_you_mean(flags[0], list(_flags(options)))
+    near = near.partition("?")[0] + "? " if near.startswith("Did you mean") else ""
+    return f"there is no option {', '.join(flags)}", near.replace("'", "")
+
+
+def _flags(options: type) -> Iterator[str]:
+    for f in fields(options):
+        made = f.default_factory() if callable(f.default_factory) else None
+        if is_dataclass(made):
+            yield from _flags(type(made))
         else:
-            sections[-1].append(line)
-    parts = [s for s in sections if s]
-    if "╭" not in plain:
-        parts = parts[1:]
-    if not parts:
-        return "the command line was not understood", ""
-    text = " ".join(line.strip() for line in parts[0]).rstrip(".")
-    if text.startswith("Missing from"):
-        # Names stand at one depth, their descriptions deeper.
-        depths = [len(line) - len(line.lstrip()) for line in parts[0][1:]]
-        named = [x.strip() for x, d in zip(parts[0][1:], depths, strict=True) if d == min(depths)]
-        text = f"{prog} needs {' and '.join(named)}"
-    text = re.sub(r"Expected one of \((.*)\)", _choices, text)
-    near = next((s[1].split()[0] for s in parts[1:] if "Perhaps" in s[0] and len(s) > 1), "")
-    return text[:1].lower() + text[1:], near.rstrip(",")
-
-
-def _choices(found: re.Match[str]) -> str:
-    """The choices in a fixed order, without the None that only Python knows."""
-    names = sorted({x.strip(" '") for x in found[1].split(",")} - {"None", ""})
-    return f"Known: {', '.join(names)}"
+            yield ("--no-" if f.default is True else "--") + f.name.replace("_", "-")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,14 +13,20 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Flag, Reading, Training
-from poise.cli.perpetual_options import Primitives
+from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
+from poise.cli.perpetual_options import BY_HAND, Primitives, settings
+from poise.cli.settings import given
 from poise.cli.train_inbetween import Network
 from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
 
-#: Recipes that can be trained.
-RECIPES = ("residual-force", "inbetween", "perpetual")
+#: Recipes that can be trained, and where their settings are imported from.
+_KINDS = {
+    "residual-force": ("poise.recipes", "ResidualForce"),
+    "inbetween": ("poise.jobs.inbetween", "Inbetween"),
+    "perpetual": ("poise.recipes.perpetual", "Perpetual"),
+}
+RECIPES = tuple(_KINDS)
 
 
 #: How a single file is read, which is nothing for a folder, and what to do about it.
@@ -48,6 +55,7 @@ class Options:
     json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
+    recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
     library: OmitArgPrefixes[Library] = field(default_factory=Library)
     network: OmitArgPrefixes[Network] = field(default_factory=Network)
     primitives: OmitArgPrefixes[Primitives] = field(default_factory=Primitives)
@@ -60,14 +68,22 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     o = options
     if o.recipe not in RECIPES:
         raise PoiseError(f"there is no recipe '{o.recipe}'. {did_you_mean(o.recipe, RECIPES)}")
-    if o.recipe == "inbetween":
-        return _inbetween(o, argv)
-    if o.recipe == "perpetual":
-        return _perpetual(o, argv)
+    o.training.check(o.recipe_settings)
+    config = config_of(o)
+    if o.training.print_config:
+        return printed(config)
+    again = command_line("train", argv)
+    if o.recipe != "residual-force":
+        _only_a_folder(o)
+        from poise.cli.train_inbetween import run as inbetween
+        from poise.cli.train_perpetual import run as perpetual
+
+        if o.recipe == "inbetween":
+            return inbetween(o.library, config, o.out, o.training, again)
+        return perpetual(o, config, again)
     if not o.clips:
         raise PoiseError("no clip was given", hint=f"Write poise train {o.recipe} CLIP -o RUNDIR")
-    again = command_line("train", argv)
-    job = Job(o.clips, o.out, o.out, o.training, o.body, o.reading, again)
+    job = Job(o.clips, o.out, o.out, o.training, config, o.reading, again)
     from poise.learn.parallel import joined
 
     with joined() as comm:
@@ -87,13 +103,27 @@ def trained(last: Any) -> dict[str, Any] | None:
     return None if last is None else {"seconds": last.seconds, "samples": last.samples}
 
 
-def _perpetual(o: Options, argv: Sequence[str]) -> Answer:
-    """One policy for a folder of clips."""
-    from poise.cli.train_perpetual import run as train
+def blank() -> Options:
+    """The options of a command line that only prints its settings."""
+    return Options("residual-force", Path())
 
-    _only_a_folder(o)
-    again = command_line("train", argv)
-    return train(o.library, o.primitives, o.out, o.training, o.body, again)
+
+def config_of(o: Options) -> Any:
+    """The recipe's settings, as the command line states them; what belongs to another one is refused."""
+    values = given(o.recipe_settings, o.network, o.primitives)
+    module, name = _KINDS[o.recipe]
+    default = getattr(import_module(module), name)()
+    known = {f.name for f in fields(default)}
+    own = {"inbetween": ("dropout",), "perpetual": BY_HAND}.get(o.recipe, ())
+    for name in [*values, *(given(o.body) if "body" not in known else ())]:
+        if name not in known and name not in own:
+            option = {"num_envs": "envs", "going_on": "from"}.get(name, name.replace("_", "-"))
+            raise PoiseError(f"the recipe {o.recipe} has no --{option}", hint="Leave it out")
+    if o.recipe == "perpetual":
+        return settings(o.primitives, o.training, o.body, values)
+    if "dropout" in values:
+        values["between_training.dropout"] = values.pop("dropout")
+    return o.training.settings(o.recipe, default, o.body, values)
 
 
 def _only_a_folder(o: Options) -> None:
@@ -104,15 +134,3 @@ def _only_a_folder(o: Options) -> None:
     for name, instead in _OF_A_CLIP:
         if getattr(o.reading, name) != getattr(plain, name):
             raise PoiseError(f"--{name.replace('_', '-')} is about a single clip", hint=instead)
-
-
-def _inbetween(o: Options, argv: Sequence[str]) -> Answer:
-    """A network instead of a character: only some of the options have a meaning."""
-    from poise.cli.train_inbetween import run as train
-
-    _only_a_folder(o)
-    o.training.check()
-    t, again = o.training, command_line("train", argv)
-    return train(
-        o.library, o.network, o.out, t.minutes, t.seed, t.iterations, t.threads, t.resume, again
-    )

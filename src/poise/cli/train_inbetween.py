@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from tyro.conf import arg
 
@@ -13,62 +13,60 @@ from poise.cli.console import say, tell
 from poise.cli.library_options import Library
 from poise.cli.output import claimed
 from poise.cli.progress import clock, showing
+from poise.cli.settings import derived
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
+    from poise.cli.options import Training
+    from poise.jobs.inbetween import Inbetween
     from poise.learn.inbetween import BlockStats
 
-
-Contacts = Literal["floor", "harvey", "two-stage"]
+if TYPE_CHECKING:
+    _Derived: TypeAlias = Any
+else:
+    _Derived = derived("inbetween", "inbetween: ", "net", "contacts")
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(_Derived):
     """What only the recipe inbetween knows."""
 
-    net: Literal["transformer", "rtn"] = "transformer"
-    """inbetween: the network; rtn is that of Harvey et al. 2020."""
-    contacts: Annotated[Contacts, arg(metavar="NAME")] = "floor"
-    """inbetween: when a foot stands: floor says while it is low and slow; harvey and two-stage are the
-    papers' rules, for recordings whose feet never slide."""
-    dropout: Annotated[float, arg(metavar="SHARE")] = 0.0
+    dropout: Annotated[float | None, arg(metavar="SHARE", help_behavior_hint="(default: 0.0)")] = None
     """inbetween: share of the transformer's channels that a step leaves out; 0.15 suits less than an
     hour of motion."""
 
 
-def run(library: Library, network: Network, out: Path, minutes: float, seed: int, steps: int | None,
-        threads: int, resume: bool, again: str) -> Answer:  # fmt: skip
+def run(library: Library, config: Inbetween, out: Path, training: Training, again: str) -> Answer:
     """Trains until the last step or Ctrl-C."""
     import os
 
     import torch
 
-    from poise.jobs.inbetween import RUN_FILE, Inbetween, begin, train
-    from poise.learn.between import BetweenTraining
+    from poise.jobs.inbetween import RUN_FILE, begin, train
 
     folder = library.folder("inbetween")
     if library.backwards:
         raise PoiseError("the recipe inbetween has no --backwards", hint="Leave it out")
-    if (out / RUN_FILE).exists() and not resume:
+    if (out / RUN_FILE).exists() and not training.resume:
         raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    torch.set_num_threads(threads or cores)
-    if not 0 <= network.dropout < 1:
-        raise PoiseError(f"--dropout must be at least 0 and below 1, got {network.dropout:g}")
-    if network.dropout and network.net == "rtn":
+    torch.set_num_threads(training.threads or cores)
+    dropout = config.between_training.dropout
+    if not 0 <= dropout < 1:
+        raise PoiseError(f"--dropout must be at least 0 and below 1, got {dropout:g}")
+    if dropout and config.net == "rtn":
         raise PoiseError("the network rtn has no --dropout", hint="Leave it out")
-    reading = None
+    reading = config.reading
     if library.library_fps or library.library_skeleton:
         # Its windows are seen in a mirror, not the clips.
         reading = replace(library.reading(), mirror=False)
-    config = Inbetween(
-        net=network.net, name=folder.name, seed=seed, validation=library.hold_out,
-        final=library.never or r"(?!)", contacts=network.contacts, mirror=library.mirror,
-        onto=None if library.onto is None else str(library.onto.resolve()),
-        reading=reading,
-        between_training=BetweenTraining(dropout=network.dropout),
+    config = replace(
+        config, name=folder.name, validation=library.hold_out or config.validation,
+        final=library.never or config.final, mirror=library.mirror or config.mirror,
+        onto=config.onto if library.onto is None else str(library.onto.resolve()), reading=reading,
     )  # fmt: skip
+    minutes, steps = training.minutes, training.iterations
     with claimed(out):
         task, steps = begin(out, folder, config, minutes, steps, tell)
     used = len(task.data.first) - 1

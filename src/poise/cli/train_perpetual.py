@@ -13,9 +13,8 @@ from poise.cli.answer import Answer
 from poise.cli.callbacks import beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.library_options import Library
-from poise.cli.options import Body, Training
 from poise.cli.output import claimed
-from poise.cli.perpetual_options import Primitives, check_going_on, settings
+from poise.cli.perpetual_options import check_going_on
 from poise.cli.perpetual_shown import report
 from poise.cli.perpetual_shown import training as shown
 from poise.cli.progress import clock
@@ -23,21 +22,20 @@ from poise.cli.training import stopped
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
+    from poise.cli.options import Training
+    from poise.cli.train import Options
     from poise.jobs.track.policy import Tracker
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
 
 
-def run(
-    library: Library, primitives: Primitives, out: Path, training: Training, body: Body, again: str
-) -> Answer:
+def run(o: Options, config: Perpetual, again: str) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
+    library, primitives, out, training, body = o.library, o.primitives, o.out, o.training, o.body
     library.folder("perpetual")
     if launched() and int(os.environ["WORLD_SIZE"]) > 1:
         hint = "Start it without torchrun; --threads and --device take all of one machine"
         raise PoiseError("the recipe perpetual trains in one process", hint=hint)
-    training.check()
-    config = settings(primitives, training, body)
     from poise.jobs.perpetual.run import train
     from poise.jobs.runs import RUN_FILE
     from poise.learn import Until
@@ -55,10 +53,10 @@ def run(
         # Whether --max-primitives has a say is known by the policy alone.
         returns = tracker.recovery_clips is not None
         check_going_on(primitives, body, library, returns)
-        if training.envs is None:
+        if o.recipe_settings.num_envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
         config = going_on(tracker.config, config, returns)
-    imitation = begin(library, primitives, out, config, training, held, tracker)
+    imitation = begin(library, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result = training, None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
@@ -75,7 +73,6 @@ def run(
 
 def begin(
     library: Library,
-    primitives: Primitives,
     out: Path,
     config: Perpetual,
     training: Training,

@@ -17,7 +17,7 @@ from poise.cli import progress
 from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.callbacks import First, beginning
 from poise.cli.console import launched, notes, say, tell
-from poise.cli.options import Body, Reading, Training
+from poise.cli.options import Reading, Training
 from poise.cli.output import claimed
 from poise.errors import PoiseError
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from poise.learn import RunResult
     from poise.learn.parallel import Comm
     from poise.motion import ClipLibrary
+    from poise.recipes import ResidualForce
     from poise.recipes.imitation import Imitation
 
 
@@ -36,7 +37,7 @@ class Job:
     out: Path
     run: Path
     training: Training
-    body: Body
+    config: ResidualForce
     reading: Reading
     again: str
     """The command line that goes on with it."""
@@ -47,16 +48,14 @@ class Job:
         from poise.learn.parallel import share_of, together
 
         with together(comm):
-            self.training.check()
             if comm.size > 1:
-                share_of(self.training.config(self.body).num_envs, comm)
+                share_of(self.config.num_envs, comm)
             imitation = self.begin() if comm.rank == 0 else None
         with together(comm):
             return imitation or open_run(self.run).task
 
     def begin(self) -> Imitation:
         """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""
-        config = self.training.config(self.body)
         from poise.jobs.runs import RUN_FILE, begin
 
         held = (self.run / RUN_FILE).exists()
@@ -67,7 +66,7 @@ class Job:
         say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
         notes([n for clip in library for n in clip.skeleton.source.notes])
         with claimed(self.out), claimed(self.run), progress.working("making the body"):
-            imitation = begin(self.run, library, config, self.training.device)
+            imitation = begin(self.run, library, self.config, self.training.device)
         if self.training.resume and not held:
             tell(f"There was no run in {self.run}; a new one starts.")
         notes(imitation.report.sentences())

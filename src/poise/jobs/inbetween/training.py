@@ -70,7 +70,7 @@ class Inbetween:
     name: str = "library"
     final: str = r"(?!)"
     validation: str | None = None
-    contacts: Contacts = "harvey"
+    contacts: Contacts = "floor"
     fps: float = 30.0
     seed: int = 0
     ema: float = 0.999

@@ -1,0 +1,117 @@
+"""Options that are derived from a recipe's dataclass: the same fields, types and defaults, one truth."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+from poise.cli import imitate, train
+from poise.cli.main import main
+from poise.cli.parse import parse
+from poise.cli.settings import SOURCES, _fields_of, configured, dotted, stated
+from poise.errors import PoiseError
+from poise.jobs.inbetween import Inbetween
+from poise.plan import TrajOptConfig
+from poise.recipes import ResidualForce
+from poise.recipes.perpetual import Perpetual
+
+KINDS: dict[str, Any] = {"residual-force": ResidualForce, "perpetual": Perpetual, "inbetween": Inbetween}
+
+
+def imitates(*argv: str) -> ResidualForce:
+    return imitate.config_of(parse(imitate.Options, ["a.bvh", "-o", "o", *argv], "poise"))
+
+
+def trains(*argv: str) -> Any:
+    return train.config_of(parse(train.Options, [*argv, "-o", "o"], "poise train"))
+
+
+@pytest.mark.parametrize("recipe", SOURCES)
+def test_the_source_that_is_read_is_the_class_that_is_imported(recipe: str) -> None:
+    kind, plain = KINDS[recipe], KINDS[recipe]()
+    types, found = get_type_hints(kind), _fields_of(recipe)
+    assert len(found) >= 8
+    for name, (read, default, _) in found.items():
+        assert default == getattr(plain, name), name
+        assert types[name] in (read, read | None), name
+    assert set(found) <= {f.name for f in fields(kind)}
+
+
+def test_every_derived_option_has_a_help_text() -> None:
+    for group in (imitate.Chosen, train.Network, train.Primitives):
+        for hint in get_type_hints(group, include_extras=True).values():
+            told = hint.__metadata__[0]
+            assert getattr(told, "help", None) is None or len(told.help) > 12
+
+
+def test_python_and_the_command_line_have_the_same_defaults() -> None:
+    assert imitates() == ResidualForce() and trains("residual-force") == ResidualForce()
+    assert trains("perpetual") == Perpetual() and trains("inbetween") == Inbetween()
+    assert trains("perpetual", "--action", "additive") == Perpetual.additive()
+
+
+def test_what_is_stated_reaches_the_settings() -> None:
+    made = imitates(
+        "--method", "deepmimic", "--envs", "64", "--no-expert", "--mass", "50", "--set", "lfoot.kp=400",
+        "--ppo.policy-lr", "1e-4", "--set", "horizon=99", "--sim.rate_hz=120",
+    )  # fmt: skip
+    plain = ResidualForce()
+    assert made == replace(
+        plain,
+        method="deepmimic", num_envs=64, expert=False, horizon=99,
+        body=replace(plain.body, mass_kg=50.0, overrides=(("lfoot.kp", 400.0),)),
+        ppo=replace(plain.ppo, policy_lr=1e-4), sim=replace(plain.sim, rate_hz=120),
+    )  # fmt: skip
+    made = trains("perpetual", "--paths", "11", "--no-style", "--no-recovery-clips", "--single")
+    plain = Perpetual()
+    assert made == replace(
+        plain, single=True, help_start=0.0, trajopt=TrajOptConfig(iterations=11), style=None,
+        recovering=replace(plain.recovering, demonstrations=0),
+    )  # fmt: skip
+    made = trains("inbetween", "--net", "transformer", "--dropout", "0.15", "--seed", "3")
+    assert made.between_training.dropout == 0.15 and made.seed == 3
+
+
+def test_presets_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert imitates("--preset", "paper") == ResidualForce.paper()
+    with pytest.raises(PoiseError, match="preset"):
+        imitates("--preset", "papr")
+    for verb, argv in (("imitate", []), ("train", ["perpetual"]), ("train", ["inbetween"])):
+        assert main([verb, *argv, "--print-config", "--seed", "7"]) == 0
+        said = capsys.readouterr()
+        (path := tmp_path / "c.toml").write_text(said.out)
+        found = (imitates if verb == "imitate" else trains)(*argv, "--config", str(path))
+        assert found == replace(KINDS[argv[0] if argv else "residual-force"](), seed=7)
+    path.write_text("sead = 3\n")
+    with pytest.raises(PoiseError, match="sead"):
+        imitates("--config", str(path))
+    with pytest.raises(PoiseError, match="both state"):
+        imitates("--config", str(path), "--preset", "paper")
+
+
+def test_settings_of_another_recipe_are_refused() -> None:
+    for argv, option in (
+        (("perpetual", "--method", "deepmimic"), "--method"),
+        (("perpetual", "--dropout", "0.1"), "--dropout"),
+        (("inbetween", "--single"), "--single"),
+        (("inbetween", "--envs", "4"), "--envs"),
+        (("inbetween", "--mass", "60"), "--mass"),
+        (("residual-force", "a.bvh", "--from", "x"), "--from"),
+    ):
+        with pytest.raises(PoiseError, match=f"the recipe {argv[0]} has no {option}"):
+            trains(*argv)
+    for name, what in (("ppo.polcy_lr=1", "policy_lr"), ("ppo.gamma=high", "must be a number")):
+        with pytest.raises(PoiseError, match=what):
+            imitates("--set", name)
+
+
+def test_dotted_options_are_settings() -> None:
+    assert dotted(["--a.b-c", "3", "x.y", "--d.e=4"]) == ["--set", "a.b-c=3", "x.y", "--set", "d.e=4"]
+    with pytest.raises(PoiseError, match="needs a value"):
+        dotted(["--a.b"])
+    settings, other = stated(("ppo.policy-lr=1e-4", "lfoot.kp=3", "action=absolute"), ResidualForce)
+    assert settings == {"ppo.policy_lr": 1e-4, "action": "absolute"} and other == ["lfoot.kp=3"]
+    assert configured(plain := Perpetual(style=None), {}) is plain
