@@ -13,10 +13,13 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 import poise
 from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.motion import Clip
 
 T = TypeVar("T")
 #: Where the dataclass of each recipe stands, below the package.
@@ -142,28 +145,24 @@ def configured(base: T, values: Mapping[str, Any]) -> T:
     return from_data(type(base), data, "the command line")
 
 
-def base_of(recipe: str, default: T, preset: str | None, config: Path | None, verb: str) -> T:
-    """The settings that options then change: the recipe's, those of a preset, or of a file."""
+def base_of(
+    recipe: str, default: T, preset: str | None, config: Path | None, verb: str, clip: Clip | None
+) -> T:
+    """The settings that options then change: the recipe's, those of a preset, or of a file.
+
+    clip: what is imitated, by which a preset chooses some of its values.
+    """
     from poise.settings import from_toml
 
     if preset is not None and config is not None:
         raise PoiseError("--preset and --config both state all settings", hint="Leave one out")
     if config is not None:
         return from_toml(type(default), config, verb)
-    return default if preset is None else _preset_of(recipe, preset)
+    if preset is None:
+        return default
+    from poise.jobs.presets import preset_of
 
-
-def _preset_of(recipe: str, preset: str) -> Any:
-    try:
-        from poise.recipes import preset_of  # type: ignore[attr-defined]
-    except ImportError:
-        from poise.recipes.residual_force import ResidualForce, paper
-
-        if (recipe, preset) != ("residual-force", "paper"):
-            hint = "Known: paper, of residual-force"
-            raise PoiseError(f"the recipe {recipe} has no preset '{preset}'", hint=hint) from None
-        return paper(ResidualForce())
-    return preset_of(recipe, preset)
+    return preset_of(recipe, preset, clip)
 
 
 def dotted(argv: Sequence[str]) -> list[str]:
