@@ -78,7 +78,8 @@ class GeneratorGoal(BufferedGoal):
 
     def supply(self, ids: Tensor) -> None:
         b, g = self.buffer, self.generator
-        short = ids[(self.at[ids] + 1 >= b.count[ids]) & (self.at[ids] < b.last[ids])]
+        begun = b.count[ids] > 0
+        short = ids[begun & (self.at[ids] + 1 >= b.count[ids]) & (self.at[ids] < b.last[ids])]
         if not len(short):
             return
         index = b.count[short].unsqueeze(1) - g.past + torch.arange(g.past, device=self.device)
