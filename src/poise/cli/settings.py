@@ -28,7 +28,7 @@ SOURCES = {
     "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
 }
-_TYPES = {"float": float, "int": int, "bool": bool, "str": str, "Literal": Literal}
+_TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.
 _UNSAID = {
     "num_envs": "environments that are simulated at once.",
@@ -75,20 +75,28 @@ def _fields_of(recipe: str) -> dict[str, tuple[Any, Any, str]]:
     """Type, default and help text of each field of plain values."""
     file, name = SOURCES[recipe]
     tree = ast.parse((Path(poise.__file__).parent / file).read_text("utf-8"))
-    known = dict(_TYPES)
+    known: dict[str, Any] = dict(_TYPES)
     for node in tree.body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.value).startswith("Literal["):
-            known[ast.unparse(node.targets[0])] = eval(ast.unparse(node.value), known)
+        if isinstance(node, ast.Assign) and (alias := _type_of(node.value, known)) is not None:
+            known[ast.unparse(node.targets[0])] = alias
     kind = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name)
     rows = {str(ast.unparse(n.target)): n for n in kind.body if isinstance(n, ast.AnnAssign)}
     texts = _texts(ast.get_docstring(kind) or "", tuple(rows))
     out: dict[str, tuple[Any, Any, str]] = {}
     for row, node in rows.items():
-        written = ast.unparse(node.annotation).removesuffix(" | None")
-        if isinstance(node.value, ast.Constant) and written.partition("[")[0] in known:
-            text = texts.get(row) or _UNSAID.get(row, "")
-            out[row] = eval(written, dict(known)), node.value.value, text
+        read = _type_of(node.annotation, known)
+        if isinstance(node.value, ast.Constant) and read is not None:
+            out[row] = read, node.value.value, texts.get(row) or _UNSAID.get(row, "")
     return out
+
+
+def _type_of(node: ast.expr, known: Mapping[str, Any]) -> Any:
+    """The plain type that an annotation names, without its None; None for any other."""
+    if isinstance(node, ast.BinOp):
+        return _type_of(node.left, known)
+    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
+        return Literal[ast.literal_eval(node.slice)]
+    return known.get(node.id) if isinstance(node, ast.Name) else None
 
 
 def _texts(doc: str, names: tuple[str, ...]) -> dict[str, str]:
