@@ -90,7 +90,7 @@ class ImitationEnv:
         self._terms = self._make_terms(fused)
         self.goal.aim(None, None)
         # Once as they are, so that it is known which tensors the terms read.
-        self._terms.evaluated(self._sources.live(self.goal.now(), self.goal.ahead()))
+        self._terms.check(self._sources.live(self.goal.now(), self.goal.ahead()), n)
         self._sources.settle()
         # Worlds stand on their goals where these are known already.
         obs = self._set_down(None) if self.goal.begins else self.observe()
@@ -267,8 +267,8 @@ class ImitationEnv:
         """Whether the goal has changed by what it sees of the characters."""
         if type(self.goal).watch is Goal.watch:
             return False
-        pose = self.pose()
-        changed = self.goal.watch(self.backend.state.qpos, pose.pos, pose.linvel)
+        sim = self._terms.frame(self._sources).sim
+        changed = self.goal.watch(self.backend.state.qpos, sim.pos, sim.linvel)
         if changed:
             self.goal.aim(None, self._held())
         return changed

@@ -156,7 +156,7 @@ class Frame:
     @classmethod
     def given(cls, **values: Any) -> Frame:
         """A frame whose observables are `values`; others that are asked for are None."""
-        frame = cls({}, dict.fromkeys(cls.__annotations__, _none))
+        frame = cls({}, _Unknown())
         frame.__dict__.update(values)
         return frame
 
@@ -184,8 +184,14 @@ class Frame:
 Observable = Callable[[Frame], Any]
 
 
-def _none(frame: Frame) -> None:
-    return None
+class _Unknown(dict[str, Observable]):
+    """Observables of which every one is None."""
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and not name.startswith("__")
+
+    def __getitem__(self, name: str) -> Observable:
+        return lambda frame: None
 
 
 TermFunction = Callable[..., Tensor]

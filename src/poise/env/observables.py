@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FunctionType
 
 import torch
 from torch import Tensor
 
 from poise.control import Residual
-from poise.env.frame import Frame, Layout, LazyPose, Place, PointGoal, Pose
+from poise.env.frame import Frame, Layout, LazyPose, Observable, Place, PointGoal, Pose
 from poise.spatial import heading_quat
 
 
@@ -119,8 +120,9 @@ def sizes(frame: Frame) -> Tensor | None:
     return None
 
 
-#: All of the above by name.
-STANDARD = {
-    fn.__name__: fn
-    for fn in (sim, ref, ahead, place, phase, min_height, residual, reg, age, torque, point, sizes)
+#: All functions of this file by name.
+STANDARD: dict[str, Observable] = {
+    name: fn
+    for name, fn in vars().copy().items()
+    if getattr(fn, "__module__", "") == __name__ and isinstance(fn, FunctionType)
 }

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
+import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,6 +40,42 @@ class Poser:
             self.local(qpos.float()),
             heading_quat(qpos[:, 3:7].float()),
         )
+
+    def live(self, qpos: Tensor, qvel: Tensor) -> Pose:
+        """The same poses by MuJoCo, one after another: for the few frames that become known in a step,
+        for which torch takes milliseconds. What a frame's pose is does not depend on the others."""
+        model, data = self.humanoid.model, self._data
+        bodies = model.nbody - 1
+        out = np.empty((len(qpos), bodies, 13))
+        centres = np.empty((len(qpos), 3))
+        for i, (q, v) in enumerate(zip(qpos.numpy(), qvel.numpy(), strict=True)):
+            data.qpos, data.qvel = q, v
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            turning, moving = data.cvel[1:, :3], data.cvel[1:, 3:]
+            # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
+            arm = data.xpos[1:] - data.subtree_com[model.body_rootid[1:]]
+            out[i, :, :3], out[i, :, 3:7] = data.xpos[1:], data.xquat[1:]
+            out[i, :, 7:10], out[i, :, 10:] = moving + np.cross(turning, arm), turning
+            centres[i] = data.subtree_com[1]
+        pos, quat, linvel, angvel = torch.from_numpy(out).float().split((3, 4, 3, 3), -1)
+        small = qpos.float()
+        return Pose(
+            small,
+            qvel.float(),
+            pos,
+            quat,
+            linvel,
+            angvel,
+            torch.from_numpy(centres).float(),
+            self.local(small),
+            heading_quat(small[:, 3:7]),
+        )
+
+    @cached_property
+    def _data(self) -> mujoco.MjData:
+        return mujoco.MjData(self.humanoid.model)
 
     def local(self, qpos: Tensor) -> Tensor:
         """`(F, J, 4)` wxyz local turns of hinged bodies."""

@@ -86,6 +86,13 @@ class TaskConfig:
         if self.help_by not in ("all", "clip", "bin"):
             what = f"help is given by 'all', 'clip' or 'bin', got '{self.help_by}'"
             raise PoiseError(what, "TaskConfig")
+        for terms in (self.obs, self.rewards, self.dones):
+            names = [t.name for t in terms]
+            twice = [n for n in names if names.count(n) > 1]
+            if twice:
+                raise PoiseError(
+                    f"two terms are called '{twice[0]}'", "TaskConfig", "Rename one of them"
+                )
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:
             raise PoiseError(

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -118,11 +118,13 @@ def read_score(path: str | Path) -> ScoreCard:
         raise PoiseError(f"is no JSON: {problem.msg}", f"{path}, line {problem.lineno}") from None
     if not isinstance(raw, dict):
         raise PoiseError("is no score card: the file must hold one JSON object", path)
-    _require(raw, [f.name for f in fields(ScoreCard)], path)
+    # A figure that is newer than the file has its default.
+    told = [f for f in fields(ScoreCard) if f.name in raw or f.default is MISSING]
+    _require(raw, [f.name for f in told if f.default_factory is MISSING], path)
     if not isinstance(raw["help"], dict):
         raise PoiseError("is no score card: 'help' must be an object", path)
     _require(raw["help"], [f.name for f in fields(Help)], path)
-    values: dict[str, Any] = {f.name: _numbers(raw[f.name]) for f in fields(ScoreCard)}
+    values: dict[str, Any] = {f.name: _numbers(raw[f.name]) for f in told if f.name in raw}
     aid: dict[str, Any] = {f.name: _numbers(raw["help"][f.name]) for f in fields(Help)}
     for name in ("limit_n", "limit_nm"):
         aid[name] = math.inf if raw["help"][name] is None else aid[name]

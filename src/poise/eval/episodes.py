@@ -40,6 +40,13 @@ def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observer
         policy: acts on raw observations, deterministically.
         obs: `(N, O)` of the worlds as they stand, from `env.reset_to`.
     """
+    sizes = getattr(policy, "num_obs", env.num_obs), getattr(policy, "num_actions", env.num_actions)
+    if sizes != (env.num_obs, env.num_actions):
+        raise PoiseError(
+            f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, and the task has "
+            f"{env.num_obs} and {env.num_actions}",
+            hint="It was trained for other observations, actions, or another body",
+        )
     for observer in observers:
         observer.see(env, 0)
     for t in range(1, steps + 1):

@@ -68,7 +68,7 @@ class FrameBuffer:
     def packed(self, ids: Tensor, index: Tensor) -> Tensor:
         """Packed poses `(n, W)` of frames `index (n,)`; the place says where the motion ends."""
         qpos, qvel = (x.cpu() for x in self.coordinates(ids, index))
-        pose = self.poser(qpos, qvel)
+        pose = self.poser.live(qpos, qvel)
         end = (index >= self.last[ids]).float().cpu()
         low = self.qpos[ids, 0, 2].float().cpu()
         place = torch.stack((torch.zeros_like(end), low, end, torch.zeros_like(end)), 1)

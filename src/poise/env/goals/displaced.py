@@ -114,5 +114,5 @@ class DisplacedGoal(Goal):
         qvel = (pose.qvel.double() + rate[off]).cpu()
         place = packed[off][:, -len(self.layout.place(packed)) :]
         out = packed.clone()
-        out[off] = self.layout.pack(self._poser(qpos, qvel), place.cpu()).to(packed)
+        out[off] = self.layout.pack(self._poser.live(qpos, qvel), place.cpu()).to(packed)
         return out

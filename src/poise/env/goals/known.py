@@ -42,6 +42,8 @@ class BufferedGoal(Goal):
         self._wait = torch.zeros_like(self.at)
         self._ahead = self.buffer.packed(self._every, self.at)
         self._hinges = self.buffer.qpos[:, 0, 7:].clone()
+        # Worlds whose next frame may have changed since it was looked up.
+        self._stale = torch.zeros(num_envs, dtype=torch.bool, device=device)
 
     def local(self, qpos: Tensor) -> Tensor:
         return self._poser.local(qpos)
@@ -58,12 +60,18 @@ class BufferedGoal(Goal):
         ids = self._every if ids is None else ids
         self._wait = torch.zeros_like(self.at) if held is None else held.long()
         self.supply(ids)
-        self._look(ids)
+        self._stale[ids] = True
 
-    def _look(self, ids: Tensor) -> None:
+    def _look(self) -> None:
+        """Looks up the next frames where they may have changed."""
+        ids = self._stale.nonzero().squeeze(-1)
+        if not len(ids):
+            return
         index = self.at[ids] + 1 - self._wait[ids]
+        self._ahead = self._ahead.clone()
         self._ahead[ids] = self.buffer.packed(ids, index)
         self._hinges[ids] = self.buffer.coordinates(ids, index)[0][:, 7:]
+        self._stale[ids] = False
 
     def now(self, ids: Tensor | None = None) -> Tensor:
         ids = self._every if ids is None else ids
@@ -71,23 +79,24 @@ class BufferedGoal(Goal):
 
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         if k == 1:
+            self._look()
             return self._ahead if ids is None else self._ahead[ids]
         ids = self._every if ids is None else ids
         return self.buffer.packed(ids, self.at[ids] + k)
 
     def targets(self) -> tuple[Tensor, Tensor]:
+        self._look()
         return self._hinges, self._every
 
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
+        now = self.ahead()
         self.at += 1 if waited is None else 1 - waited.long()
-        now = self._ahead
-        self._ahead = now.clone()
         self.aim(None, held)
-        return now, self._ahead
+        return now, self.ahead()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         super().load_state(state)
-        self._look(self._every)
+        self._stale[:] = True
 
     def rows(self) -> dict[str, Tensor]:
         return {"at": self.at, **self.buffer.rows()}

@@ -75,14 +75,14 @@ class StreamGoal(BufferedGoal):
             self._note(ids[jumped], f"jumped by {far} m between two frames; the goal is there now")
         self.buffer.append(ids, qpos, jumped)
         self._stalled[ids] = False
-        self._look(ids)
+        self._stale[ids] = True
 
     def close(self, ids: Tensor | None = None) -> None:
         """The streams of worlds `ids`, all for None, have ended with their last frames."""
         ids = self._every if ids is None else ids
         self.buffer.last[ids] = (self.buffer.count[ids] - 1).clamp_min(0)
         self._note(ids, "ended")
-        self._look(ids)
+        self._stale[ids] = True
 
     def draw(self, ids: Tensor) -> None:
         """A new episode begins at the newest frame.

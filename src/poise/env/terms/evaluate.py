@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.env.frame import DoneTerm, Frame, Observable, ObsTerm, RewardTerm
 from poise.env.observables import Context
 from poise.env.record import TensorFunction, record
+from poise.errors import PoiseError
 from poise.sim import Backend
 
 #: From so many worlds on, two threads evaluate a half each.
@@ -161,6 +162,30 @@ class Terms:
         scores = torch.cat((self._weights @ values, values))
         ends = torch.stack(self.ends(frame, failed))
         return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
+
+    def check(self, sources: Mapping[str, Tensor], worlds: int) -> None:
+        """Evaluates every term once, and names one that gives what it must not.
+
+        Raises:
+            PoiseError: an observation that is not `(N, k)`, a reward that is not `(N,)`, or a
+                termination that is not `(N,)` bool.
+        """
+        frame = self.frame(sources)
+        for kind, terms, ndim in (
+            ("observation", (*self.obs, *self.style), 2),
+            ("reward", self.rewards, 1),
+            ("termination", self.dones, 1),
+        ):
+            for term in terms:
+                value = term.fn(frame, **term.params)
+                want = "(N, k)" if ndim == 2 else "(N,) bool" if kind == "termination" else "(N,)"
+                good = value.ndim == ndim and len(value) == worlds
+                if not good or (kind == "termination") != (value.dtype == torch.bool):
+                    got = f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+                    raise PoiseError(
+                        f"the {kind} '{term.name}' must be {want} for N = {worlds}, got {got}"
+                    )
+        self.evaluated(sources)
 
     def _run(
         self,
