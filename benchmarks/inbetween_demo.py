@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from poise.cli.inbetween import model_of
+from poise.jobs.inbetween.fill import shipped_model
+from poise.learn.model import load_model
 from poise.metrics.plausibility import foot_slide
 from poise.motion import Clip, read_clip
 from poise.motion.windows import foot_joints
@@ -46,7 +47,9 @@ def one(path: Path, args: argparse.Namespace, picture: Path | None) -> dict:
     step = round(args.every * clip.fps)
     keys = list(range(0, clip.frames, step))
     begun = time.perf_counter()
-    filled = fill_keyframes(clip, keys, model_of(args.model), Filling(adaptation=EACH_GAP))
+    filled = fill_keyframes(
+        clip, keys, load_model(shipped_model(args.model)), Filling(adaptation=EACH_GAP)
+    )
     seconds = time.perf_counter() - begun
     gaps = [Gap(a, b) for a, b in pairwise(keys)]
     made, plain = filled.clips[0], interpolated(clip, *clip.tensors(), gaps)

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from field.model_card import model_card
 from perpetual_curves import draw, draw_runs, read_curve
 from perpetual_live import noise, noisy, speed
 from perpetual_measure import (
@@ -48,7 +49,6 @@ from perpetual_text import report
 from speed import machine
 
 from poise.errors import PoiseError
-from poise.eval.model_card import model_card
 from poise.learn.checkpoint import write_atomic
 from poise.motion import ClipLibrary
 from poise.plan import SamplingConfig

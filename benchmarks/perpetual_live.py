@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from field.table import field_table
 from perpetual_measure import Run, Tell, library_task
 from speed import bench_latency, machine
 
 from poise.errors import PoiseError
-from poise.eval.field_table import field_table
 from poise.jobs.library.files import motion_files_of
 from poise.jobs.track import TrackConfig, side_by_side, track
 from poise.jobs.track.crowd import Crowd

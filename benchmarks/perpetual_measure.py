@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from field.card import FieldTable
+from field.table import field_table
 from speed.stance import relaxed_stance
 from torch import Tensor
 
@@ -18,8 +20,6 @@ from poise.env import ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval import ClipResults
 from poise.eval.episodes import run_episodes
-from poise.eval.field_card import FieldTable
-from poise.eval.field_table import field_table
 from poise.eval.recovery import KINDS, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
 from poise.jobs.library.clips import LibraryConfig

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
+from field.table import field_table
 from perpetual_measure import Run
 
 from poise.env import Acts, ImitationEnv
 from poise.eval.episodes import run_episodes
-from poise.eval.field_table import field_table
 from poise.eval.rolloutset import RolloutSet
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.searching import replay, search

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from field.card import FieldTable, markdown
+from field.paper import PHC_RECOVERY, paper_rows
 from perpetual_curves import at_samples
-
-from poise.eval.field_card import FieldTable, markdown
-from poise.eval.field_paper import PHC_RECOVERY, paper_rows
 
 #: What must be said beside every comparison with the paper.
 DIFFERENCE = (

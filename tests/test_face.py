@@ -126,9 +126,9 @@ def test_inbetween_gives_the_frames_of_the_command(tmp_path: Path) -> None:
 
 
 def test_defaults_are_those_of_the_command() -> None:
-    from poise.cli.options import Body, Training
+    from poise.cli import imitate
 
-    assert Training().config(Body()) == poise.ResidualForce()
+    assert imitate.config_of(imitate.Options(WALK, Path("out"))) == poise.ResidualForce()
 
 
 def test_mistakes_are_sentences(tmp_path: Path) -> None:

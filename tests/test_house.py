@@ -75,6 +75,9 @@ def test_only_the_command_line_prints() -> None:
 def test_nothing_that_is_loaded_can_run_code() -> None:
     unsafe_modules = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal", "cloudpickle"}
     unsafe_calls = {"torch.load", "torch.save", "eval", "exec", "os.system"}
+    # One file reads pickles of motion by an allow-list of instructions, and never lets pickle load them.
+    reader = PACKAGE / "motion/io/numpy/pickles.py"
+    unsafe_calls |= {"pickle.load", "pickle.loads", "pickle.Unpickler", "pickle._Unpickler"}
     found = []
     for file in _python():
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -84,7 +87,9 @@ def test_nothing_that_is_loaded_can_run_code() -> None:
             elif isinstance(node, ast.ImportFrom):
                 names = [node.module or ""]
             found += [
-                f"{file.name}:{node.lineno} {n}" for n in names if n.split(".")[0] in unsafe_modules
+                f"{file.name}:{node.lineno} {n}"
+                for n in names
+                if n.split(".")[0] in unsafe_modules and not (file == reader and n == "pickle")
             ]
         found += [f"{file.name}:{line} {name}" for line, name in _calls(file) if name in unsafe_calls]
         text = file.read_text(encoding="utf-8")

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poise.cli.inbetween import model_of
 from poise.cli.main import main
+from poise.jobs.inbetween.fill import shipped_model
+from poise.learn.model import load_model
 from poise.motion import read_clip
 
 
@@ -30,7 +31,7 @@ def test_it_fills_without_training_and_keeps_keyframes(
 
 
 def test_it_is_small_and_says_what_it_learned_from() -> None:
-    model = model_of(None)
+    model = load_model(shipped_model())
     path = Path(str(files("poise"))) / "data/inbetween/model.safetensors"
     assert path.stat().st_size < 6e6
     assert model.kind == "transformer" and model.longest == 60 and model.fps == 30

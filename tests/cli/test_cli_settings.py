@@ -17,7 +17,6 @@ from poise.jobs.inbetween import Inbetween
 from poise.plan import TrajOptConfig
 from poise.recipes import ResidualForce
 from poise.recipes.perpetual import Perpetual
-from poise.recipes.residual_force import paper
 
 KINDS: dict[str, Any] = {"residual-force": ResidualForce, "perpetual": Perpetual, "inbetween": Inbetween}
 
@@ -77,7 +76,7 @@ def test_what_is_stated_reaches_the_settings() -> None:
 
 
 def test_presets_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert imitates("--preset", "paper") == paper(ResidualForce())
+    assert imitates("--preset", "paper") == ResidualForce.paper()
     with pytest.raises(PoiseError, match="preset"):
         imitates("--preset", "papr")
     for verb, argv in (("imitate", []), ("train", ["perpetual"]), ("train", ["inbetween"])):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,9 +55,9 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, fills, writes."""
+    from poise.jobs.inbetween.fill import inbetween
     from poise.motion.io import write_clip
     from poise.synth.gaps import check_keyframes
-    from poise.synth.inbetween import EACH_GAP, Filling, fill_keyframes
 
     o = options
     keys = frames_of(o.keyframes)
@@ -69,9 +69,6 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         may_write(path, o.force, o.clip)
     clip = o.reading.read(o.clip)
     check_keyframes(keys, clip.frames, str(o.clip))
-    model = model_of(o.model)
-    adaptation = replace(EACH_GAP, iterations=o.adapt) if o.adapt else None
-    filling = Filling(o.samples, o.foot_lock, adaptation=adaptation, seed=o.seed)
     begun = time.monotonic()
     tell(f"filling {len(keys) - 1} gaps", "dim")
     with showing("filling", at_once=False) as show:
@@ -81,7 +78,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             left = clock(took / done * (of - done))
             show(done / of, f"gap {done} of {of}, {done / took:.1f} gaps/s, {left} left")
 
-        filled = fill_keyframes(clip, keys, model, filling, count)
+        filled = inbetween(
+            clip, keys, o.model, samples=o.samples, foot_lock=o.foot_lock, adapt=o.adapt, seed=o.seed,
+            on_gap=count,
+        )  # fmt: skip
     for warning in filled.warnings:
         tell(f"warning: {warning}.", "yellow")
     outputs = {"clip" if one else f"clip-{k}": path for k, path in enumerate(outs)}
@@ -115,20 +115,3 @@ def frames_of(text: str) -> tuple[int, ...]:
     except ValueError:
         hint = "Write for example --keyframes 0,30,45"
         raise PoiseError(f"--keyframes needs whole numbers, got '{text}'", hint=hint) from None
-
-
-def model_of(folder: Path | None):
-    """The model named, or the one that came with Poise."""
-    from importlib.resources import files
-
-    from poise.learn.model import MODEL, load_model
-
-    if folder is not None:
-        return load_model(folder)
-    shipped = Path(str(files("poise"))) / "data" / "inbetween" / MODEL
-    if not shipped.exists():
-        raise PoiseError(
-            "no in-betweening network came with this installation",
-            hint="Train one with poise train inbetween --library DIR -o RUN, and give --model RUN",
-        )
-    return load_model(shipped)

@@ -25,7 +25,7 @@ SOURCES = {
     "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
 }
-_TYPES = {"float": float, "int": int, "bool": bool, "str": str, "Literal": Literal}
+_TYPES: dict[str, Any] = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.
 _UNSAID = {
     "num_envs": "environments that are simulated at once.",
@@ -75,17 +75,25 @@ def _fields_of(recipe: str) -> dict[str, tuple[Any, Any, str]]:
     known = dict(_TYPES)
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.value).startswith("Literal["):
-            known[ast.unparse(node.targets[0])] = eval(ast.unparse(node.value), known)
+            known[ast.unparse(node.targets[0])] = _type(node.value, known)
     kind = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name)
     rows = {str(ast.unparse(n.target)): n for n in kind.body if isinstance(n, ast.AnnAssign)}
     texts = _texts(ast.get_docstring(kind) or "", tuple(rows))
     out: dict[str, tuple[Any, Any, str]] = {}
     for row, node in rows.items():
-        written = ast.unparse(node.annotation).removesuffix(" | None")
-        if isinstance(node.value, ast.Constant) and written.partition("[")[0] in known:
-            text = texts.get(row) or _UNSAID.get(row, "")
-            out[row] = eval(written, dict(known)), node.value.value, text
+        plain = _type(node.annotation, known)
+        if isinstance(node.value, ast.Constant) and plain is not None:
+            out[row] = plain, node.value.value, texts.get(row) or _UNSAID.get(row, "")
     return out
+
+
+def _type(node: ast.expr, known: Mapping[str, Any]) -> Any:
+    """The type of plain values that an annotation names, `X | None` as X; None for any other type."""
+    if isinstance(node, ast.BinOp) and isinstance(node.right, ast.Constant):
+        return _type(node.left, known)
+    if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
+        return Literal[ast.literal_eval(node.slice)]
+    return known.get(node.id) if isinstance(node, ast.Name) else None
 
 
 def _texts(doc: str, names: tuple[str, ...]) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from typing import TypeVar
 
@@ -17,7 +16,7 @@ from poise.env.goals.goal import Goal
 from poise.env.make import goal_of, plugins_of
 from poise.env.plugins import Ended, Plugin
 from poise.env.reference import Reference
-from poise.env.snapshot import Snapshot, copied, written
+from poise.env.snapshot import Snapshot, put, take
 from poise.env.step_log import StepLog
 from poise.env.style import ClipFeatures, ClipWindows
 from poise.env.task import EnvStep, TaskConfig
@@ -94,7 +93,8 @@ class ImitationEnv:
         # Once as they are, so that it is known which tensors the terms read.
         self._terms.evaluated(self._sources.live(self.goal.now(), self.goal.ahead()))
         self._sources.settle()
-        obs = self._begin()
+        # Worlds stand on their goals where these are known already.
+        obs = self._set_down(None) if self.goal.begins else self.observe()
         self.num_obs = obs.shape[1]
         self._style = seen_by(self._terms.style, self._frame())
         self._obs = torch.empty(n, self.num_obs, device=here)
@@ -113,12 +113,6 @@ class ImitationEnv:
         )
         kinds = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         return Terms(*kinds, placed(task.style, here), named, context, self._ends, here, fused)
-
-    def _begin(self) -> Tensor:
-        """The first observations; worlds stand on their goals where these are known already."""
-        if self.goal.begins:
-            return self._set_down(None, None)
-        return self.observe()
 
     # --- what is followed ---------------------------------------------------------------------
 
@@ -187,7 +181,7 @@ class ImitationEnv:
         if kind is not None and not any(type(p).kinds is not Plugin.kinds for p in self.plugins):
             raise PoiseError("this task knows no falls", hint="Set TaskConfig.recovery")
         self.goal.seek(clip, frame)
-        return self._set_down(None, kind)
+        return self._set_down(kind)
 
     def _restart(self, ids: Tensor) -> None:
         """New episodes in worlds `ids (n,)`."""
@@ -195,8 +189,8 @@ class ImitationEnv:
         drawn = (p.kinds(len(ids), self.goal.rng) for p in self.plugins)
         self._place(ids, next((kind for kind in drawn if kind is not None), None))
 
-    def _set_down(self, ids: Tensor | None, kind: Tensor | None) -> Tensor:
-        self._place(ids, kind)
+    def _set_down(self, kind: Tensor | None) -> Tensor:
+        self._place(None, kind)
         return self.observe()
 
     def _place(self, ids: Tensor | None, kind: Tensor | None) -> None:
@@ -350,16 +344,8 @@ class ImitationEnv:
     # --- copies and persistence ---------------------------------------------------------------
 
     def snapshot(self, rows: Tensor | None = None) -> Snapshot:
-        """Everything that worlds `rows (n,)`, all for None, are: physics, bodies, goal, episode,
-        recovery; and of all worlds what they share: help, failure rates, odds, random generators."""
-        sim = self.backend.snapshot()
-        goal = {f"goal/{k}": v for k, v in self.goal.rows().items()}
-        worlds = {"sim": sim, "age": self.age, "action": self.action, **goal}
-        for plugin in self.plugins:
-            worlds |= plugin.rows()
-        width = self.backend.snapshot(derived=False).shape[1]
-        shared = self._shared() if rows is None else None
-        return Snapshot(copied(worlds, rows), width, dict(self.goal.shared()), shared)
+        """Everything that worlds `rows (n,)`, all for None, are, see `Snapshot`."""
+        return take(self, rows)
 
     def restore(self, snapshot: Snapshot, rows: Tensor | None = None) -> Tensor:
         """Makes worlds `rows (n,)`, all for None, what a snapshot of n worlds holds; a snapshot of one
@@ -372,46 +358,9 @@ class ImitationEnv:
         Raises:
             PoiseError: another number of worlds, or the snapshot of another kind of environment.
         """
-        count = self.num_envs if rows is None else len(rows)
-        if len(snapshot) == 1 and count > 1:
-            snapshot = snapshot.repeated(count)
-        if len(snapshot) != count:
-            raise PoiseError(
-                f"the snapshot holds {len(snapshot)} worlds, and {count} are to be restored"
-            )
-        goal = {f"goal/{k}": v for k, v in self.goal.rows().items()}
-        into = {"age": self.age, "action": self.action, **goal}
-        for plugin in self.plugins:
-            into |= plugin.rows()
-        missing = sorted(into.keys() - snapshot.worlds.keys())
-        if missing:
-            raise PoiseError(f"the snapshot of another kind of environment has no '{missing[0]}'")
-        self.goal.load_shared(snapshot.goal)
-        written(into, snapshot.worlds, rows)
-        for plugin in self.plugins:
-            plugin.assign(rows, self.goal.body(rows))
-        sim = snapshot.worlds["sim"]
-        if sim.shape[1] != self.backend.snapshot().shape[1]:
-            # Other terms have other fields of the state fetched, which follow from the rest.
-            sim = sim[:, : snapshot.physics]
-        self.backend.restore(sim, rows)
-        if rows is None and snapshot.shared is not None:
-            self._load_shared(snapshot.shared)
+        put(self, snapshot, rows)
         self.goal.aim(None, self._held())
         return self._observe()
-
-    def _shared(self) -> dict[str, Tensor]:
-        own = {k: v for plugin in self.plugins for k, v in plugin.state().items()}
-        if self.goal.begins:
-            own["weights"] = self.weights
-        return {**own, "rng": self.goal.rng.get_state()}
-
-    def _load_shared(self, shared: Mapping[str, Tensor]) -> None:
-        for plugin in self.plugins:
-            plugin.load_state(shared)
-        if "weights" in shared:
-            self.weights = shared["weights"]
-        self.goal.rng.set_state(shared["rng"])
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a bit-exact continuation needs; what another kind of backend needs, too."""

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
+
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.env.env import ImitationEnv
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +45,58 @@ class Snapshot:
         return Snapshot({k: v[rows] for k, v in self.worlds.items()}, self.physics, self.goal, None)
 
 
-def copied(values: Mapping[str, Tensor], rows: Tensor | None) -> dict[str, Tensor]:
-    """Copies of rows `(n,)` of tensors `(N, ...)`, all for None."""
-    return {k: v.clone() if rows is None else torch.index_select(v, 0, rows) for k, v in values.items()}
+def take(env: ImitationEnv, rows: Tensor | None) -> Snapshot:
+    """What worlds `rows (n,)` of an environment are, all for None: physics, bodies, goal, episode,
+    recovery; and of all worlds what they share: help, failure rates, odds, random generators."""
+    worlds = {"sim": env.backend.snapshot(), **_rows(env)}
+    copies = {k: v.clone() if rows is None else v.index_select(0, rows) for k, v in worlds.items()}
+    width = env.backend.snapshot(derived=False).shape[1]
+    return Snapshot(copies, width, dict(env.goal.shared()), _shared(env) if rows is None else None)
 
 
-def written(into: Mapping[str, Tensor], values: Mapping[str, Tensor], rows: Tensor | None) -> None:
-    """Writes values `(n, ...)` into rows `(n,)` of the tensors of the same names, all for None."""
+def put(env: ImitationEnv, snapshot: Snapshot, rows: Tensor | None) -> None:
+    """Makes worlds `rows (n,)` of an environment, all for None, what a snapshot holds; see
+    `ImitationEnv.restore`, which aims their goals then."""
+    count = env.num_envs if rows is None else len(rows)
+    if len(snapshot) == 1 and count > 1:
+        snapshot = snapshot.repeated(count)
+    if len(snapshot) != count:
+        raise PoiseError(f"the snapshot holds {len(snapshot)} worlds, and {count} are to be restored")
+    into = _rows(env)
+    missing = sorted(into.keys() - snapshot.worlds.keys())
+    if missing:
+        raise PoiseError(f"the snapshot of another kind of environment has no '{missing[0]}'")
+    env.goal.load_shared(snapshot.goal)
     for name, value in into.items():
         if rows is None:
-            value.copy_(values[name])
+            value.copy_(snapshot.worlds[name])
         else:
-            value[rows] = values[name]
+            value[rows] = snapshot.worlds[name]
+    for plugin in env.plugins:
+        plugin.assign(rows, env.goal.body(rows))
+    sim = snapshot.worlds["sim"]
+    if sim.shape[1] != env.backend.snapshot().shape[1]:
+        # Other terms have other fields of the state fetched, which follow from the rest.
+        sim = sim[:, : snapshot.physics]
+    env.backend.restore(sim, rows)
+    if rows is None and snapshot.shared is not None:
+        for plugin in env.plugins:
+            plugin.load_state(snapshot.shared)
+        if "weights" in snapshot.shared:
+            env.weights = snapshot.shared["weights"]
+        env.goal.rng.set_state(snapshot.shared["rng"])
+
+
+def _rows(env: ImitationEnv) -> dict[str, Tensor]:
+    """The tensors `(N, ...)` of an environment beside its physics, by name."""
+    goal = {f"goal/{k}": v for k, v in env.goal.rows().items()}
+    own = {"age": env.age, "action": env.action, **goal}
+    return {**own, **{k: v for plugin in env.plugins for k, v in plugin.rows().items()}}
+
+
+def _shared(env: ImitationEnv) -> dict[str, Tensor]:
+    """What all worlds of an environment share, by name."""
+    own = {k: v for plugin in env.plugins for k, v in plugin.state().items()}
+    if env.goal.begins:
+        own["weights"] = env.weights
+    return {**own, "rng": env.goal.rng.get_state()}

@@ -12,21 +12,15 @@ from poise.eval.episodes import (
     simulate,
     start_frames,
 )
-from poise.eval.field_card import FieldTable, markdown, read_field_table, write_field_table
-from poise.eval.field_paper import PHC_RECOVERY, PHC_ROWS, paper_rows
-from poise.eval.field_table import field_table
 from poise.eval.recovery import RecoveryCard, recovery_card, trial_task, write_recovery
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.scorecard import Help, ScoreCard, read_score, score_rollouts, write_score
 from poise.eval.verdicts import THRESHOLDS, Row, Threshold, table
 
 __all__ = [
-    "PHC_RECOVERY",
-    "PHC_ROWS",
     "THRESHOLDS",
     "ClipJudge",
     "ClipResults",
-    "FieldTable",
     "Help",
     "Observer",
     "Recorder",
@@ -37,10 +31,6 @@ __all__ = [
     "ScoreCard",
     "Threshold",
     "clip_figures",
-    "field_table",
-    "markdown",
-    "paper_rows",
-    "read_field_table",
     "read_score",
     "record",
     "recovery_card",
@@ -51,7 +41,6 @@ __all__ = [
     "start_frames",
     "table",
     "trial_task",
-    "write_field_table",
     "write_recovery",
     "write_score",
 ]

@@ -76,7 +76,7 @@ class ClipJudge:
         """Adds one frame of each clip that has not ended or failed."""
         if step == 0:
             return False
-        sim, ref = env.pose().pos, env.reference.gather(env.clip, env.frame).pos
+        sim, ref = env.pose().pos, env.goal_pose().pos
         distance, counted = mpjpe_global(sim, ref), self.alive & (step <= self.last)
         # A world that went bad has no distance, and has failed.
         good = distance <= self._limit

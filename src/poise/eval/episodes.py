@@ -190,7 +190,7 @@ class Recorder:
         """Keeps the frame `step` of all episodes."""
         t = step
         self._qpos.append(env.backend.state.qpos[list(self._first.values())].clone())
-        sim, ref = env.pose(), env.reference.gather(env.clip, env.frame)
+        sim, ref = env.pose(), env.goal_pose()
         out = self.tensors
         out["pos"][:, t], out["quat"][:, t] = sim.pos, sim.quat
         out["ref_pos"][:, t], out["ref_quat"][:, t] = ref.pos, ref.quat

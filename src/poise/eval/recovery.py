@@ -24,7 +24,6 @@ from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import FALLEN, FAR
 from poise.errors import PoiseError
 from poise.eval.episodes import simulate
-from poise.eval.field_paper import PHC_RECOVERY
 
 #: The fail-states by name.
 KINDS: Mapping[str, int] = {"fallen": FALLEN, "far": FAR, "fallen and far": FALLEN | FAR}
@@ -72,27 +71,6 @@ class RecoveryCard:
         for row in data["rows"]:
             row.update({k: None for k in ("median", "slowest") if math.isnan(row[k])})
         return data
-
-    def to_markdown(self) -> str:
-        """A table with the paper's rows beneath its own."""
-        times = [f"Succ-{s:g}s" for s in self.seconds]
-        kinds = [r.kind for r in self.rows]
-        head = ["method", "trials", *(f"{kind} {time}" for kind in kinds for time in times)]
-        own = [self.method, str(max(r.trials for r in self.rows))]
-        lines = [head, ["---"] * len(head), [*own, *(_share(x) for r in self.rows for x in r.within)]]
-        told = {(r.method, r.start): (r.succ_5s, r.succ_10s) for r in PHC_RECOVERY}
-        for name in dict.fromkeys(r.method for r in PHC_RECOVERY):
-            found = [dict(zip(SECONDS, told[name, kind], strict=True)) for kind in kinds]
-            cells = [_share(f.get(s, math.nan) / 100) for f in found for s in self.seconds]
-            lines.append([f"{name} (table 4)", "1000", *cells])
-        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-        low, high = self.distance
-        where = f"{low:g} m" if low == high else f"{low:g} to {high:g} m"
-        return (
-            f"{table}\n\nReference: {self.reference} from frame {self.frame}. Back: bodies on average "
-            f"within {self.near:g} m for {self.held:g} s. Far: {where} away. The paper does not say "
-            "what counts as back; its clip stands still.\n"
-        )
 
 
 def trial_task(
@@ -231,7 +209,3 @@ def _row(kind: str, back: Tensor, seconds: Sequence[float]) -> Recovered:
     within = tuple(float((back <= s + 1e-9).double().mean()) for s in seconds)
     median, slowest = (float(came.median()), float(came.max())) if len(came) else (math.nan, math.nan)
     return Recovered(kind, len(back), within, median, slowest)
-
-
-def _share(x: float) -> str:
-    return "" if math.isnan(x) else f"{100 * x:.1f} %"

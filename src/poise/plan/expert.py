@@ -143,7 +143,7 @@ class Expert:
     def _help(self, rows: Tensor) -> Tensor:
         """The root wrench as residual action: planned part and spring, cut to the limits."""
         env, residual = self.env, self._residual
-        state, ref = env.backend.state, env.reference.gather(env.clip, env.frame)
+        state, ref = env.backend.state, env.goal_pose()
         qpos, qvel = state.qpos[:, :7].float(), state.qvel[:, :6].float()
         k, d, k_turn, d_turn = self._gains
         quat, ref_quat = qpos[:, 3:7], ref.qpos[:, 3:7]

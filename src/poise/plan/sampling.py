@@ -216,7 +216,7 @@ class SamplingControl:
             given.append(self.offsets[step] + drawn)
             made.append(self.policy.act(obs) + given[-1])
             obs = env.step(made[-1]).final_obs
-            ref = env.reference.gather(env.clip, env.frame).pos
+            ref = env.goal_pose().pos
             off = mpjpe_global(env.pose().pos, ref) / 1000.0
             lost |= ~(off <= LOST)
             cost, error = cost - env.imitation, error + off

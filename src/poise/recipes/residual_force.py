@@ -117,8 +117,7 @@ class ResidualForce:
 
         Not expressed: targets about a constant bent pose with a scale of 5 at some hinges, weights of
         the feet in the pose reward, reference velocities clipped at 10, ten frames after the end of a
-        clip, episodes of whole clips per worker, explicit forces on every body (here on pelvis and
-        feet).
+        clip, episodes of whole clips per worker, explicit forces on every body (here pelvis and feet).
         """
         return _stated("code", clip, changes)
 

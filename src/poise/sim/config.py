@@ -74,11 +74,6 @@ class SimConfig:
         """Seconds per physics step."""
         return 1.0 / self.rate_hz
 
-    @property
-    def control_step(self) -> float:
-        """Seconds per control step."""
-        return 1.0 / self.control_hz
-
     def apply(self, target: mujoco.MjSpec | mujoco.MjModel) -> None:
         """Write these settings into a model description or a compiled model, in place."""
         option = target.option if isinstance(target, mujoco.MjSpec) else target.opt

@@ -23,7 +23,6 @@ from poise.env.recovery.config import (
     toward,
 )
 from poise.env.recovery.falls import fall_states, rest_angles
-from poise.errors import PoiseError
 from poise.sim import Backend
 
 
@@ -202,15 +201,3 @@ class RecoveryClock(Plugin):
 
     def rows(self) -> dict[str, Tensor]:
         return {"recovery": self.table}
-
-
-def recovery_of(plugins: tuple[Plugin, ...]) -> RecoveryClock:
-    """The recovery clock among an environment's plug-ins.
-
-    Raises:
-        PoiseError: the task knows no recovery.
-    """
-    for plugin in plugins:
-        if isinstance(plugin, RecoveryClock):
-            return plugin
-    raise PoiseError("this task knows no falls", hint="Set TaskConfig.recovery")

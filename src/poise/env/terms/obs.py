@@ -14,11 +14,6 @@ def root_height(frame: Frame) -> Tensor:
     return frame.sim.qpos[:, 2:3]
 
 
-def root_quat(frame: Frame) -> Tensor:
-    """Root orientation wxyz as it is `(N, 4)` (the authors' observation)."""
-    return _root(frame.sim)
-
-
 def root_tilt(frame: Frame) -> Tensor:
     """Root orientation without heading, first two matrix columns `(N, 6)`."""
     columns = quat_to_sixd(_root(frame.sim)).unflatten(-1, (2, 3))

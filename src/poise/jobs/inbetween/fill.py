@@ -25,14 +25,19 @@ class Inbetweened(Result):
     """What came of filling keyframes; nothing is simulated, so there is no score.
 
     clips: the first is the best guess, the others are variants. source: what came in. keyframes: its
-    frames that stayed. notes: what is doubtful, in sentences.
+    frames that stayed. warnings: what is doubtful.
     """
 
     clips: tuple[Clip, ...]
     source: Clip
     keyframes: tuple[int, ...]
-    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
     card: None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is doubtful, and what was guessed about the file, in sentences."""
+        return (*(f"{w}." for w in self.warnings), *self.source.skeleton.source.notes)
 
     @property
     def clip(self) -> Clip:
@@ -82,8 +87,7 @@ def inbetween(
     adaptation = replace(EACH_GAP, iterations=adapt) if adapt else None
     filling = Filling(samples, foot_lock, adaptation=adaptation, seed=seed)
     filled = fill_keyframes(source, keys, net, filling, on_gap)
-    notes = (*(f"{w}." for w in filled.warnings), *source.skeleton.source.notes)
-    return Inbetweened(filled.clips, source, tuple(keys), notes)
+    return Inbetweened(filled.clips, source, tuple(keys), filled.warnings)
 
 
 def shipped_model(path: str | Path | None = None) -> Path:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,25 +12,23 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import ScoreCard, record, score_rollouts
+from poise.eval import record, score_rollouts
 from poise.eval.judged import judge
-from poise.jobs.deliver import finished, simulated_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
 from poise.jobs.track.crowd import Crowd, places
-from poise.jobs.track.placement import Placed, home, place
+from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.points import fitted, follow
 from poise.jobs.track.policy import Tracker
-from poise.jobs.track.recovering import Losses, with_returns
+from poise.jobs.track.recovering import with_returns
 from poise.jobs.track.searching import replay, search, sentence
-from poise.kin import hold_feet
+from poise.jobs.track.tracked import Clean, Tracked
 from poise.kin.fit import widen
 from poise.metrics import mpjpe_global, success_rule
 from poise.motion import Clip, ClipLibrary
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Noise, perturb_clip, perturb_points
-from poise.plan import SamplingConfig, SamplingResult
+from poise.plan import SamplingConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
 
@@ -77,92 +73,6 @@ class TrackConfig:
         if self.search and (self.recover or self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes or is put back"
             raise PoiseError(f"a motion is searched for a single character, not {what}")
-
-
-@dataclass(frozen=True)
-class Clean:
-    """An input with noise, and the character that followed it, beside the motion without noise.
-
-    Attributes:
-        noise_mm: mean distance of the bodies in the input.
-        off_mm: that of the character, up to where it failed.
-        succeeded: whether the character stayed within 0.5 m of the motion without noise.
-    """
-
-    noise_mm: float
-    off_mm: float
-    succeeded: bool
-
-    def sentence(self) -> str:
-        """The figures in words."""
-        return (
-            f"The score is that against the input with noise, which moved the bodies by "
-            f"{self.noise_mm:.0f} mm on average; the character is {self.off_mm:.0f} mm from the motion "
-            "without noise."
-        )
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Tracked(Result):
-    """What came of tracking.
-
-    Attributes:
-        imitation: the motion as a task of its own.
-        evaluation: score card (help 0), rollouts, the episode.
-        placed: the motion on the body.
-        failures: (character, seconds) of each failure in the order of time; without `reset_on_fail` and
-            `recover` at most one per character.
-        clean: what the noise changed, None without noise.
-        notes: sentences on the input and the noise.
-        losses: with `recover`, when the motion was lost and found again; None where it was not.
-        found: with `search`, what that came to; None where the policy alone did not lose the motion.
-    """
-
-    tracker: Tracker
-    imitation: Imitation
-    evaluation: Evaluation
-    placed: Placed
-    failures: tuple[tuple[int, float], ...]
-    clean: Clean | None
-    notes: tuple[str, ...]
-    losses: Losses | None = None
-    found: SamplingResult | None = None
-
-    @property
-    def failed_s(self) -> tuple[float, ...]:
-        """Seconds at which the first character failed."""
-        return tuple(t for character, t in self.failures if character == 0)
-
-    @cached_property
-    def card(self) -> ScoreCard:
-        """The score of the simulation, help 0, with what holding the feet did."""
-        return finished(self.imitation, self.evaluation).card
-
-    @property
-    def clip(self) -> Clip:
-        """The first character's motion on the skeleton that came in, standing feet held."""
-        return self.delivered()
-
-    def delivered(self, character: int = 0, hold: bool = True) -> Clip:
-        """A character's motion on the skeleton that came in. hold: standing feet are held."""
-        made = self.motion(character)
-        if hold:
-            made = hold_feet(made, self.imitation.humanoid.table)[0]
-        if self.placed.moved is None:
-            return made
-        return home(made, self.placed, self.tracker).replaced(name=made.name)
-
-    def _shown(self) -> Shown:
-        return Shown(self.clip, self.placed.source, self.card, self.notes)
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        from poise.jobs.track.written import write
-
-        return write(self, folder).paths
-
-    def motion(self, character: int = 0) -> Clip:
-        """The simulated motion on the body's skeleton, as it was simulated."""
-        return simulated_clip(self.imitation, self.evaluation, character)
 
 
 def track(
@@ -326,7 +236,7 @@ class Keeper:
         """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
         env = self.env
         if self.resets:
-            ref = env.reference.gather(env.clip, env.frame).pos
+            ref = env.goal_pose().pos
             failed = ~(mpjpe_global(env.pose().pos, ref) <= self._limit_mm)
             if bool(failed.any()):
                 obs = self._mend(env, failed, obs)

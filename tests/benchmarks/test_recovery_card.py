@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from field.paper import PHC_RECOVERY
+from field.recovery import recovery_markdown
 
 from poise.control import PDTargets
 from poise.env import Recovery, TaskConfig
 from poise.env.recovery.falls import Drop
 from poise.errors import PoiseError
 from poise.eval import recovery_card, trial_task, write_recovery
-from poise.eval.field_paper import PHC_RECOVERY
 from poise.eval.recovery import KINDS, back_after
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
@@ -94,7 +95,7 @@ def test_a_policy_that_does_nothing_never_gets_up(built, tmp_path):
     write_recovery(card, path)
     data = json.loads(path.read_text())
     assert data["rows"][0]["median"] is None and data["rows"][0]["trials"] == 3
-    text = card.to_markdown()
+    text = recovery_markdown(card)
     assert "| still | 3 | 0.0 % | 0.0 % |" in text
     assert "| PHC (table 4) | 1000 | 95.0 % | 83.7 % |" in text and "3 m away" in text
 

@@ -6,9 +6,9 @@ from copy import deepcopy
 from typing import Any
 
 import pytest
+from field.model_card import model_card
 
 from poise.errors import PoiseError
-from poise.eval.model_card import model_card
 
 ABOUT: dict[str, Any] = {
     "clips": 12, "minutes_of_motion": 3.5, "subjects": ["cmu 02", "cmu 07"], "stage": "composer",

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from field.card import FieldTable, markdown
+from field.paper import PHC_RECOVERY, paper_rows
 from poise.errors import PoiseError
-from poise.eval.field_card import FieldTable, markdown
-from poise.eval.field_paper import PHC_RECOVERY, paper_rows
 
 #: Subjects that are named one by one.
 NAMED = 60

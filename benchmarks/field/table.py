@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from field.card import FIGURES, ClipErrors, Errors, FieldTable, View
 from poise.errors import PoiseError
-from poise.eval.field_card import FIGURES, ClipErrors, Errors, FieldTable, View
 from poise.eval.judged import Sums, judge
 from poise.eval.rolloutset import RolloutSet
 from poise.metrics import (

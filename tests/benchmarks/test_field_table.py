@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from field.card import FIGURES, FieldTable, markdown, read_field_table, write_field_table
+from field.paper import PHC_RECOVERY, PHC_ROWS, paper_rows
+from field.table import field_table
 
 from poise.errors import PoiseError
-from poise.eval.field_card import FIGURES, FieldTable, markdown, read_field_table, write_field_table
-from poise.eval.field_paper import PHC_RECOVERY, PHC_ROWS, paper_rows
-from poise.eval.field_table import field_table
 from poise.eval.rolloutset import RolloutSet
 
 

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from field.paper import PHC_ROWS, PaperRow
 from poise.errors import PoiseError
-from poise.eval.field_paper import PHC_ROWS, PaperRow
 from poise.learn.checkpoint import write_atomic
 
 View = Literal["all_frame", "all_clip", "succ_frame", "succ_clip"]

@@ -1,0 +1,133 @@
+"""What came of tracking: the motion on the skeleton that came in, its score, its report, its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from poise.errors import PoiseError
+from poise.eval import ScoreCard
+from poise.jobs.deliver import Delivery, deliver, finished, simulated_clip
+from poise.jobs.result import Result, Shown
+from poise.jobs.runs import Evaluation
+from poise.jobs.track.placement import Placed, home
+from poise.jobs.track.policy import Tracker
+from poise.jobs.track.recovering import Losses
+from poise.kin import hold_feet
+from poise.motion import Clip
+from poise.motion.io import home_suffix, write_clip
+from poise.plan import SamplingResult
+from poise.recipes.imitation import Imitation
+
+
+@dataclass(frozen=True)
+class Clean:
+    """An input with noise, and the character that followed it, beside the motion without noise.
+
+    noise_mm: mean distance of the bodies in the input. off_mm: that of the character, up to where it
+    failed. succeeded: whether the character stayed within 0.5 m of the motion without noise.
+    """
+
+    noise_mm: float
+    off_mm: float
+    succeeded: bool
+
+    def sentence(self) -> str:
+        """The figures in words."""
+        return (
+            f"The score is that against the input with noise, which moved the bodies by "
+            f"{self.noise_mm:.0f} mm on average; the character is {self.off_mm:.0f} mm from the motion "
+            "without noise."
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tracked(Result):
+    """What came of tracking.
+
+    imitation: the motion as a task of its own. evaluation: score card (help 0), rollouts, the episode.
+    placed: the motion on the body. failures: (character, seconds) of each failure in the order of time;
+    without `reset_on_fail` and `recover` at most one per character. clean: what the noise changed, None
+    without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
+    was lost and found again; None where it was not. found: with `search`, what that came to; None where
+    the policy alone did not lose the motion.
+    """
+
+    tracker: Tracker
+    imitation: Imitation
+    evaluation: Evaluation
+    placed: Placed
+    failures: tuple[tuple[int, float], ...]
+    clean: Clean | None
+    notes: tuple[str, ...]
+    losses: Losses | None = None
+    found: SamplingResult | None = None
+
+    @property
+    def failed_s(self) -> tuple[float, ...]:
+        """Seconds at which the first character failed."""
+        return tuple(t for who, t in self.failures if who == 0)
+
+    @cached_property
+    def card(self) -> ScoreCard:
+        """The score of the simulation, help 0, with what holding the feet did."""
+        return finished(self.imitation, self.evaluation).card
+
+    @property
+    def clip(self) -> Clip:
+        """The first character's motion on the skeleton that came in, standing feet held."""
+        return self.delivered()
+
+    def delivered(self, character: int = 0, hold: bool = True) -> Clip:
+        """A character's motion on the skeleton that came in. hold: standing feet are held."""
+        made = self.motion(character)
+        if hold:
+            made = hold_feet(made, self.imitation.humanoid.table)[0]
+        if self.placed.moved is None:
+            return made
+        return home(made, self.placed, self.tracker).replaced(name=made.name)
+
+    def _shown(self) -> Shown:
+        return Shown(self.clip, self.placed.source, self.card, self.notes)
+
+    def _save_all(self, folder: Path) -> dict[str, Path]:
+        return write(self, folder).paths
+
+    def motion(self, character: int = 0) -> Clip:
+        """The simulated motion on the body's skeleton, as it was simulated."""
+        return simulated_clip(self.imitation, self.evaluation, character)
+
+
+def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
+    """Writes the motion, `score.json` and `report.html` into `out`, see `deliver`.
+
+    The motion is on the skeleton that came in; where that is not the body's, the motion on the body's
+    skeleton lies beside it as `body.bvh`.
+
+    Args:
+        motion: the file of the motion, in place of one in `out`. hold: see `deliver`.
+    """
+    t, placed, count = tracked, tracked.placed, len(tracked.evaluation.recordings)
+    if count > 1 and motion is not None:
+        raise PoiseError(f"{count} characters make {count} files", motion, "Give a folder as -o")
+    other = placed.moved is not None
+    inner = out / "body.bvh" if other and count == 1 else motion
+    said = tuple(
+        f"The character failed at {seconds:.1f} s" + (f" (character {k + 1})." if count > 1 else ".")
+        for k, seconds in t.failures
+    )
+    done = deliver(t.imitation, t.evaluation, out, {}, inner, hold, placed.source, said)
+    if not other:
+        return done
+    paths: dict[str, Path] = {}
+    for k, (name, path) in enumerate(done.paths.items()):
+        if k >= count:
+            paths[name] = path
+            continue
+        back = t.delivered(k, hold)
+        body = name.replace("simulated", "body", 1)
+        paths[body] = path.rename(out / f"{body}{path.suffix}")
+        paths[name] = motion or out / f"{name}{home_suffix(back)}"
+        write_clip(back, paths[name])
+    return replace(done, paths=paths)
