@@ -190,7 +190,7 @@ def test_states_of_other_kinds():
     budget = HelpBudget(RULE, groups=2)
     budget.set(torch.tensor([0.5, 0.25]))
     ended(budget, (0, True), (1, False))
-    # One of all worlds: its scale for all, and episodes that are nobody's in particular.
+    # One of all worlds: its scale for all, and episodes of no clip in particular.
     other = HelpBudget(RULE, groups=3)
     other.load_state(torch.tensor([0.75, 8.0, 6.0, 2.0], dtype=torch.float64))
     assert other.scale.tolist() == [0.75] * 3 and other.steps == 8
