@@ -1,4 +1,4 @@
-"""Help by clip through the stages: limits, evaluations, the table, the stage record, and a resumed run."""
+"""Help by clip through the stages: limits, evaluations, the table, the record, and a resumed run."""
 
 from __future__ import annotations
 
