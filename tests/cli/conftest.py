@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny_clips import deepmimic, put
+from tiny_clips import MINIATURE, deepmimic, put
 
 from poise.cli.main import main
-
-MINIATURE = ["--iterations", "2", "--envs", "16", "--threads", "1"]
 
 
 @pytest.fixture(scope="session")

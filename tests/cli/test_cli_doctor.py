@@ -141,10 +141,10 @@ def test_sides_can_be_exchanged(tmp_path: Path, capsys) -> None:
 
 def test_keypoints_state_their_evidence(tmp_path: Path, answered) -> None:
     from poise.motion.io.points.raw import RawPoints, assemble_points
-    from poise.motion.io.raw import Options
+    from poise.motion.io.raw import ReadOptions
 
     clip = read_clip(WALK)
     points = clip.positions() * 1000
     raw = RawPoints("trc", tmp_path / "a.trc", tuple(clip.skeleton.names), points, 30.0)
-    evidence = dict(assemble_points(raw, Options()).source.evidence)
+    evidence = dict(assemble_points(raw, ReadOptions()).source.evidence)
     assert evidence["fps"] == "The file has 30 frames per second" and "code" not in evidence["unit"]

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny_clips import MINIATURE
 
 import poise
-from conftest import MINIATURE
 from poise.cli.answer import Answer, document, plain
 from poise.cli.main import VERBS, main
 from poise.errors import PoiseError

@@ -7,9 +7,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tiny_clips import put
+from tiny_clips import MINIATURE, put
 
-from conftest import MINIATURE
 from poise.cli.main import main
 from poise.cli.output import may_write, places
 from poise.errors import PoiseError

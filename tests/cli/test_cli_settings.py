@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import pytest
+from tiny_clips import deepmimic, put
 
 from poise.cli import imitate, train
 from poise.cli.main import main
@@ -14,6 +15,8 @@ from poise.cli.parse import parse
 from poise.cli.settings import SOURCES, _fields_of, configured, dotted, stated
 from poise.errors import PoiseError
 from poise.jobs.inbetween import Inbetween
+from poise.jobs.presets import preset_of
+from poise.motion import read_clip
 from poise.plan import TrajOptConfig
 from poise.recipes import ResidualForce
 from poise.recipes.perpetual import Perpetual
@@ -76,9 +79,13 @@ def test_what_is_stated_reaches_the_settings() -> None:
 
 
 def test_presets_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert imitates("--preset", "paper") == ResidualForce.paper()
+    stand = put(tmp_path, "stand.txt", deepmimic())
+    train_it = ("residual-force", str(stand), "--preset", "paper")
+    assert trains(*train_it) == preset_of("residual-force", "paper", read_clip(stand))
+    for recipe, name in (("perpetual", "paper"), ("perpetual", "fast"), ("inbetween", "code")):
+        assert trains(recipe, "--preset", name) == preset_of(recipe, name)
     with pytest.raises(PoiseError, match="preset"):
-        imitates("--preset", "papr")
+        trains("perpetual", "--preset", "papr")
     for verb, argv in (("imitate", []), ("train", ["perpetual"]), ("train", ["inbetween"])):
         assert main([verb, *argv, "--print-config", "--seed", "7"]) == 0
         said = capsys.readouterr()

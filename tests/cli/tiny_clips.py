@@ -111,3 +111,7 @@ def put(folder: Path, name: str, text: str | bytes) -> Path:
     path = folder / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
+
+
+#: Options of a training that takes seconds.
+MINIATURE = ["--iterations", "2", "--envs", "16", "--threads", "1"]

@@ -52,10 +52,12 @@ def blank() -> Options:
 
 def config_of(o: Options) -> ResidualForce:
     """The recipe's settings, as the command line states them."""
-    o.training.check(o.recipe_settings)
+    t = o.training
+    t.check(o.recipe_settings)
     from poise.recipes import ResidualForce
 
-    return o.training.settings("residual-force", ResidualForce(), o.body, given(o.recipe_settings))
+    clip = o.reading.read(o.clip) if t.by_clip else None
+    return t.settings("residual-force", ResidualForce(), o.body, given(o.recipe_settings), clip)
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:

@@ -171,11 +171,16 @@ class Training:
     resume: Flag = False
     """Go on with the run that is in the folder."""
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """Settings to begin with in place of the recipe's defaults, such as paper."""
+    """Settings to begin with in place of the recipe's defaults: paper, code or fast."""
     config: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="")] = None
     """A file of settings, as --print-config prints them."""
     print_config: Flag = False
     """Print all settings as TOML and do nothing."""
+
+    @property
+    def by_clip(self) -> bool:
+        """Whether the settings depend on the clip, see `base_of`."""
+        return self.preset is not None and self.config is None and not self.print_config
 
     def check(self, chosen: Any) -> None:
         """Refuses numbers that make no sense, before anything is read or made."""
@@ -192,10 +197,15 @@ class Training:
                 raise PoiseError(f"--{name} must be a whole number of at least {low}, got {value}")
         check_device(self.device)
 
-    def settings(self, recipe: str, default: T, body: Body, values: Mapping[str, Any]) -> T:
-        """The settings of a run: `default`, a preset or a file, then what the command line states."""
+    def settings(
+        self, recipe: str, default: T, body: Body, values: Mapping[str, Any], clip: Clip | None = None
+    ) -> T:
+        """The settings of a run: `default`, a preset or a file, then what the command line states.
+
+        clip: see `base_of`.
+        """
         verb = "imitate" if recipe == "residual-force" else f"train {recipe}"
-        base = base_of(recipe, default, self.preset, self.config, verb)
+        base = base_of(recipe, default, self.preset, self.config, verb, clip)
         more, overrides = stated(body.set, type(base))
         return configured(base, {**body.values(overrides), **values, **more})
 

@@ -13,10 +13,13 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 import poise
 from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.motion import Clip
 
 T = TypeVar("T")
 #: Where the dataclass of each recipe stands, below the package.
@@ -25,7 +28,7 @@ SOURCES = {
     "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
 }
-_TYPES: dict[str, Any] = {"float": float, "int": int, "bool": bool, "str": str}
+_TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.
 _UNSAID = {
     "num_envs": "environments that are simulated at once.",
@@ -72,25 +75,25 @@ def _fields_of(recipe: str) -> dict[str, tuple[Any, Any, str]]:
     """Type, default and help text of each field of plain values."""
     file, name = SOURCES[recipe]
     tree = ast.parse((Path(poise.__file__).parent / file).read_text("utf-8"))
-    known = dict(_TYPES)
+    known: dict[str, Any] = dict(_TYPES)
     for node in tree.body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.value).startswith("Literal["):
-            known[ast.unparse(node.targets[0])] = _type(node.value, known)
+        if isinstance(node, ast.Assign) and (alias := _type_of(node.value, known)) is not None:
+            known[ast.unparse(node.targets[0])] = alias
     kind = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name)
     rows = {str(ast.unparse(n.target)): n for n in kind.body if isinstance(n, ast.AnnAssign)}
     texts = _texts(ast.get_docstring(kind) or "", tuple(rows))
     out: dict[str, tuple[Any, Any, str]] = {}
     for row, node in rows.items():
-        plain = _type(node.annotation, known)
-        if isinstance(node.value, ast.Constant) and plain is not None:
-            out[row] = plain, node.value.value, texts.get(row) or _UNSAID.get(row, "")
+        read = _type_of(node.annotation, known)
+        if isinstance(node.value, ast.Constant) and read is not None:
+            out[row] = read, node.value.value, texts.get(row) or _UNSAID.get(row, "")
     return out
 
 
-def _type(node: ast.expr, known: Mapping[str, Any]) -> Any:
-    """The type of plain values that an annotation names, `X | None` as X; None for any other type."""
-    if isinstance(node, ast.BinOp) and isinstance(node.right, ast.Constant):
-        return _type(node.left, known)
+def _type_of(node: ast.expr, known: Mapping[str, Any]) -> Any:
+    """The plain type that an annotation names, without its None; None for any other."""
+    if isinstance(node, ast.BinOp):
+        return _type_of(node.left, known)
     if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
         return Literal[ast.literal_eval(node.slice)]
     return known.get(node.id) if isinstance(node, ast.Name) else None
@@ -150,8 +153,13 @@ def configured(base: T, values: Mapping[str, Any]) -> T:
     return from_data(type(base), data, "the command line")
 
 
-def base_of(recipe: str, default: T, preset: str | None, config: Path | None, verb: str) -> T:
-    """The settings that options then change: the recipe's, those of a preset, or of a file."""
+def base_of(
+    recipe: str, default: T, preset: str | None, config: Path | None, verb: str, clip: Clip | None
+) -> T:
+    """The settings that options then change: the recipe's, those of a preset, or of a file.
+
+    clip: what is imitated, by which a preset chooses some of its values.
+    """
     from poise.settings import from_toml
 
     if preset is not None and config is not None:
@@ -162,7 +170,7 @@ def base_of(recipe: str, default: T, preset: str | None, config: Path | None, ve
         return default
     from poise.jobs.presets import preset_of
 
-    return preset_of(recipe, preset)
+    return preset_of(recipe, preset, clip)
 
 
 def dotted(argv: Sequence[str]) -> list[str]:

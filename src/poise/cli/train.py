@@ -123,7 +123,10 @@ def config_of(o: Options) -> Any:
         return settings(o.primitives, o.training, o.body, values)
     if "dropout" in values:
         values["between_training.dropout"] = values.pop("dropout")
-    return o.training.settings(o.recipe, default, o.body, values)
+    t, clip = o.training, None
+    if t.by_clip and o.clips:
+        clip = o.reading.read(o.clips[0])
+    return t.settings(o.recipe, default, o.body, values, clip)
 
 
 def _only_a_folder(o: Options) -> None:
