@@ -204,7 +204,7 @@ def test_states_of_other_kinds():
         budget.set(torch.ones(3))
     with pytest.raises(PoiseError, match="at least 1 group"):
         HelpBudget(groups=0)
-    with pytest.raises(PoiseError, match="not told"):
+    with pytest.raises(PoiseError, match="name no group"):
         budget.count(1, 0)
 
 
