@@ -6,7 +6,7 @@
 Sequence Model for Human Dynamics": one row of 117 numbers a frame, the root's place in CMU's units and
 the exponential maps of 38 joints, the ends of limbs among them, at 120 Hz. `--skeleton` is any BVH of
 CMU's 31 joints. Its proportions are not the performers', with which standing feet would slide: the root
-travels as far as they say. Takes whose feet slide in spite of that are left out, and so are those of
+travels as far as they say. Takes with feet that slide in spite of that are left out, and so are those of
 performers that are held out (05, 11, 14).
 """
 

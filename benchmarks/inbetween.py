@@ -92,7 +92,7 @@ def some_of(test: TestSet, most: int) -> TestSet:
 def chosen(
     model: InbetweenModel, held: TestSet, length: int, among: Sequence[Adaptation] = SETTINGS
 ) -> Adaptation:
-    """The setting and the iterations whose transitions have the lowest figures on validation.
+    """The setting and the iterations with the lowest figures of transitions on validation.
 
     Foot skating is what TTA is for, but L2P must not rise, so settings that raise it are out; of the
     others the one counts that lowers the share and depth of penetration, the slide and L2P most.

@@ -5,8 +5,8 @@
 
 All clips are brought onto one subject's skeleton; the whole of the subjects in `HELD_OUT` is kept apart.
 Writes the model in half precision and, beside this script, `inbetween_cmu.json`: clips, cost, figures on
-the held-out subjects next to those of interpolation, and after test-time adaptation, whose settings are
-chosen on subjects 03, 11 and 14 and whose figures are of subject 05's dances. Resumable.
+the held-out subjects next to those of interpolation, and after test-time adaptation; its settings are
+chosen on subjects 03, 11 and 14, and its figures are of subject 05's dances. Resumable.
 
 CMU's files state 120 frames a second throughout, but some were captured at 60: subject 90 falls with
 four times the gravity at 120, and the salsa of subjects 60 and 61 would be danced at 360 beats a minute.

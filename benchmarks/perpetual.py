@@ -16,7 +16,7 @@ are read again. Nothing helps. Parts (all by default; what a part lacks, such as
 
 Writes `perpetual.json`, `perpetual.md` and the curves next to -o (here by default). Results of parts and
 runs that are not asked for stay, so that the measurement can be made in pieces; recovery goes on after
-the kind that was finished last. A run whose policy has changed is measured anew.
+the kind that was finished last. A run with a changed policy is measured anew.
 """
 
 from __future__ import annotations

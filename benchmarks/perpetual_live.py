@@ -66,7 +66,7 @@ def speed(run: Run, steps: int, count: int) -> dict[str, Any]:
 
 
 def crowd(run: Run, steps: int, count: int, threads: int) -> dict[str, Any]:
-    """Control steps of `count` characters who share a world, policy and terms on `threads` threads.
+    """Control steps of `count` characters that share a world, policy and terms on `threads` threads.
 
     "ms" is the median of the time that passed, "cpu_ms" the mean of the processor's time of all threads,
     which other programs on the machine hardly change.

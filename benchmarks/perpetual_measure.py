@@ -105,7 +105,7 @@ class Run:
 
 
 def subjects(names: Sequence[str]) -> list[str]:
-    """Who moves in these clips."""
+    """The performers of these clips."""
     return sorted({subject_of(n) for n in names})
 
 
@@ -168,7 +168,7 @@ def _same(a: Clip, b: Clip) -> bool:
 
 
 def library_task(run: Run, clips: ClipLibrary) -> Imitation:
-    """Clips as a task on the run's own body, whose joint ranges they do not change."""
+    """Clips as a task on the run's own body; they do not change its joint ranges."""
     return imitation_of(run.tracker, [place(c, run.tracker) for c in clips])
 
 
@@ -264,7 +264,7 @@ def recovery_kinds() -> tuple[str, ...]:
 
 
 def owners(run: Run, threads: int) -> dict[str, Any]:
-    """The composer beside every primitive on every clip that was learned; who owns which clip."""
+    """The composer beside every primitive on every clip that was learned; which one owns which clip."""
     if not isinstance(run.policy.policy, Composer) or run.owner is None:
         return {"skipped": "the policy is no composer of primitives"}
     names, task = run.imitation.library.names, run.imitation

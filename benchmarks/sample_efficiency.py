@@ -4,7 +4,7 @@
 
 RFC's cartwheel, the same physics, body, reward and help (100 N, kept) for all, so that only what is
 learned with differs: "paper" observes the phase, acts with absolute targets and has the paper's PPO
-(50,000 samples a batch), "additive" is ours from nothing, "expert" is ours from the cloned expert, whose
+(50,000 samples a batch), "additive" is ours from nothing, "expert" is ours from the cloned expert; its
 samples are counted. Every point is the deterministic policy from 64 start frames to the clip's end.
 Finished runs are kept in `--work`; the JSON and the plot are made from all of them.
 """

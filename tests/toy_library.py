@@ -94,7 +94,7 @@ class Scripted:
 
 
 def rises(name: str = "rises") -> Clip:
-    """Somebody who lies on the back for a moment, gets up within a second, and stands."""
+    """A motion that lies on the back for a moment, gets up within a second, and stands."""
     clip = swing(2.4, name=name)
     up = torch.linspace(0, 2.4, clip.frames).sub(0.5).clamp(0, 1)
     lean = -math.pi / 2 * (1 - up)

@@ -47,7 +47,7 @@ def field_table(
 
     Args:
         rollouts: episodes, by the protocol one per clip from frame 0.
-        bodies: whose errors are averaged, by default all; the rule looks at the rollouts' own.
+        bodies: their errors are averaged, by default all; the rule looks at the rollouts' own.
 
     Raises:
         PoiseError: no episode, two frame rates, or an unknown rule.

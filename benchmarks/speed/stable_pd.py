@@ -13,7 +13,7 @@ from poise.sim import CpuBackend
 
 
 class StablePDBackend(CpuBackend):
-    """Worlds whose actuators are replaced by `control.stable_pd_torque` (Tan et al. 2011).
+    """Worlds with actuators that are replaced by `control.stable_pd_torque` (Tan et al. 2011).
 
     Gains, damping and torque limits are those of the model's position servos and joints; `drive.ctrl`
     still holds target angles. Thousands of linear solves a second make it a reference for short

@@ -54,7 +54,7 @@ class Standing:
 def stand(
     humanoid: Humanoid, stance: Stance, seconds: float = 10.0, config: SimConfig | None = None
 ) -> Standing:
-    """Holds a stance by servos whose targets are its angles: no feedback on the root, no other force."""
+    """Holds a stance by servos with its angles as targets: no feedback on the root, no other force."""
     spec = config or SimConfig()
     model = humanoid.model
     spec.apply(model)

@@ -1,4 +1,4 @@
-"""The recovery table: what counts as back, and trials whose outcome is known."""
+"""The recovery table: what counts as back, and trials with a known outcome."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Still:
 
 
 class Carried(Still):
-    """Sets everybody on the reference after some control steps: who is back when is known."""
+    """Sets all worlds on the reference after some control steps: each is back at a known time."""
 
     def __init__(self, env, after: list[int]):
         super().__init__(env.num_actions)

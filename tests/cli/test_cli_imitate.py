@@ -112,7 +112,7 @@ def test_eval_gives_the_score_of_the_result(
 ) -> None:
     said = answered("eval", trained)["result"]
     result = json.loads((trained / "score.json").read_text())
-    # Only a delivery writes a motion whose feet can be told.
+    # Only a delivery writes a motion with feet that can be told.
     assert result.pop("delivered")[0]["delivered"]["penetration_mm"] < 0.01
     assert said == {**result, "delivered": []}
     assert main(["eval", str(trained / "run"), "--rule", "any_25cm"]) == 0

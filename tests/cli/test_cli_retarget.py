@@ -18,7 +18,7 @@ from toy_human import human, swing
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    """A walk, and the file of a bigger person whose joints are called otherwise."""
+    """A walk, and the file of a bigger body with other names of joints."""
     clip = swing(seconds=1.0, speed=1.0)
     here, there = tmp_path / "walk.bvh", tmp_path / "big.bvh"
     write_clip(clip, here)

@@ -1,4 +1,4 @@
-"""Small motion files for the command line: a person who can be simulated, and many that cannot."""
+"""Small motion files for the command line: a body that can be simulated, and many that cannot."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def amc(frames: int = 4, bone: str = "head") -> str:
 
 
 def deepmimic(frames: int = 16) -> str:
-    """A person who stands at 30 Hz, bends a knee and raises an arm: 15 control steps."""
+    """A body that stands at 30 Hz, bends a knee and raises an arm: 15 control steps."""
     one, rows = [1.0, 0.0, 0.0, 0.0], []
     for t in range(frames):
         bend = 0.2 * math.sin(0.4 * t)

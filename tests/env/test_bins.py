@@ -206,7 +206,7 @@ def test_starts_stay_within_clips():
     # Without odds, or a share, nothing is drawn otherwise than before there were any.
     for same in (drawn(None), drawn(odds, 0.0)):
         torch.testing.assert_close(same, drawn(None, 0.0))
-    with pytest.raises(PoiseError, match="at hard moments"):
+    with pytest.raises(PoiseError, match="by adaptive sampling"):
         drawn(odds, 1.5)
 
 

@@ -190,7 +190,7 @@ def test_states_of_other_kinds():
     budget = HelpBudget(RULE, groups=2)
     budget.set(torch.tensor([0.5, 0.25]))
     ended(budget, (0, True), (1, False))
-    # One of all worlds: its scale for all, and episodes that are nobody's in particular.
+    # One of all worlds: its scale for all, and episodes of no clip in particular.
     other = HelpBudget(RULE, groups=3)
     other.load_state(torch.tensor([0.75, 8.0, 6.0, 2.0], dtype=torch.float64))
     assert other.scale.tolist() == [0.75] * 3 and other.steps == 8
@@ -204,7 +204,7 @@ def test_states_of_other_kinds():
         budget.set(torch.ones(3))
     with pytest.raises(PoiseError, match="at least 1 group"):
         HelpBudget(groups=0)
-    with pytest.raises(PoiseError, match="not told"):
+    with pytest.raises(PoiseError, match="name no group"):
         budget.count(1, 0)
 
 

@@ -20,7 +20,7 @@ import torch
 
 STEPS, FEW_STEPS, WORLDS, SEED = 300, 60, 16, 3
 HERE = Path(__file__).resolve().parent
-#: Tasks whose environments are stepped; `api.environment(name)` makes them.
+#: Tasks with environments that are stepped; `api.environment(name)` makes them.
 TASKS = (
     "imitate",
     "imitate_schedule",

@@ -18,7 +18,7 @@ from toy_human import swing
 
 
 def played(*clips: Clip) -> tuple:
-    """The task of some clips and an evaluation whose recordings are the reference itself."""
+    """The task of some clips and an evaluation with recordings of the reference itself."""
     imitation = build(ClipLibrary(clips), ResidualForce(num_envs=2))
     ref = imitation.reference
     rows = [range(int(a), int(a + n)) for a, n in zip(ref.start, ref.length, strict=True)]

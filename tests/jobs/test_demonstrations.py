@@ -1,4 +1,4 @@
-"""Ways back are learned as clips are, the policy stays what it was, and a killed run goes on."""
+"""Recovery motions are learned as clips are, the policy stays what it was, and a killed run goes on."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
     owners = Owners(env, policy, torch.ones(len(own.library), dtype=torch.long), own=False)
     assert owners.owner.tolist() == [1] * len(own.library) + [0] * 4
     env.close()
-    # In a library in which nobody gets up, recovery is learned by a primitive of its own.
+    # In a library without a clip that gets up, recovery is learned by a primitive of its own.
     assert build(library(), config).config.recovering.primitive == "own"
 
 
@@ -210,7 +210,7 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
     assert abs(a - b).max() < 1e-9
     assert "lost the motion" in done.losses.sentence()
-    # Who learns the motion still knows its ways back.
+    # A policy that learned the motion still knows its recovery clips.
     learned = learn(able, plain.placed, tmp_path / "learned", 0.01, threads=1)
     assert learned.tracker.recovery_clips is able.recovery_clips
     with pytest.raises(PoiseError, match="a single character"):

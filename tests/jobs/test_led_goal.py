@@ -1,4 +1,4 @@
-"""A guide leads whoever has lost the reference back to it, and lets alone who has not."""
+"""A goal leads characters that have lost the reference back to it, and no others."""
 
 from __future__ import annotations
 

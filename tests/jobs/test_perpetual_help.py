@@ -1,4 +1,4 @@
-"""Help by clip through the stages: limits, evaluations, the table, the ledger, and a resumed run."""
+"""Help by clip through the stages: limits, evaluations, the table, the record, and a resumed run."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_less_help_on_average_is_better_then_more_clips() -> None:
         return all(torch.equal(v, stage_record.best[name]) for name, v in policies[k].state().items())
 
     assert best(0, torch.tensor([0.9, 0.3, 0.3]), True, True, True)
-    # Whoever has the help; a difference within 1 % is none.
+    # Whichever world has the help; a difference within 1 % is none.
     assert best(1, torch.tensor([0.0, 0.0, 1.2]), False, False, False)
     assert best(2, torch.tensor([0.399, 0.4, 0.4]), True, False, False)
     assert not best(1, torch.tensor([0.396, 0.4, 0.4]), False, False, False)

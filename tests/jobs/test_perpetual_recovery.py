@@ -1,4 +1,4 @@
-"""Recovery in the perpetual recipe: on which clips, with which goals, by whom taught, how judged."""
+"""Recovery in the perpetual recipe: on which clips, with which goals, by which teacher, how judged."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def built() -> Imitation:
 
 
 def low(name: str) -> Clip:
-    """Somebody who lies on the back all the time."""
+    """A motion that lies on the back all the time."""
     clip = swing(1.2, name=name)
     rot = clip.rot.copy()
     rot[:, 0] = [math.cos(math.pi / 4), 0.0, -math.sin(math.pi / 4), 0.0]

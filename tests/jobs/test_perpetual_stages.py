@@ -28,7 +28,7 @@ from toy_library import PPO, Script, Scripted, library, tiny
 
 
 def script(kind: str, columns: int, scale: float, clip: int) -> bool:
-    """Primitive k learns clip k - 1 without help, the composer the first two, nobody the third."""
+    """Primitive k learns clip k - 1 without help, the composer the first two, none the third."""
     return clip < 2 if kind == "composer" else clip == columns - 1 and clip < 2
 
 

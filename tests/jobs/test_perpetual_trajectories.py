@@ -58,7 +58,7 @@ def test_a_killed_search_goes_on_where_it_was(tmp_path: Path) -> None:
 
 def test_paths_of_other_clips_are_refused(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / PATHS, {"qpos": torch.zeros(2, 3)}, {"kind": "paths", "clips": ["other"]})
-    with pytest.raises(PoiseError, match="paths of other clips"):
+    with pytest.raises(PoiseError, match="trajectories of other clips"):
         run(tmp_path)
 
 

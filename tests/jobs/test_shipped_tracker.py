@@ -53,7 +53,7 @@ def test_it_gets_up_and_comes_back(tracker: Tracker) -> None:
 
 
 def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
-    """A jump aside of 2 m in one frame, which nobody can do."""
+    """A jump aside of 2 m in one frame, which no character can do."""
     clip = read_clip(WALK)
     pos = clip.root_pos.copy()
     pos[clip.frames // 2 :, 1] += 2.0

@@ -113,7 +113,7 @@ def test_resets_change_nothing_before_the_first_failure(tracker: Tracker) -> Non
     plain = track(tracker, walk())
     again = track(tracker, walk(), TrackConfig(reset_on_fail=True))
     assert len(again.failed_s) > 1 and again.failed_s[0] == plain.failed_s[0]
-    # The score is that of the character that nobody put back.
+    # The score is that of the character that was not put back.
     assert again.evaluation.card.mpjpe_mm == plain.evaluation.card.mpjpe_mm
     assert again.evaluation.card.succ == 0.0
     r, ref = again.evaluation.rollouts, again.imitation.reference
@@ -230,7 +230,7 @@ def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:
 
 
 def test_a_joint_beyond_its_range_is_no_blow(tracker: Tracker) -> None:
-    """Who is put down outside a joint's range must not be thrown back into it."""
+    """A character set down outside a joint's range must not be thrown back into it."""
     clip = walk(0, 40)
     knee = clip.skeleton.index("LeftLeg")
     turned = quat_mul(

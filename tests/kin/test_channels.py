@@ -80,7 +80,7 @@ def test_a_twist_in_the_chain_leaves_the_elbow_in_place_and_the_forearm_turned()
     np.testing.assert_allclose(here.pos.numpy(), clip.positions()[:, joints], atol=1e-9)
     row = [r.name for r in table.rows].index("J_Bip_L_LowerArm")
     assert apart(here.quat.numpy()[:, row], clip.world()[1][:, elbow]).max() < 1e-6
-    # The upper arm, whose own channels rest, does not turn.
+    # The upper arm does not turn: its own channels rest.
     arm = [r.name for r in table.rows].index("J_Bip_L_UpperArm")
     assert np.ptp(here.quat.numpy()[:, arm], axis=0).max() < 1e-9
     back = qpos_to_clip(qpos, table, one.skeleton, clip.fps, template=clip)

@@ -21,7 +21,7 @@ def lowest(qpos: np.ndarray, table) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def still():
-    """A still stance whose level soles are at z = 0 exactly, and its table."""
+    """A still stance with level soles at z = 0 exactly, and its table."""
     table = generate_table(human())
     qpos = np.repeat(clip_to_qpos(swing(), table)[:1], 60, 0)
     qpos[:, 7:] = 0.0

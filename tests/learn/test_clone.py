@@ -100,7 +100,7 @@ def test_cloning_stops_when_it_is_told_to() -> None:
 
 
 def test_the_teacher_drives_round_0_and_the_student_the_rest() -> None:
-    """A teacher who always pushes out is obeyed in round 0 and only asked afterwards."""
+    """A teacher that always pushes out is obeyed in round 0 and only asked afterwards."""
 
     class Outward(Pusher):
         def act(self, obs: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ def test_tensorboard_reads_what_was_written_and_hides_repeated_steps(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     for last in (0, 2):
-        # Files are read in the order of their names, whose stamps are whole seconds.
+        # Files are read in the order of their names, with stamps of whole seconds.
         time.sleep(1.01 if last else 0.0)
         log = Log(tmp_path, last=last)
         for i in range(last + 1, 5):

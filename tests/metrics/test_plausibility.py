@@ -1,4 +1,4 @@
-"""Sliding, penetration, floating and jerk on motions whose figures are known."""
+"""Sliding, penetration, floating and jerk on motions of known figures."""
 
 from __future__ import annotations
 

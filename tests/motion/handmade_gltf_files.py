@@ -137,7 +137,7 @@ def person(
 
 
 def walker(frames: int = 7, fps: float = 30.0, skin: bool = True) -> tuple[Gltf, dict[str, int]]:
-    """A person who travels along Z and swings the leg about X."""
+    """A body that travels along Z and swings the leg about X."""
     file, at = person(skin=skin)
     animation = file.animation("walk")
     times = [k / fps for k in range(frames)]

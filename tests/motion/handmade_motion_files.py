@@ -45,7 +45,7 @@ BVH_WIDTH = 18
 
 
 def bvh_rows(frames: int = 8) -> list[str]:
-    """A person who walks along +Z and sways."""
+    """A body that walks along +Z and sways."""
     rows = []
     for t in range(frames):
         values = [0.5 * t, 90.0, 2.0 * t] + [10.0 * math.sin(0.7 * t + k) + 5 for k in range(15)]

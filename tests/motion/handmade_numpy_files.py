@@ -12,7 +12,7 @@ from poise.motion import Channel, Clip, Skeleton, Source
 
 
 def amass(width: int = 156, frames: int = 12, seed: int = 0) -> dict[str, Any]:
-    """Somebody who stands along Z, walks along -Y and waves every joint a little."""
+    """A body that stands along Z, walks along -Y and waves every joint a little."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames)[:, None] / 60.0
     poses = 0.3 * np.sin(3.0 * t + rng.uniform(0, 6, width))
@@ -84,7 +84,7 @@ def save_npy(path: Path, value: Any) -> Path:
 
 
 def odd_clip() -> Clip:
-    """A clip whose every field is something that a careless format would lose."""
+    """A clip in which every field is something that a careless format would lose."""
     rng = np.random.default_rng(3)
     rot = rng.normal(size=(7, 3, 4))
     rot /= np.linalg.norm(rot, axis=-1, keepdims=True)

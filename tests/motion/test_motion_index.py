@@ -34,7 +34,7 @@ def check(clip: Clip, row: dict[str, str]) -> None:
     z_up = "cmu_bvh/ad/" in path and "14_14" not in path and "jumping" not in path
     assert facts["up_axis"] == ("Z" if z_up else "Y"), path
     assert 1.35 < facts["height_m"] < 1.9, path
-    # Nobody is far below the floor or flies above it.
+    # No body is far below the floor or flies above it.
     assert -0.35 < clip.positions()[..., 2].min() < 0.35, path
 
 

@@ -19,7 +19,7 @@ HEADER = "Coordinates\nversion=1\nnRows={n}\nnColumns=3\ninDegrees=yes\n\nendhea
 
 
 def mot(frames: int = 5, **turns: float) -> str:
-    """A table in degrees of somebody who stands; `turns` are constant coordinates."""
+    """A table in degrees of a body that stands; `turns` are constant coordinates."""
     names = ["time", *dict.fromkeys((*PELVIS, *LEGS, *turns))]
     rows = []
     for t in range(frames):

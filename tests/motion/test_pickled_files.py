@@ -73,7 +73,7 @@ class Evil:
 
 
 def hashed_for_ever() -> bytes:
-    """A dict whose key is a tuple of tuples of tuples: its hash takes 2^60 steps."""
+    """A dict with a key that is a tuple of tuples of tuples: its hash takes 2^60 steps."""
     step = b"q\x01h\x01h\x01\x86"
     return b"\x80\x02}(" + b"K\x01" + step * 60 + b"K\x01u."
 

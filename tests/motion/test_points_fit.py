@@ -19,7 +19,7 @@ from poise.motion.points.labels import find_places, split_label
 from poise.motion.points.solve import hold_lengths, steady_twist
 from poise.spatial import quat_angle, quat_between
 
-# A standing person who faces -Y with the left at +X, m.
+# A standing body that faces -Y with the left at +X, m.
 BODY = {
     "LHip": (0.1, 0, 0.9), "RHip": (-0.1, 0, 0.9),
     "LKnee": (0.1, -0.02, 0.5), "RKnee": (-0.1, -0.02, 0.5),
@@ -32,7 +32,7 @@ BODY = {
 
 
 def standing(frames: int = 40, fps: float = 30.0, leave_out: tuple[str, ...] = ()) -> Keypoints:
-    """The person, who sways a little so that nothing is still."""
+    """The body, which sways a little so that nothing is still."""
     names = tuple(n for n in BODY if n not in leave_out)
     rest = np.array([BODY[n] for n in names])
     sway = 0.05 * np.sin(np.arange(frames) / fps * 2 * np.pi)[:, None, None]

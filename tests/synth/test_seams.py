@@ -108,7 +108,7 @@ def test_long_gaps_are_split_and_told() -> None:
 
 
 def bent() -> tuple[Skeleton, torch.Tensor, torch.Tensor]:
-    """A person who sways with bent knees, so that feet can be reached for."""
+    """A body that sways with bent knees, so that feet can be reached for."""
     clip = swing(1.0, bend=0.3)
     root, rot = clip.tensors()
     sway = 0.03 * torch.sin(torch.linspace(0, 6, 31, dtype=torch.float64))

@@ -20,7 +20,7 @@ First = Callable[["PolicyBundle", "WarmStart"], None]
 
 
 def beginning(first: First | None = None) -> TrainingCallbacks:
-    """Tells the steps of a beginning; `first` gets the clone."""
+    """Callbacks that tell the steps before PPO begins; `first` gets the clone."""
     from poise.jobs.warm_start import TrainingCallbacks
 
     def expert(card: ScoreCard) -> None:

@@ -87,7 +87,7 @@ def notes(sentences: Sequence[str], limit: int = 12) -> None:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], left: int = 1) -> None:
-    """A table whose first `left` columns are words and whose others are figures."""
+    """A table: its first `left` columns are words, the others are figures."""
     if title:
         # As a line of its own, since rich would fold a title to the width of its table.
         say(title, "bold")

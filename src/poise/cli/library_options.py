@@ -24,11 +24,11 @@ class Library:
     library: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """The folder of clips."""
     hold_out: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """Clips whose names match are not learned from; inbetween keeps them for validation figures."""
+    """Clips with matching names are not learned from; inbetween keeps them for validation figures."""
     never: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """Clips whose names match are not used at all."""
+    """Clips with matching names are not used at all."""
     onto: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """A motion file (for perpetual also an MJCF body) onto whose skeleton all is retargeted."""
+    """A motion file (for perpetual also an MJCF body); all is retargeted onto its skeleton."""
     library_skeleton: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RE=F")] = ()
     """REGEX=FILE.asf, for AMC files of such names that have none beside them."""
     library_fps: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RE=HZ")] = ()
@@ -36,7 +36,7 @@ class Library:
     mirror: Flag = False
     """Learn from every clip in a mirror, too."""
     backwards: Annotated[str | None, arg(metavar="REGEX", help_behavior_hint="")] = None
-    """perpetual: learn clips whose names match backwards, too."""
+    """perpetual: learn clips with matching names backwards, too."""
 
     def folder(self, recipe: str) -> Path:
         """The folder.

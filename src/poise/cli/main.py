@@ -79,7 +79,7 @@ def guarded(work: Callable[[], int | None], told: Callable[[PoiseError], Any] | 
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
     except BrokenPipeError:
-        # Whoever read our output has seen enough; what is still buffered goes nowhere.
+        # The reader of our output has closed it; what is still buffered goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _PIPE_CLOSED
     except (KeyboardInterrupt, Exception) as problem:
@@ -110,7 +110,7 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     from poise.cli.parse import parse
 
     module = import_module(f"poise.cli.{verb}")
-    # Who asks for the settings alone need name no files.
+    # A command that prints the settings alone need name no files.
     blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
     options = parse(module.Options, rest, f"poise {verb}", blank)
     if blank is None:

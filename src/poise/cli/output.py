@@ -115,7 +115,7 @@ def run_folder(path: Path) -> Path:
     Raises:
         PoiseError: there is no such folder, or it is a result of `track`, which has no run.
     """
-    # The name of the run file stands in poise.jobs.runs, whose import takes seconds.
+    # The name of the run file stands in poise.jobs.runs, which takes seconds to import.
     from poise.jobs.runs import RUN_FILE
 
     if not path.exists():

@@ -21,7 +21,7 @@ from poise.errors import PoiseError, did_you_mean
 
 T = TypeVar("T")
 _CONFIG = (tyro.conf.FlagCreatePairsOff,)
-#: The version of tyro whose events were tried.
+#: The version of tyro with the events that were tried.
 TRIED = "1.0.17"
 _KINDS = {"INT": "a whole number", "FLOAT": "a number"}
 

@@ -31,7 +31,7 @@ class Primitives(_Derived):
 
     recovery_clips: Flag = True
     """perpetual: characters that recover are told a point to come back to, as in the paper; by default
-    they follow the library's own clips, where somebody gets up in it and somebody walks."""
+    they follow the library's own clips, where some of them get up and some walk."""
     going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
     """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body;
     with recovery it stays as it is, beside a primitive that recovers or, where it can already, others
@@ -61,7 +61,7 @@ def settings(
             "--paths are for the expert, and --no-expert does without", hint="Leave one out"
         )
     if primitives.paths:
-        # What follows paths needs no help from the beginning.
+        # The LQR teacher on optimised trajectories needs no help at any time.
         values |= {"help_start": 0.0, "trajopt.iterations": primitives.paths}
     if not primitives.recovery_clips:
         values["recovering.demonstrations"] = 0
@@ -73,8 +73,10 @@ def settings(
 
 
 def check_going_on(primitives: Primitives, body: Body, library: Library, returns: bool = True) -> None:
-    """Refuses options whose say a policy has that training goes on from. returns: it comes back by ways
-    already, so that primitives may learn what it fails."""
+    """Refuses options that the policy decides from which training goes on.
+
+    returns: the policy tracks recovery motions already, so that primitives may learn what it fails.
+    """
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")

@@ -162,7 +162,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     if lost:
         say(advice(o))
     word = "lost" if lost else "found" if tracked.found else "came back" if tracked.losses else "tracked"
-    failures = [{"character": who, "seconds": t} for who, t in tracked.failures]
+    failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
     result = {"outcome": word, "sentence": said, "failures": failures, "score": done.card.to_dict()}
     saved = {"policy": o.save_policy} if o.save_policy else {}
     told = (*tracked.notes, *done.notes)
@@ -239,7 +239,7 @@ def outcome(tracked: Tracked, reset: bool) -> str:
     """Where the character failed, in one sentence."""
     reference, times = tracked.imitation.reference, tracked.failed_s
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
-    count, fell = len(reference.length), {who for who, _ in tracked.failures}
+    count, fell = len(reference.length), {k for k, _ in tracked.failures}
     if count > 1:
         first = f", the first lost at {tracked.failures[0][1]:.1f} s" if fell else ""
         again = f"; they were put back {len(tracked.failures)} times" if fell and reset else ""

@@ -19,13 +19,12 @@ ALWAYS_FAILS = 0.1
 
 
 class FailureRates:
-    """How often episodes failed in each of G moments lately.
+    """How often episodes failed in each of G motion bins lately.
 
     Attributes:
         odds: `(G,)` float64 on the CPU, with which bins are to be practised: f (1 + `ALWAYS_FAILS` - f)
-        of the
-            share f that failed, most where about every second episode fails. Bins that always fail are
-            neither dwelled on nor given up.
+            of the share f that failed, most where about every second episode fails. Bins that always
+            fail are neither dwelled on nor given up.
     """
 
     def __init__(self, bins: int, device: torch.device | str = "cpu"):

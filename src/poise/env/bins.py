@@ -1,7 +1,8 @@
-"""Clips cut into moments of about a second, and how often episodes fail in each.
+"""Clips cut into motion bins of about a second, and how often episodes fail in each.
 
-A long clip is rarely hard all over: where it fails it mostly fails within the same second. What is known
-of moments says where episodes are to begin (`Starts`) and which of them still need help (`HelpBudget`).
+A long clip is rarely hard all over: where it fails it mostly fails within the same second. The failure
+rates of the bins say where episodes are to begin (`Starts`), and which bins still need help
+(`HelpBudget`).
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-#: How long a moment lasts, nearly.
+#: How long a motion bin lasts, nearly, s.
 BIN_S = 1.0
 
 
 class Outcomes(NamedTuple):
-    """What one control step says of moments: `bin (K,)`, and float64 `ended`, `failed (K,)`, 1 where
+    """What one control step says of motion bins: `bin (K,)`, and float64 `ended`, `failed (K,)`, 1 where
     a character has come through it or failed, and 1 where it failed."""
 
     bin: Tensor
@@ -32,12 +33,18 @@ class Outcomes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionBins:
-    """The moments of all clips, one after another: G of them, in a reference of R rows.
+    """The motion bins of all clips, one after another: G of them, in a reference of R rows.
 
-    clip, begin, size: `(G,)`, whose they are, the frame they begin on, and their frames. offset, count:
-    `(C,)`, the first moment of each clip, and how many it has. of, into: `(R,)`, the moment of each row
-    and the frames since it began. last: `(R,)` bool, its last frame. before: `(G,)`, the one that comes
-    before it, which for the first one of a clip is its last.
+    Attributes:
+        clip: `(G,)`, the clip of each bin.
+        begin: `(G,)`, the frame of its clip that it begins on.
+        size: `(G,)`, its number of frames.
+        offset: `(C,)`, the first bin of each clip.
+        count: `(C,)`, the number of bins of each clip.
+        of: `(R,)`, the bin of each row.
+        into: `(R,)`, frames from the begin of the bin to the row.
+        last: `(R,)` bool, rows that are the last frame of their bin.
+        before: `(G,)`, the bin before it; for the first bin of a clip, the clip's last.
     """
 
     clip: Tensor
@@ -52,17 +59,18 @@ class MotionBins:
 
     @classmethod
     def cut(cls, length: Tensor, cyclic: Tensor, rate_hz: float, seconds: float = BIN_S) -> MotionBins:
-        """MotionBins of equal length, as near `seconds` as goes.
+        """Motion bins of equal length, as near `seconds` as goes.
 
-        length: `(C,)` frames at `rate_hz`, at least 3. cyclic: `(C,)` bool, clips whose last frame is
-        their first, one cycle later.
+        Args:
+            length: `(C,)` frames at `rate_hz`, at least 3.
+            cyclic: `(C,)` bool, cyclic clips: their last frame is their first, one cycle later.
         """
         frames = length - cyclic.long()
         count = (frames.double() / (seconds * rate_hz)).round().long().clamp(min=1)
         offset, start = count.cumsum(0) - count, length.cumsum(0) - length
         clip = torch.arange(len(length)).repeat_interleave(count)
         number = torch.arange(len(clip)) - offset[clip]
-        # Frame f is in moment f * count // frames.
+        # Frame f is in bin f * count // frames.
         ends = [-(-(k * frames[clip]) // count[clip]) for k in (number, number + 1)]
         begin, size = ends[0], ends[1] - ends[0]
         row_clip = torch.arange(len(length)).repeat_interleave(length)
@@ -83,12 +91,13 @@ class MotionBins:
     def outcomes(self, row: Tensor, age: Tensor, failed: Tensor, done: Tensor) -> Outcomes:
         """What a step says that brought N worlds to `row (N,)`.
 
-        A moment has been done when the one after it has, or the clip: who fails has mostly lost balance
-        before. So a failure counts in its own moment and in the one before, if the episode has been
-        there; that one is done, if the episode has seen half of it, when its successor is left.
+        A bin has been done when the one after it has, or the clip: a character that fails has mostly
+        lost balance before. So a failure counts in its own bin and in the one before, if the episode has
+        been there; that one is done, if the episode has seen half of it, when its successor is left.
 
-        age: `(N,)` control steps since the episodes began. failed, done: `(N,)` bool, which failed, and
-        which came to the end of their clips.
+        Args:
+            age: `(N,)` control steps since the episodes began.
+            failed, done: `(N,)` bool, which failed, and which came to the end of their clips.
         """
         now, into = self.of[row], self.into[row]
         before = self.before[now]
@@ -100,7 +109,7 @@ class MotionBins:
         return Outcomes(torch.cat((now, before)), ended, fell)
 
     def by_clip(self, values: Tensor, most: bool = False) -> Tensor:
-        """The mean, or the most, of the values `(G,)` of each clip's moments: `(C,)`."""
+        """The mean, or the most, of the values `(G,)` of each clip's bins: `(C,)`."""
         out = values.new_zeros(len(self.count))
         how = "amax" if most else "mean"
         return out.scatter_reduce(0, self.clip.to(values.device), values, how, include_self=False)

@@ -45,7 +45,8 @@ class ImitationEnv:
         plugins: help, adaptive sampling, recovery, bodies, ... as far as the task has them.
         help: what is left of the residual force, see `HelpBudget`.
         age: `(N,)` control steps since the episode began.
-        action: `(N, A)` the last one. wrench: what the residual force was.
+        action: `(N, A)` the last one.
+        wrench: what the residual force was.
         terms, imitation: values of the last step's rewards by name, and the imitation reward `(N,)`.
     """
 
@@ -205,7 +206,7 @@ class ImitationEnv:
         self.goal.aim(ids, self._held())
 
     def _held(self) -> Tensor | None:
-        """`(N,)` bool, worlds whose goals wait in the next step."""
+        """`(N,)` bool, worlds with goals that wait in the next step."""
         for plugin in self._holding:
             return plugin.held()
         return None
@@ -275,10 +276,10 @@ class ImitationEnv:
 
     def _ends(self, frame: Frame, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Which episodes failed, are terminated and are truncated."""
-        # A clip that is done to its end is a finished task, whose remaining return is stated: as many
-        # steps like the last as `completion_bonus` says, since with nothing to come the last moments
+        # A clip that is done to its end is a finished task, and its remaining return is stated: as many
+        # steps like the last as `completion_bonus` says, since with nothing to come the last steps
         # would not matter and characters would fall in them. To bootstrap there would rest on a state
-        # whose value is never learned, and the policy comes to exploit it.
+        # with a value that is never learned, and the policy comes to exploit it.
         done = frame.place.end > 0
         for plugin in self.plugins:
             failed, done = plugin.ends(frame, failed, done)

@@ -41,10 +41,11 @@ FIELDS = tuple(f.name for f in fields(Pose))
 class Place(NamedTuple):
     """What a packed pose says of its clip, float32 `(N)` each.
 
-    phase: place in the clip, 0 to 1.
-    low: the clip's lowest root height, m.
-    end: 1 on the last frame of a clip that does not go on, else 0.
-    body: which of the goal's bodies the clip is for.
+    Attributes:
+        phase: place in the clip, 0 to 1.
+        low: the clip's lowest root height, m.
+        end: 1 on the last frame of a clip that does not go on, else 0.
+        body: which of the goal's bodies the clip is for.
     """
 
     phase: Tensor
@@ -65,7 +66,7 @@ class Layout:
         return torch.cat((packed_pose(pose), place), 1)
 
     def unpacked(self, packed: Tensor) -> Pose:
-        """The poses whose numbers are the rows of `packed (N, W)`, as views of it."""
+        """The poses in the rows of `packed (N, W)`, as views of it."""
         parts = packed.split_with_sizes(self._widths, -1)[: len(FIELDS)]
         return Pose(
             *(
@@ -85,7 +86,7 @@ def packed_pose(pose: Pose) -> Tensor:
 
 
 class LazyPose(Pose):
-    """A pose whose fields are made when a term first asks for them, and kept.
+    """A pose with fields that are made when a term first asks for them, and kept.
 
     makers: a function for every field. What is asked for must be asked for before the state that the
     functions read moves on.
@@ -155,7 +156,7 @@ class Frame:
 
     @classmethod
     def given(cls, **values: Any) -> Frame:
-        """A frame whose observables are `values`; others that are asked for are None."""
+        """A frame with the observables `values`; others that are asked for are None."""
         frame = cls({}, _Unknown())
         frame.__dict__.update(values)
         return frame
@@ -180,7 +181,7 @@ class Frame:
         return value
 
 
-#: A function of a frame, whose value the frame keeps.
+#: A function of a frame; the frame keeps its value.
 Observable = Callable[[Frame], Any]
 
 
@@ -210,11 +211,13 @@ class ObsTerm:
 class RewardTerm:
     """`fn(frame, **params)` gives `(N,)`; the reward is the weighted sum.
 
-    weight: above 0 for a reward, whose values lie in [0, 1]; below 0 for a cost, whose values are at
-    least 0 and have a unit of their own, such as W.
-    imitation: whether the term counts for the imitation reward that is reported (regularizers and costs
-    do not). when: always, or in a task with recovery only near the reference or far from it; elsewhere
-    it is 0. Without recovery all are near.
+    Attributes:
+        weight: above 0 for a reward, with values in [0, 1]; below 0 for a cost, with values of at least
+            0 and a unit of their own, such as W.
+        imitation: whether the term counts for the imitation reward that is reported (regularizers and
+            costs do not).
+        when: always, or in a task with recovery only near the reference or far from it; elsewhere it is
+            0. Without recovery all are near.
     """
 
     name: str

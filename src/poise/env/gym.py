@@ -21,8 +21,8 @@ Info = dict[str, Any]
 class GymVectorEnv(VectorEnv):
     """All worlds of an `ImitationEnv` as one `gymnasium.vector.VectorEnv`.
 
-    Observations `(N, O)` and actions `(N, A)` are float32. A world whose episode ends begins the next
-    one in the same step: its last observation stands in `infos["final_obs"]`, as Gymnasium's
+    Observations `(N, O)` and actions `(N, A)` are float32. Where an episode ends, the world begins the
+    next one in the same step: its last observation stands in `infos["final_obs"]`, as Gymnasium's
     SAME_STEP mode has it. `log` holds the last step's means by name.
 
     Args:

@@ -26,14 +26,14 @@ EPISODES = 5.0
 class HelpBudget:
     """Scales the residual force's limits by what a schedule decides from the episodes' outcomes.
 
-    With several groups, which are clips or their moments, each has a scale of its own, decided from the
+    With several groups, which are clips or motion bins, each has a scale of its own, decided from the
     outcomes of its own episodes: as soon as it knows `EPISODES` of them, while groups with fewer go on
     collecting (a schedule of time alone, such as `LinearHelp`, lowers them all the same). One group is
     all worlds, and is decided every time.
 
     scale: float32, multiplied with the limits, where the worlds are: 0-dimensional for one group, else
         `(G,)`. now: a Python number, which need not wait for a GPU: the largest scale of any group in
-        use, so that 0 means that nobody is helped. Without a schedule they stay as they are set.
+        use, so that 0 means that no group is helped. Without a schedule they stay as they are set.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class HelpBudget:
     @property
     def left(self) -> float | Tensor:
         """What `set` takes: the scale of all, or a copy of those of the groups, `(G,)` on the CPU; 0.0
-        where nobody in use is helped."""
+        where no group in use is helped."""
         return self.now if self.groups == 1 or self.now == 0.0 else torch.tensor(self._scales)
 
     def at(self, group: Tensor) -> Tensor:
@@ -106,10 +106,10 @@ class HelpBudget:
         """One control step of all worlds of a single group, in which episodes ended, some by failure.
 
         Raises:
-            PoiseError: there are several groups, whose episodes are not told apart here.
+            PoiseError: there are several groups, and their episodes are not told apart here.
         """
         if self.groups > 1:
-            raise PoiseError("whose episodes ended is not told", hint="Use HelpBudget.count_worlds")
+            raise PoiseError("the ended episodes name no group", hint="Use HelpBudget.count_worlds")
         if self.schedule is None:
             return
         self._counts.numpy()[:, 0] += ended, failed

@@ -27,10 +27,11 @@ Start = tuple[Tensor, Tensor]
 class Ended:
     """What became of the episodes in one control step.
 
-    ids: `(n,)` worlds whose episodes end.
-    failed, terminated: `(N,)` bool.
-    counted: `(N,)` bool, worlds whose outcomes say something of where they are in their clips; None:
-    all.
+    Attributes:
+        ids: `(n,)` worlds in which an episode ends.
+        failed, terminated: `(N,)` bool.
+        counted: `(N,)` bool, worlds with outcomes that say something of where they are in their clips;
+            None: all.
     """
 
     ids: Tensor
@@ -78,7 +79,7 @@ class Plugin:
         return None
 
     def held(self) -> Tensor | None:
-        """`(N,)` bool, worlds whose goals wait in the next step; None: no goal waits."""
+        """`(N,)` bool, worlds with goals that wait in the next step; None: no goal waits."""
         return None
 
     def targets(self, hinges: Tensor) -> Tensor:
@@ -95,13 +96,15 @@ class Plugin:
     def judged(self, ends: Tensor, ref: Tensor, late: Tensor, rng: torch.Generator | None) -> None:
         """Notes, or takes back in place, what became of the episodes.
 
-        ends: `(3, N)` bool: failed, terminated, truncated.
-        ref: packed goals `(N, W)` of the step. late: `(N,)` bool, episodes whose time is over.
-        rng: draws which go on; None where none may.
+        Args:
+            ends: `(3, N)` bool: failed, terminated, truncated.
+            ref: packed goals `(N, W)` of the step.
+            late: `(N,)` bool, episodes that are over by their time.
+            rng: draws which go on; None where none may.
         """
 
     def counted(self) -> Tensor | None:
-        """`(N,)` bool, worlds whose outcomes count for help and adaptive sampling; None: all."""
+        """`(N,)` bool, worlds with outcomes that count for help and adaptive sampling; None: all."""
         return None
 
     def count(self, ended: Ended) -> None:

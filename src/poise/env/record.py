@@ -20,7 +20,7 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
 
     It is the same operations in the same order, without Python's share: half of the time for hundreds
     of worlds, most of it for one. It runs in torch's inference mode: copy what it makes before giving
-    it to anybody who may want gradients. A function whose operations depend on values, such as an `if`
+    it to code that may want gradients. A function with operations that depend on values, such as an `if`
     on a tensor, cannot be recorded: it is given back as it is.
     """
     with warnings.catch_warnings(record=True) as told:

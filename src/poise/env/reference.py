@@ -27,9 +27,9 @@ _JOINED = (
 class Reference:
     """Reference motion at the control rate, all clips end to end.
 
-    Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. A cyclic clip, whose last frame is
-    its first one cycle later (`poise.kin.close_cycle`), goes on with its first frames, moved and turned
-    to where the last frame stands.
+    Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. The last frame of a cyclic clip is
+    its first one cycle later (`poise.kin.close_cycle`); the clip goes on with its first frames, moved
+    and turned to where the last frame stands.
 
     Args:
         bodies: S bodies of the same joints and hinges, of which `humanoid` is the first; None: it alone.
@@ -77,7 +77,7 @@ class Reference:
             [p.min() for p in torch.split(qpos[:, 2].float(), self.length.tolist())]
         )
         self.any_cyclic = bool(self.cyclic.any())
-        #: Its clips cut into moments.
+        #: Its clips cut into motion bins.
         self.bins = MotionBins.cut(self.length, self.cyclic, rate_hz)
         clip = torch.arange(len(motions)).repeat_interleave(self.length)
         frame = torch.arange(len(qpos)) - self.start[clip]

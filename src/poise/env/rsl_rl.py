@@ -80,7 +80,7 @@ class RslRlVecEnv:
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """One control step: observations, rewards `(N,)`, dones `(N,)` int64, extras."""
-        # Rsl_rl collects in inference mode, whose tensors could not be changed outside of it.
+        # Rsl_rl collects in inference mode; its tensors could not be changed outside of it.
         with torch.inference_mode(False), torch.no_grad():
             out = self.env.step(actions.detach().to(self.env.device, copy=True))
             self._obs = out.obs.clone()

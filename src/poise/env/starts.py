@@ -10,7 +10,7 @@ from torch import Tensor
 from poise.env.bins import MotionBins
 from poise.errors import PoiseError
 
-#: Who practises a moment begins at most so many times its length before its middle.
+#: An episode that practises a motion bin begins at most so many bin lengths before the bin's middle.
 RUN_UP = 2.0
 
 
@@ -23,10 +23,10 @@ class Starts:
         seed: of all draws.
         first: share of the starts that stand on frame 0; the others are uniform over the frames from
             which at least one step can be made (reference state initialisation).
-        moments: of the clips, where some are practised more than others, see `draw`.
-        hard: share of the starts (before those on frame 0 are taken) that practise hard moments.
-        over: whether the hard moments are those of the drawn "clip", or of the whole "library", so that
-            clips are drawn by how much of them is hard.
+        bins: of the clips, where some are practised more than others, see `draw`.
+        hard: share of the starts (before those on frame 0 are taken) that adaptive sampling draws.
+        over: whether adaptive sampling draws among the motion bins of the drawn "clip", or of the whole
+            "library", so that clips are drawn by how often they fail.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Starts:
     ):
         self.length, self.first, self.hard, self.over = length.cpu(), first, hard, over
         self.bins = None if bins is None else bins.to(torch.device("cpu"))
-        for what, share in (("on frame 0", first), ("at hard moments", hard)):
+        for what, share in (("on frame 0", first), ("by adaptive sampling", hard)):
             if not 0.0 <= share <= 1.0:
                 raise PoiseError(f"the share of starts {what} must lie in [0, 1], got {share}")
         self._weights = self._checked((self.length - 1).double() if weights is None else weights)
@@ -68,9 +68,9 @@ class Starts:
     def draw(self, count: int, odds: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(clip, frame) of `count` starts, `(count,)` each.
 
-        odds: `(G,)` float64 of the moments, such as `FailureRates.odds`. The share `hard` of the starts
-        lies in the `RUN_UP` before the middle of a moment that is drawn by them among those of its
-        clip, or of all clips of odds above 0; where all are 0 it is begun as without.
+        odds: `(G,)` float64 of the motion bins, such as `FailureRates.odds`. The share `hard` of the
+            starts lies in the `RUN_UP` before the middle of a bin that is drawn by them among those of
+            its clip, or of all clips of odds above 0; where all are 0 an episode begins as without.
         """
         pick = torch.multinomial(self._weights, count, replacement=True, generator=self.rng)
         span = (self.length[pick] - 1).double()
@@ -85,7 +85,7 @@ class Starts:
     def _practise(
         self, m: MotionBins, pick: Tensor, frame: Tensor, odds: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Some of the starts anew, before moments that are drawn by their odds."""
+        """Some of the starts anew, before motion bins that are drawn by their odds."""
         chance, where, before = torch.rand(3, len(pick), dtype=torch.float64, generator=self.rng)
         if self.over == "library":
             # Those of clips that are not drawn at all are not practised either.

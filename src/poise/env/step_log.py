@@ -1,4 +1,4 @@
-"""The log of one control step, worked out only where somebody reads it."""
+"""The log of one control step, worked out only where it is read."""
 
 from __future__ import annotations
 

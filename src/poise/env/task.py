@@ -96,6 +96,6 @@ class TaskConfig:
         lost = [r.name for r in self.rewards if r.when == "far"]
         if lost and self.recovery is None:
             raise PoiseError(
-                f"the reward '{lost[0]}' counts far from the reference alone, and nobody is ever far",
+                f"the reward '{lost[0]}' counts far from the reference alone, and no world is ever far",
                 hint="Set TaskConfig.recovery, for instance to Recovery.phc()",
             )

@@ -36,7 +36,7 @@ def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observer
     observer has seen enough.
 
     Args:
-        env: without automatic reset; whoever made it closes it.
+        env: without automatic reset; it is not closed here.
         policy: acts on raw observations, deterministically.
         obs: `(N, O)` of the worlds as they stand, from `env.reset_to`.
     """

@@ -37,7 +37,7 @@ class Recovered:
     """The trials of one kind.
 
     kind: of `KINDS`. trials: how many. within: share that was back, of each of the card's times. median
-    and slowest: s until back, of those who came back at all; NaN if nobody did.
+    and slowest: s until back, over the trials that came back at all; NaN if none did.
     """
 
     kind: str
@@ -78,9 +78,11 @@ def trial_task(
 ) -> TaskConfig:
     """The task in which recovery is tried: far is exactly `distance` m, and nothing ends or begins anew.
 
-    falls: different fallen characters. guided: by ways, so that no goal is a point and no reference
-    waits. The rest of `task.recovery` stays: a policy must see a point goal where it learned to; a task
-    without recovery gets the paper's.
+    The rest of `task.recovery` stays: a policy must see a point goal where it learned to; a task without
+    recovery gets the paper's.
+
+    falls: different fallen characters. guided: by recovery motions, so that no goal is a point and no
+        reference waits.
     """
     recovery = task.recovery or Recovery.phc()
     drop = replace(recovery.drop, count=falls)
@@ -176,7 +178,7 @@ class _Apart:
         if step:
             ref = self.reference.gather(self.clip, env.frame if self._at is None else self._at)
             self.apart.append((env.pose().pos - ref.pos).norm(dim=-1).mean(-1).cpu())
-        # Where somebody is led, the frame that was told before the step.
+        # Where a goal leads back, the frame that was told before the step.
         self._at = None if self.led is None else self.led.frame.clone()
 
 

@@ -36,8 +36,11 @@ _NO_SCORE = ("per_clip", "variants")
 class FleetJob:
     """One training.
 
-    name: its folder in the fleet's. command: arguments of Python; `--threads K` is added. result:
-    the file that proves that it is done. facts: what the table says about it, such as clip and seed.
+    Attributes:
+        name: its folder in the fleet's.
+        command: arguments of Python; `--threads K` is added.
+        result: the file that proves that it is done.
+        facts: what the table says about it, such as clip and seed.
     """
 
     name: str
@@ -92,8 +95,8 @@ def run_fleet(
 ) -> FleetResult:
     """Runs all jobs that are not done yet; Ctrl-C lets the running ones save, and returns.
 
-    A job whose process ends with an error, or is killed, is started again up to `retries` times and
-    goes on from its checkpoint.
+    If the process of a job ends with an error or is killed, the job is started again, up to `retries`
+    times, and goes on from its checkpoint.
 
     Raises:
         PoiseError: two jobs have one name, or `folder` holds a table of another version.

@@ -35,9 +35,12 @@ RUN = "run"
 class Imitated(Result):
     """What came of an imitation.
 
-    task: the motion with its body. policy: that was trained. evaluation: every start frame simulated.
-    run: the run folder. interrupted: whether Ctrl-C ended the training early; it was evaluated all the
-    same.
+    Attributes:
+        task: the motion with its body.
+        policy: the trained one.
+        evaluation: every start frame simulated.
+        run: the run folder.
+        interrupted: whether Ctrl-C ended the training early; it was evaluated all the same.
     """
 
     task: Imitation
@@ -104,7 +107,8 @@ def imitate(
             num_envs=64.
         folder: keeps the run (the same again goes on with it); by default it is gone with the result,
             unless that is saved.
-        threads: of the physics; 0 takes all cores. device: "cpu" or "cuda".
+        threads: of the physics; 0 takes all cores.
+        device: "cpu" or "cuda".
         on_iteration: is called after each iteration; returning False ends the training.
         callbacks: are told what happens before PPO begins.
 
@@ -127,6 +131,6 @@ def imitate(
             shutil.rmtree(run, ignore_errors=True)
         raise
     if folder is None:
-        # A run that nobody asked to keep goes with its result.
+        # A run without a folder is deleted with its result.
         weakref.finalize(made, shutil.rmtree, run, True)
     return made

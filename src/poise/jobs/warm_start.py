@@ -41,11 +41,14 @@ CLONE_WORLDS = 512
 
 @dataclass(frozen=True)
 class TrainingCallbacks:
-    """Who is told what before PPO begins.
+    """Callbacks for what happens before PPO begins.
 
-    expert: the expert's own score. round: each round of cloning. cloned: the clone, once it is saved.
-    failed: why the run begins without an expert. path: each iteration of a search for paths, and of how
-    many it is one.
+    Attributes:
+        expert: the expert's own score.
+        round: each round of cloning.
+        cloned: the clone, once it is saved.
+        failed: why the run begins without an expert.
+        path: each iteration of a trajectory optimisation, and how many there are.
     """
 
     expert: Callable[[ScoreCard], None] | None = None
@@ -107,8 +110,9 @@ def clone_expert(
 ) -> WarmStart:
     """Scores the expert and clones it into a policy of the recipe's networks and observation.
 
-    start: the policy that is taught, see `learn.clone`; a new perceptron by default. paths: what the
-    teacher follows in place of the expert, without help.
+    Args:
+        start: the policy that is taught, see `learn.clone`; a new perceptron by default.
+        paths: what the teacher follows in place of the expert, without help.
     """
     tell, plan = tell or TrainingCallbacks(), None if paths else make_plan(imitation.reference)
     if tell.expert is not None and plan is not None:

@@ -1,4 +1,4 @@
-"""Who does a fleet's jobs: processes on this machine, or the workers of a Ray cluster.
+"""The workers that do a fleet's jobs: processes on this machine, or the workers of a Ray cluster.
 
 A job is a command line of this Python in a fresh process; what it prints goes into a file.
 """
@@ -39,7 +39,7 @@ class Ended(NamedTuple):
 
 
 class Workers(Protocol):
-    """What a fleet asks of whoever runs its jobs."""
+    """What a fleet asks of the workers that run its jobs."""
 
     slots: int
     """Jobs at the same time."""
@@ -267,6 +267,6 @@ def _no_answer(address: str, reason: str) -> PoiseError:
 
 
 def describe(workers: Workers) -> Mapping[str, Any]:
-    """What the table of results says about who did it."""
+    """What the table of results says about the workers."""
     kind = "this machine" if isinstance(workers, LocalWorkers) else "ray"
     return {"workers": kind, "jobs_at_once": workers.slots, "threads": workers.threads}

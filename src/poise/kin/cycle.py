@@ -67,7 +67,7 @@ def join_cycle(qpos: np.ndarray, hinges: Sequence[str]) -> tuple[np.ndarray, Cyc
 
 
 def close_cycle(qpos: np.ndarray) -> tuple[np.ndarray, float]:
-    """The cycle `qpos (T, 7 + n)` whose last frame is its first one cycle later, and its gap in degrees.
+    """A cycle `qpos (T, 7 + n)`, closed: its last frame is its first one cycle later; gap in degrees.
 
     Frame i takes the share s = i / (T - 1) of the gap: hinges modulo 2 pi, the root's height, and its
     tilt, the orientation without heading. What a cycle adds, heading and horizontal travel, stays. The

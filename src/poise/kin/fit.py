@@ -35,7 +35,7 @@ class FitReport:
     clean: flips and impossible speeds that were repaired, per clip. cycles: how the
     ends of cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance
     per clip between its joints and the humanoid's after conversion (turns that a chain cannot make),
-    before a cycle was closed. widened: hinges whose range had to grow, with the growth in degrees.
+    before a cycle was closed. widened: hinges with a range that had to grow, and the growth in degrees.
     excluded: body pairs that overlap in the reference.
     """
 
@@ -148,7 +148,7 @@ def fit_humanoid(
 
 
 def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
-    """Hinge orders whose middle angle stays far from +-90 degrees, where speeds would explode.
+    """Hinge orders with a middle angle that stays far from +-90 degrees, where speeds would explode.
 
     An order is changed only where the motion comes nearer than `GIMBAL` to the lock.
     """
@@ -193,7 +193,7 @@ def widen(
 
 
 def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str, str], ...]:
-    """Pairs of bodies whose shapes overlap by more than `OVERLAP_M` in some reference frame."""
+    """Pairs of bodies with shapes that overlap by more than `OVERLAP_M` in some reference frame."""
     model = humanoid.model
     data = mujoco.MjData(model)
     found: set[tuple[str, str]] = set()

@@ -94,8 +94,8 @@ def fit_ground(
     stands has that percentile set on the floor.
     A body that still hovers higher than `HOVER_M` for more than 0.2 s, neither in flight nor `ALOFT_M`
     high, is lowered there. Parts that sink in by more than `sink_m`, such as the toes of a rigid foot at
-    push-off, are lifted out frame by frame (a replay without physics asks for less than the training,
-    whose contacts push such parts out). Both follow the running extreme of the excess over 0.1 s
+    push-off, are lifted out frame by frame (a replay without physics asks for less than the training:
+    there contacts push such parts out). Both follow the running extreme of the excess over 0.1 s
     smoothed over 0.2 s; in a closed cycle also across the seam, so that it stays closed. A floor that is
     `known` to be at z = 0 needs no constant lift.
     """

@@ -22,7 +22,7 @@ def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
 
 
 def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None = None) -> Tensor:
-    """Hinge angles `(T, n)` rad whose chain comes nearest to `rot (T, 4)`, continuous in time.
+    """Hinge angles `(T, n)` rad of the chain that comes nearest to `rot (T, 4)`, continuous in time.
 
     Three hinges reproduce any rotation. Of the two Euler branches (a, b, c) and
     (a + pi, pi - b, c + pi) the sequence with the smallest sum of squared steps is found
@@ -52,7 +52,7 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
 
 
 def through_lock(angles: Tensor, order: str) -> Tensor:
-    """Euler angles `(T, 3)` whose third angle is held through frames exactly at gimbal lock.
+    """Euler angles `(T, 3)`, the third angle held through frames exactly at gimbal lock.
 
     There only the sum a +- c is known and `quat_to_euler` sets c to zero, which would be a jump.
     """

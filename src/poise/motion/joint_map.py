@@ -9,7 +9,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.roles import Roles, check_role, find_roles, split_role
 from poise.motion.skeleton import Skeleton
 
-#: Chains whose joints may differ in number; their rotation is shared out along them.
+#: Chains that may differ in their number of joints; their rotation is shared out along them.
 SHARED = ("spine", "neck", "head")
 
 
@@ -32,7 +32,7 @@ class MappedJoint:
 class JointMap:
     """How one skeleton drives another.
 
-    direct: `(source joint, target joint)` pairs whose world rotations correspond.
+    direct: `(source joint, target joint)` pairs with world rotations that correspond.
     """
 
     source: Roles
@@ -130,9 +130,9 @@ def _is_role(text: str) -> bool:
         return False
 
 
-def _known(skeleton: Skeleton, name: str, whose: str) -> None:
+def _known(skeleton: Skeleton, name: str, side: str) -> None:
     if name not in skeleton.names:
-        raise PoiseError(f"the {whose} has no joint '{name}'. {did_you_mean(name, skeleton.names)}")
+        raise PoiseError(f"the {side} has no joint '{name}'. {did_you_mean(name, skeleton.names)}")
 
 
 def _direct(source: Roles, target: Roles) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from poise.motion.clip import Clip
 from poise.motion.noise.kinds import side_pairs
 from poise.motion.windows import FrameBank
 
-#: A rest pose whose sides differ in height by more than this share of their distance is no upright one.
+#: A rest pose is not upright if its sides differ in height by more than this share of their distance.
 _LEVEL = 0.2
 
 
@@ -57,8 +57,8 @@ def mirrored(bank: FrameBank, suffix: str = "-mirrored") -> FrameBank:
 def mirrored_clip(clip: Clip) -> Clip:
     """A clip in a mirror, on bones in a mirror; see `mirrored` for the formulas.
 
-    The mirror stands between left and right as they lie at rest, or, in a skeleton whose rest is not
-    upright, across the y axis; another mirror only changes the way that the clip goes.
+    The mirror stands between left and right as they lie at rest, or, in a skeleton with a rest that is
+    not upright, across the y axis; another mirror only changes the way that the clip goes.
 
     Raises:
         PoiseError: sides that are not named.

@@ -225,7 +225,7 @@ CONVENTIONS: dict[str, frozenset[str]] = {
 
 
 def convention_of(names: tuple[str, ...]) -> tuple[str, int]:
-    """Whose names these are ("" if nobody's), and how many of them."""
+    """The naming convention of these names ("" if none), and how many of them it has."""
     bare = {
         re.sub(r"^(mixamorig\d*_?|Character\d*_|DEF-)(?=.)", "", n.rsplit(":", 1)[-1]) for n in names
     }

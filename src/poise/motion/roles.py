@@ -15,7 +15,7 @@ from poise.motion.skeleton import Skeleton
 SIDES = ("left", "right")
 LEG = ("thigh", "shin", "foot", "toes")
 ARM = ("clavicle", "upper_arm", "forearm", "hand")
-#: Without these nobody walks.
+#: Without these no body walks.
 NEEDED = ("hips", *(f"{side}_{kind}" for kind in LEG[:3] for side in SIDES))
 #: Parts that a limb may lack weigh less than those that it needs, where names can be read either way.
 _WEIGHT = {"clavicle": 0.5, "toes": 0.5}
@@ -55,7 +55,7 @@ class Role:
 class Roles:
     """The parts of one skeleton.
 
-    rows: pelvis and trunk first, then limbs. convention: whose names these are, "" where unknown.
+    rows: pelvis and trunk first, then limbs. convention: the origin of the names, "" where unknown.
     """
 
     skeleton: Skeleton

@@ -37,7 +37,7 @@ class Source:
     unit_m: metres in one file unit. up_axis: "Y" or "Z", the file's vertical.
     channels: one `Channel` per joint. notes: what was guessed or repaired, one sentence each.
     frame_time: seconds per frame exactly as the file states it.
-    travel_joint: the joint whose position channels carry the travel (Bandai: "Hips", not the root).
+    travel_joint: the joint with the channels that carry the travel (Bandai: "Hips", not the root).
     ground_m: where the floor was before it was moved to z = 0 by the user's word; None if it was not.
     evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps.
     mended: (kind, joint, first frame, last frame, size) of what the reader had to mend: "bone drift" m,
@@ -133,7 +133,7 @@ class Skeleton:
         return bool(np.allclose(self.offsets[1:], other.offsets[1:], rtol=0.0, atol=atol))
 
     def children(self, joint: int) -> tuple[int, ...]:
-        """Indices of the joints whose parent is `joint`."""
+        """Indices of the joints with the parent `joint`."""
         return tuple(j for j, p in enumerate(self.parents) if p == joint)
 
     def ancestors(self, joint: int) -> tuple[int, ...]:

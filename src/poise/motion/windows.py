@@ -79,7 +79,7 @@ class FrameBank:
         return torch.cat(parts)
 
     def only(self, wanted: Callable[[str], bool]) -> FrameBank:
-        """The clips whose names are wanted, in their order.
+        """The clips with wanted names, in their order.
 
         Raises:
             PoiseError: none is.
@@ -119,7 +119,7 @@ def pack_frames(
     """Clips of one hierarchy as one bank at `fps`; a root that never turns gives way to its child.
 
     facing: the root's local heading axis; by default the one along which the feet point on average.
-    feet: names of ankles and toes; by default joints whose names say so.
+    feet: names of ankles and toes; by default joints with names that say so.
 
     Raises:
         PoiseError: no clips, clips of different hierarchies, or no feet that could be found by name.

@@ -44,8 +44,9 @@ def as_library(clips: Clips) -> ClipLibrary:
 class Imitation:
     """A library with a body, ready to be learned.
 
-    config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
-    recovery_clips: what the library knows of coming back, where that is learned by it.
+    Attributes:
+        config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
+        recovery_clips: those of the library, where recovery is learned by them.
     """
 
     library: ClipLibrary
@@ -75,11 +76,15 @@ class Imitation:
     ) -> ImitationEnv:
         """An environment of this task; without `auto_reset` for evaluation from given frames.
 
-        threads: of the physics on the CPU. help_scale: what is left of the limits of the help, or of
-        those of each of the task's groups `(G,)`, see `TaskConfig.help_by`. device: "cpu", or "cuda" for
-        the physics on a GPU. guard: whether a world whose simulation goes bad ends everything with an
-        error; without, it is a failure like others. backend: in place of a fresh one, for worlds that
-        are simulated in another way; `num_envs`, `device` and `threads` are then its own.
+        Args:
+            threads: of the physics on the CPU.
+            help_scale: what is left of the limits of the help, or of those of each of the task's groups
+                `(G,)`, see `TaskConfig.help_by`.
+            device: "cpu", or "cuda" for the physics on a GPU.
+            guard: whether a simulation that goes bad in one world ends everything with an error;
+                without, it is a failure like others.
+            backend: in place of a fresh one, for worlds that are simulated in another way; `num_envs`,
+                `device` and `threads` are then its own.
         """
         if backend is None:
             worlds = num_envs or self.config.num_envs
@@ -140,10 +145,12 @@ class Imitation:
     ) -> Trainer:
         """A PPO trainer on a fresh environment; `ppo` in place of this task's own settings.
 
-        threads: of the physics; 0 takes this process's share of the machine's cores. comm: the
-        processes that train together; they share the config's environments out evenly. style: a motion
-        prior's settings, for which the task must have `TaskConfig.style`; or a style of your own, with
-        the `env` that it watches. env: in place of a fresh environment.
+        Args:
+            threads: of the physics; 0 takes this process's share of the machine's cores.
+            comm: the processes that train together; they share the config's environments out evenly.
+            style: a motion prior's settings, for which the task must have `TaskConfig.style`; or a style
+                of your own, with the `env` that it watches.
+            env: in place of a fresh environment.
         """
         if env is None and style is not None and not isinstance(style, AmpConfig):
             raise PoiseError(

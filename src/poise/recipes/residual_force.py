@@ -48,21 +48,25 @@ from poise.sim import SimConfig
 class ResidualForce:
     """Settings of one run.
 
-    method: rfc-implicit, rfc-explicit, or deepmimic (no residual force).
-    help_limit: N, the most residual force that is left at the end; the torque limit is the same
-    number in N m. help_start: N, the limit at the beginning; None (or a number that is not above
-    help_limit) keeps the limit constant, as the paper does.
-    help_schedule: from start to end by success (`control.SuccessHelp`) or linear in time over
-    `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
-    reward: world (App. B.1) or local (App. B.2). observation: reference (state and next reference
-    frame) or phase (the paper's). action: additive or absolute. faithful: where the paper and its
-    authors' code disagree, whose value holds (rotation angle or half of it; reward weights).
-    done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
-    residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
-    that of the joints. 0.3 is the paper's; with the joints' 0.055 the help is hardly tried.
-    completion_bonus: a clip done to its end is worth what holding on as in its last step would be;
-    without it the last moments matter little and characters fall in them. expert: start from a cloned
-    expert (`jobs.warm_start`); without it PPO starts from nothing.
+    Attributes:
+        method: rfc-implicit, rfc-explicit, or deepmimic (no residual force).
+        help_limit: N, the most residual force that is left at the end; the torque limit is the same
+            number in N m.
+        help_start: N, the limit at the start; None (or a number that is not above help_limit) keeps the
+            limit constant, as the paper does.
+        help_schedule: from start to end by success (`control.SuccessHelp`) or linear in time over
+            `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
+        reward: world (App. B.1) or local (App. B.2).
+        observation: reference (state and next reference frame) or phase (the paper's).
+        action: additive or absolute.
+        faithful: to the paper or to its authors' code where their values disagree (rotation angle or
+            half of it; reward weights).
+        done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
+        residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
+            that of the joints. 0.3 is the paper's; with the joints' 0.055 the help is hardly tried.
+        completion_bonus: a clip done to its end is worth what holding on as in its last step would be;
+            without it the last steps matter little and characters fall in them.
+        expert: start from a cloned expert (`jobs.warm_start`); without it PPO starts from nothing.
     """
 
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
@@ -92,8 +96,10 @@ class ResidualForce:
     def paper(cls, clip: Clip | None = None, **changes: Any) -> ResidualForce:
         """All that the paper and its supplement state, for a GPU or for hours.
 
-        clip: by its length the reward is chosen (Sup. 2): in world coordinates for less than 5 s or
-        where no clip is given, else local. changes: settings that differ.
+        Args:
+            clip: by its length the reward is chosen (Sup. 2): in world coordinates for less than 5 s or
+                where no clip is given, else local.
+            changes: settings that differ.
 
         Not stated, and ours: how many worlds share a batch, the friction, how far joint ranges reach
         beyond the motion. Not expressed: Euler steps with stable PD outside of the simulator (here

@@ -26,7 +26,7 @@ def lock_feet(
     and feet that swing are raised clear of the floor, see `synth.steps`.
 
     Args:
-        feet: joints; ankles whose toes are among them are held, others left alone.
+        feet: joints; ankles with toes among them are held, others left alone.
         root: `(T, 3)` m. rot: `(T, J, 4)` wxyz, local.
         contact: `(T, F)` bool per foot joint. free: `(T)` bool, frames that may change; the others
             (keyframes) say where a foot that stands must be.

@@ -28,7 +28,7 @@ from poise.synth.seams import meet, sampled
 #: 1e-4 the one with the least slide, against the recorded, in its worst of four CMU clips (03_01, 03_03,
 #: 11_01, 14_14). By the mean of the four 10 iterations at 3e-5 would be as good.
 EACH_GAP = Adaptation(iterations=20, lr=1e-4)
-#: Bones whose directions differ by more than this (mean over joints, cosine) belong to another rig.
+#: Bones with directions that differ by more than this (mean over joints, cosine) are of another rig.
 _SAME_RIG = 0.94
 
 
@@ -112,8 +112,8 @@ def fill_keyframes(
 
 
 def unlike(clip: Clip, model: InbetweenModel) -> str | None:
-    """In what a clip's skeleton differs from the model's, as the beginning of a sentence; None if not:
-    the same joints, whose rest directions agree."""
+    """In what a clip's skeleton differs from the model's, as the first part of a sentence; None if not:
+    the same joints, with rest directions that agree."""
     own = without_still_root(clip).skeleton
     if own.names != model.names or own.parents != model.layout.parents:
         here = [n for n in own.names if n not in model.names]

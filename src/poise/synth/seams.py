@@ -44,7 +44,7 @@ def fade(count: int, frames: int) -> Tensor:
 
 
 def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tuple[Tensor, Tensor]:
-    """A path whose generated middle leaves and reaches the kept frames at their speed.
+    """A path; its generated middle leaves and reaches the kept frames at their speed.
 
         y(1) = x(0) + (x(0) - x(-1)),   y(n) = x(n+1) - (x(n+2) - x(n+1)),
 

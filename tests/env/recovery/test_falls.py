@@ -25,7 +25,7 @@ def test_the_fallen_lie_on_the_floor(make_phc, drop):
     assert torch.equal(before, backend.snapshot())  # The worlds come back as they were.
     assert bool(lies(humanoid, states).all()) and not states[:, :2].any()
     assert float(states[:, 2].max()) < 0.6 * standing_height(humanoid)
-    # MuJoCo itself finds everybody touching the floor and nobody deep in anything.
+    # MuJoCo itself finds every body touching the floor and none deep in anything.
     data = mujoco.MjData(humanoid.model)
     for q in states:
         data.qpos[:] = q.numpy()

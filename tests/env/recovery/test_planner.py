@@ -1,4 +1,4 @@
-"""Ways back made of a library's own clips: what they are made of, where they lead, how they move."""
+"""Recovery motions of a library's own clips: what they are made of, where they lead, how they move."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_walk_leads_from_anywhere_to_a_place(built: Built, bearing: float) -> 
     assert turned_by(way[0], start) < 0.1
     assert way[-1, :2].norm() < 0.1
     assert turned_by(way[-1], place) < 0.15
-    # Nobody runs, and at the end a second is stood.
+    # No motion runs, and all stand for a second at the end.
     pace = (way[1:, :2] - way[:-1, :2]).norm(dim=-1) * reference.rate_hz
     assert pace.max() < 1.5 and pace[-20:].max() < 1e-6
 
@@ -80,7 +80,7 @@ def test_what_is_near_and_behind_is_come_to_backwards(built: Built) -> None:
         start[0] = off
         way = plan_recovery(get_up, start, place)
         assert way[-1, :2].norm() < 0.1
-        # Who turns around to walk there faces the other way in between.
+        # A motion that turns around to walk there faces the other way in between.
         turns = max(turned_by(q, start) for q in way)
         assert (turns < 1.0) == backwards
 
@@ -144,7 +144,7 @@ def rolled(quat: Tensor, angle: float) -> Tensor:
 def test_who_lies_takes_the_nearest_clip_that_gets_up(built: Built) -> None:
     _, get_up = built
     recovery_clips = get_up.recovery_clips
-    # The same clip on the belly, as if somebody had gotten up from there.
+    # The same clip on the belly, as if it had gotten up from there.
     prone = recovery_clips.ups[0].clone()
     prone[:, 3:7] = torch.stack([rolled(q, math.pi) for q in prone[:, 3:7]])
     both = GetUpPlanner(

@@ -355,7 +355,7 @@ def test_a_cyclic_reference_waits_where_it_has_come_to(built, make_phc):
 
 
 def test_a_task_without_recovery_is_as_before(built, make_phc):
-    """Odds of 0 and nobody far: the same numbers as without any recovery, bit for bit."""
+    """Odds of 0 and no world far: the same numbers as without any recovery, bit for bit."""
     task = make_phc(WALK)
     plain = task.env(6, 3, False, threads=1)
     assert plain.plugin(RecoveryClock) is None and "recovery" not in plain.state()

@@ -1,4 +1,4 @@
-"""Feet that stand in recordings whose feet slide."""
+"""Feet that stand in recordings with sliding feet."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def pose(body: IkBody, q: np.ndarray) -> np.ndarray:
 
 
 def random_motion(body: IkBody, frames: int, seed: int, size: float = 0.6) -> np.ndarray:
-    """Smooth random coordinates whose hinges swing by up to `size` rad."""
+    """Smooth random coordinates with hinges that swing by up to `size` rad."""
     rng = np.random.default_rng(seed)
     n = sum(len(r.order) for r in body.table.rows)
     t = np.linspace(0, 1, frames)[:, None]

@@ -40,7 +40,7 @@ def real(data_dir, name: str) -> Clip:
 
 
 def turned(clip: Clip, axes: torch.Tensor | None = None) -> Clip:
-    """The same motion on a skeleton whose joints have other axes, by default such that it lies folded at
+    """The same motion on a skeleton of joints with other axes, by default such that it lies folded at
     rest, as LAFAN1's does."""
     if axes is None:
         generator = torch.Generator().manual_seed(0)

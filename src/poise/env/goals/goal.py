@@ -36,7 +36,7 @@ class Goal(ABC):
     """What N characters are to do.
 
     Attributes:
-        humanoid: the body whose coordinates the goal is in; the first of `bodies`.
+        humanoid: the goal is in its coordinates; the first of `bodies`.
         bodies: all bodies, of the same joints and hinges.
         rate_hz: control steps a second.
         layout: where the numbers of packed poses `(N, W)` stand, see `Layout`.
@@ -83,7 +83,7 @@ class Goal(ABC):
     def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
         """Looks up what comes next in worlds `ids`, all for None, after they have been set down.
 
-        held: `(N,)` bool, worlds whose goals wait in the next step; None: no goal waits.
+        held: `(N,)` bool, worlds with goals that wait in the next step; None: no goal waits.
         """
 
     def body(self, ids: Tensor | None) -> Tensor:
@@ -109,7 +109,7 @@ class Goal(ABC):
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
         """One control step has been made; `now()` and `ahead(1)` of all worlds.
 
-        waited, held: `(N,)` bool, worlds whose goals waited in this step, and wait in the next.
+        waited, held: `(N,)` bool, worlds with goals that waited in this step, and that wait in the next.
         """
 
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
@@ -178,7 +178,7 @@ def extrapolated(qpos: Tensor, qvel: Tensor, steps: Tensor, rate_hz: float) -> S
     """Where a motion goes on that is known up to `qpos (n, 7 + n)` with `qvel (n, 6 + n)`.
 
     Its velocity fades, q = q_0 + v_0 tau (1 - e^(-t / tau)), v = v_0 e^(-t / tau) with tau = `FADE_S`,
-    so that a character whose goals stop arriving comes to rest where it was heading.
+    so that a character comes to rest where it was heading if its goals stop arriving.
 
     steps: `(n,)` control steps beyond the last known frame.
     """

@@ -39,7 +39,8 @@ class LedGoal(Goal):
     on from there. A character that loses the recovery motion gets another one.
 
     Args:
-        goal: the clips. recovery_clips: of the library that the policy has learned.
+        goal: the clips.
+        recovery_clips: of the library that the policy has learned.
 
     Attributes:
         doing: `(N,)`, `TRACKS`, `FALLS` or `RETURNS`.
@@ -203,7 +204,7 @@ class LedGoal(Goal):
         return frame + int((apart + MOVES * speed + SKIPS * later).argmin())
 
     def where(self, env: int) -> str:
-        kind = {TRACKS: "", FALLS: ", lost", RETURNS: ", on the way back"}[int(self.doing[env])]
+        kind = {TRACKS: "", FALLS: ", lost", RETURNS: ", on its recovery motion"}[int(self.doing[env])]
         return f"{self.reference.names[int(self.goal.clip[env])]} frame {int(self.frame[env])}{kind}"
 
     # --- persistence --------------------------------------------------------------------------

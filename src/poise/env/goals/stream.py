@@ -25,7 +25,8 @@ class StreamGoal(BufferedGoal):
     stalls, jumps, sends what is no pose, or ends.
 
     Args:
-        humanoid: the body whose coordinates arrive. rate_hz: frames a second, as many as control steps.
+        humanoid: frames arrive in its coordinates.
+        rate_hz: frames a second, as many as control steps.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class StreamGoal(BufferedGoal):
     def push(self, qpos: Tensor, ids: Tensor | None = None) -> None:
         """The next frame, `(7 + n)` for all worlds or `(n, 7 + n)` for worlds `ids (n,)`, all for None.
 
-        A frame that is not finite or whose root has no rotation is left out, and noted.
+        A frame that is not finite, or in which the root has no rotation, is left out, and noted.
 
         Raises:
             PoiseError: another number of coordinates, or of worlds.

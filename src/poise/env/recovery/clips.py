@@ -1,4 +1,4 @@
-"""What a library knows of coming back: a body at ease, a steady walk, and how somebody gets up."""
+"""The recovery clips of a library: a body at ease, steady walks, and clips that get up."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from poise.kin import close_cycle
 from poise.spatial import heading_quat, into_heading, quat_angle, quat_between
 from poise.spatial.turns import heading_angle, turned
 
-#: Shares of the height of who stands: lower lies, at least so high stands again.
+#: Shares of the standing height: a body that is lower lies, one that is at least so high stands again.
 LIES, STANDS = 0.5, 0.9
-#: m/s: no part of who lies moves faster, on average; s: no longer is got up.
+#: m/s: no part of a body that lies moves faster, on average; s: getting up lasts no longer.
 STILL, UP_S = 0.6, 6.0
 #: s of a walk's cycle, m/s of its travel, rad that it may turn.
 CYCLE_S, TRAVEL, STRAIGHT = (0.8, 1.5), (0.7, 1.4), 0.35
@@ -26,10 +26,12 @@ SPEED_COUNTS, CLOSES = 0.1, 0.02
 
 @dataclass(frozen=True, eq=False)
 class RecoveryClips:
-    """What a library knows of coming back, coordinates `(F, 7 + n)` float64.
+    """The recovery clips of a library, coordinates `(F, 7 + n)` float64.
 
-    ease: `(7 + n)`, a body that stands. walks: each a closed cycle along +X. ups: from lying to
-    standing.
+    Attributes:
+        ease: `(7 + n)`, a body that stands.
+        walks: each a closed cycle along +X.
+        ups: from lying to standing.
     """
 
     ease: Tensor
@@ -53,10 +55,13 @@ class RecoveryClips:
 def find_recovery_clips(
     reference: Reference, ease: tuple[int, int], walking: Tensor, most: int = 2
 ) -> RecoveryClips | None:
-    """The ways of a library; None if nobody walks steadily in it or nobody gets up.
+    """The recovery clips of a library; None if none of its clips walks steadily or none gets up.
 
-    ease: (clip, frame) of who stands. walking: `(C,)` bool, clips that walk or stand. most: walks, the
-    fastest of those that close and face as walks mostly do, which leaves out who walks backwards.
+    Args:
+        ease: (clip, frame) that stands.
+        walking: `(C,)` bool, clips that walk or stand.
+        most: walks, the fastest of those that close and face as walks mostly do, which leaves out walks
+            backwards.
     """
     clip, frame = ease
     stand = reference.qpos[int(reference.start[clip]) + frame].cpu()

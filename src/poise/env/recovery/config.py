@@ -10,8 +10,9 @@ A task with a `Recovery` has these kinds of episodes, and without one only the f
 | fallen, far | both | waits |
 | continued | where a failure would have ended an episode | waits |
 
-Whoever recovers cannot fail and does not end with the clip, whose last frame then stands still: not
-before the root has come as near as `switch` and stayed for `settle` steps, with no wait left.
+A character that recovers cannot fail, and its episode does not end with the clip, of which the last
+frame then stands still: not before the root has come as near as `switch` and stayed for `settle` steps,
+with no wait left.
 
 **Point goal** (Eq. 3): as long as the root is farther than `switch` from its reference, of the goal
 nothing is told but where the reference's root is and how it is turned: see `toward`. This and the
@@ -41,13 +42,16 @@ TRACKED, FALLEN, FAR, CONTINUED = 0, 1, 2, 4
 class Recovery:
     """How often episodes are about recovery, and what it is; see the module.
 
-    fallen, far: probabilities that an episode begins fallen and that it begins far, drawn apart.
-    continues: probability that a failed episode goes on. grace: control steps for which the reference
-    waits then and for those who begin fallen. distance: m, from and to which characters begin far.
-    by_area: that distance is uniform over the ring on the floor, not over the length. switch: m between
-    the roots, beyond which the goal is a point; inf: it never is. reach: m, no point is told to be
-    farther. settle: control steps near the reference after which failures count again. drop: how the
-    fallen fell.
+    Attributes:
+        fallen, far: probabilities that an episode begins fallen and that it begins far, drawn apart.
+        continues: probability that a failed episode goes on.
+        grace: control steps for which the reference waits then and for those that begin fallen.
+        distance: m, from and to which characters begin far.
+        by_area: that distance is uniform over the ring on the floor, not over the length.
+        switch: m between the roots, beyond which the goal is a point; inf: it never is.
+        reach: m, no point is told to be farther.
+        settle: control steps near the reference after which failures count again.
+        drop: how the fallen fell.
     """
 
     fallen: float = 0.3

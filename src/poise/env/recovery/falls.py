@@ -19,7 +19,7 @@ from poise.spatial import normalize
 HELD = 2
 #: Lowest point of a state that lies, m: above it flies, below it is stuck in the floor.
 HIGHEST, DEEPEST = 0.0, -0.03
-#: Height above the floor, m, at which nobody begins to fall in contact.
+#: Height above the floor, m, from which characters fall, so that none begins in contact.
 CLEAR = 0.03
 #: Of the standing height of the root, above which a character has not fallen.
 FALLEN = 0.6
@@ -31,9 +31,12 @@ ROUNDS = 5
 class Drop:
     """How characters are let fall: in a random orientation from standing height, then driven a while.
 
-    by: "torques", random ones of every hinge, drawn anew every other physics step (the paper), or
-    "action", one random action held by the servos (the code). size: of the torques as a share of each
-    servo's limit, or of the actions. steps: physics steps. count: K, how many states are kept.
+    Attributes:
+        by: "torques", random ones of every hinge, drawn anew every other physics step (the paper), or
+            "action", one random action held by the servos (the code).
+        size: of the torques as a share of each servo's limit, or of the actions.
+        steps: physics steps.
+        count: K, how many states are kept.
     """
 
     by: Literal["torques", "action"] = "torques"
@@ -111,7 +114,7 @@ def _dropped(
     start = torch.zeros(count, backend.model.nq, dtype=torch.float64)
     start[:, 3:7] = normalize(torch.randn(count, 4, dtype=torch.float64, generator=rng))
     start[:, 7:] = rest_angles(humanoid)
-    # Arms and head may reach below the feet of one that stands, so nobody begins in the floor.
+    # Arms and head may reach below the feet of a body that stands, so none begins in the floor.
     start[:, 2] = torch.maximum(torch.tensor(height), -_lowest(humanoid, start)) + CLEAR
     times = rounds if drop.by == "torques" else 1
     push = drop.size * (2.0 * torch.rand(times, count, hinges, generator=rng) - 1.0)

@@ -13,22 +13,22 @@ from poise.spatial.turns import turned, yaw_quat
 
 #: s that a blend takes, and m of the distance between poses that are blended in a second more.
 BLEND_S, BLEND_SPEED = 0.4, 1.5
-#: Times as fast as in its clip is got up, as somebody who wants to be back.
+#: Factor by which the get-up clips are sped up.
 QUICK = 1.25
 #: m: poses that are no farther apart are the same.
 SAME = 0.01
-#: m: no limb that would reach into the floor lifts who is blended higher.
+#: m: a blend is lifted no higher than this for a limb that would reach into the floor.
 LIFT = 0.12
 #: m that a rad of the bodies' rotations counts, and a s that is up later, where poses are compared.
 TURNED, LATER = 0.3, 0.1
-#: Of the height of who stands: where the root is no higher above its lowest, somebody still lies.
+#: Share of the standing height: where the root is no higher than this above its lowest, the body lies.
 ENTERS = 0.1
 
 
 class GetUpPlanner:
     """How the characters of a library get up from anywhere.
 
-    Of all clips that get up, the one is taken that has the frame nearest to how somebody lies, from
+    Of all clips that get up, the one is taken that has the frame nearest to how the character lies, from
     there on. A library needs one from the back and one from the belly.
     """
 

@@ -1,18 +1,18 @@
-"""Ways back: from where characters lie, up and over to a place, made of a library's own clips.
+"""Recovery motions: from where characters lie, up and over to a place, made of a library's own clips.
 
-Getting up is hard to find by trial, and easy to learn from a clip of it. Of what a library knows of
-coming back (`env.recovery.clips`) a way is made for any start:
+Getting up is hard to find by trial, and easy to learn from a clip of it. Of the recovery clips of a
+library (`env.recovery.clips`) a recovery motion is planned for any start:
 
     lying -> blended (`env.recovery.get_up`) -> a clip that gets up -> the walk, steered -> at ease
 
-Before a walk to what is farther than `NEAR` it stands at ease, too.
+Before a walk to a place farther than `NEAR` the character stands at ease, too.
 
 It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
-track such ways (`jobs.perpetual.demonstrations`) finds what physics allows.
+track such motions (`jobs.perpetual.demonstrations`) finds what physics allows.
 
 Turning follows a unicycle: the heading turns toward the place at no more than `TURN` rad/s, and the
-walk's stride shortens by the cosine of what is left to turn. To a place that is near and behind the walk
-is done from its end to its beginning.
+walk's stride shortens by the cosine of what is left to turn. To a place that is near and behind, the
+walk is played from its end to its start.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TURN, HERE, FACING = 2.0, 0.08, 0.1
 #: Of a walk's pace: what is gained and lost in a step, and where all of the walk is seen; steps on the
 #: spot while turning.
 FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
-#: Share of the height of who stands at ease, below which the root of who must get up is.
+#: Share of the root's height at ease; a character with its root below must get up.
 DOWN = 0.6
 #: m: what is no farther is come to at once. Cosine: backwards, where it is no more ahead.
 NEAR, BEHIND = 1.2, -0.6
@@ -48,8 +48,10 @@ def plan_recovery(
 ) -> Tensor:
     """The frames `(T, 7 + n)` from `start (7 + n)` to standing at ease at `place (7 + n)`.
 
-    rising: how this library gets up, and what else it knows. which: of the walks. phase: 0 to 1, where
-    in its cycle the walk begins.
+    Args:
+        get_up: how this library gets up, and its other recovery clips.
+        which: of the walks.
+        phase: 0 to 1, where in its cycle the walk begins.
     """
     recovery_clips, body = get_up.recovery_clips, start[None]
     if float(start[2]) < DOWN * float(recovery_clips.ease[2]):
@@ -58,7 +60,7 @@ def plan_recovery(
     stand[:2] = body[-1, :2]
     walk = _walk(recovery_clips, stand, place, get_up.rate_hz, which, phase)
     if float((place[:2] - stand[:2]).norm()) > NEAR:
-        # Who walks far comes to stand first, since whoever sets off while getting up falls more often.
+        # Stand first before a long walk: characters that set off while getting up fall more often.
         return torch.cat((body[:-1], get_up.blend(body[-1], stand)[:-1], walk))
     return torch.cat((body[:-1], get_up.out_of(body[-1], walk)))
 
@@ -66,8 +68,11 @@ def plan_recovery(
 def recovery_motions(
     get_up: GetUpPlanner, falls: Tensor, far: float, count: int, seed: int
 ) -> dict[str, np.ndarray]:
-    """`count` ways back to standing at ease at the origin by name: every other one from lying, of which
-    two fifths are away, too, and the rest from standing up to `far` m away. falls: `(K, 7 + n)`."""
+    """`count` recovery motions to standing at ease at the origin, by name: every other one from lying,
+    of which two fifths are away, too, and the rest from standing up to `far` m away.
+
+    falls: `(K, 7 + n)`, states that lie.
+    """
     rng, recovery_clips = torch.Generator().manual_seed(seed), get_up.recovery_clips
     place = facing(recovery_clips.ease, heading_angle(recovery_clips.ease[3:7]))
     motions: dict[str, np.ndarray] = {}

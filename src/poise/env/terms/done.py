@@ -19,8 +19,10 @@ def bodies_too_far(
 ) -> Tensor:
     """The bodies are on average more than `limit` m away from the reference (UHC, PHC).
 
-    bodies: `(K,)` rows that count, all by default; `all_but_feet` is PHC's relaxed early termination.
-    grace: control steps at the begin of an episode in which nobody fails.
+    Args:
+        bodies: `(K,)` rows that count, all by default; `all_but_feet` is PHC's relaxed early
+            termination.
+        grace: control steps at the begin of an episode in which no character fails.
     """
     return _from(grace, frame, _distance(frame, bodies).mean(-1) > limit)
 

@@ -53,7 +53,7 @@ class Sources(Mapping[str, Tensor]):
         self._known = tuple(dict.fromkeys((*self._names, "age")))
 
     def of(self, goal: Tensor, ahead: Tensor, ids: Tensor | None = None) -> dict[str, Tensor]:
-        """What terms read, of all worlds; or of worlds `ids (n,)`, whose goals are given."""
+        """What terms read, of all worlds; or of worlds `ids (n,)`, of which the goals are given."""
         assert self._known is not None
         self._held |= {"goal": goal, "ahead": ahead}
         if ids is None:
@@ -84,7 +84,8 @@ class Terms:
 
     Args:
         style: what a motion prior sees, none for none.
-        observables: what frames know, by name. context: what all frames share.
+        observables: what frames know, by name.
+        context: what all frames share.
         ends: which episodes failed, are terminated and are truncated, by a frame and what the terms call
             a failure.
         fused: replay a recording of the first evaluation, see `record`; on the CPU only.

@@ -28,8 +28,8 @@ TENTH = 0.1
 
 
 def point_goal(frame: Frame, gain: float = 1.0, most: float = float("inf")) -> Tensor:
-    """gain min(d_(t-1) - d_t, most), m come nearer to the reference's root in a step; below 0 for who
-    went away. `(N,)`.
+    """gain min(d_(t-1) - d_t, most), `(N,)`: m that the character came nearer to the reference's root
+    in a step; below 0 where it went away.
 
     The reference moves, too; one that runs away at the character's speed leaves nothing to earn.
     """

@@ -80,14 +80,16 @@ def energy_term(
 ) -> RewardTerm:
     """The energy penalty of Eq. 1, r = w_task r_task + w_style r_style - 0.0005 energy.
 
-    task_weight: w_task, with which a motion prior multiplies the whole task reward and by which the
-    weight is divided here, since the penalty is not halved (1 without a prior). weight: 0.0005 for
-    primitives; the code's composer has 0.00005, and Eq. 4 a tenth, 0.00005, for recovery.
+    Args:
+        task_weight: w_task, with which a motion prior multiplies the whole task reward and by which the
+            weight is divided here, since the penalty is not halved (1 without a prior).
+        weight: 0.0005 for primitives; the code's composer has 0.00005, and Eq. 4 a tenth, 0.00005, for
+            recovery.
 
-    A body of 64 kg whose expert walks on the reference spends 530 W, and 1,700 W under a noise of 0.055
-    rad on its targets: at 0.0005 it loses 0.26 and 0.84 of the reward of at most about 1. Where nothing
-    is left above 0, falling early pays; then take the composer's weight, or less noise. The paper's
-    squares are 49,000 W^2 there, so that its formula with its weight leaves nothing at all.
+    An expert that walks a body of 64 kg on the reference spends 530 W, and 1,700 W under a noise of
+    0.055 rad on its targets: at 0.0005 it loses 0.26 and 0.84 of the reward of at most about 1. Where
+    nothing is left above 0, falling early pays; then take the composer's weight, or less noise. The
+    paper's squares are 49,000 W^2 there, so that its formula with its weight leaves nothing at all.
     """
     given = {"form": form, "exempt": exempt}
     return RewardTerm("energy", energy, -weight / task_weight, given, imitation=False)

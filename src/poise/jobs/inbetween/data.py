@@ -60,7 +60,7 @@ def library_bank(
 
 
 def motion_files(library: Path) -> list[Path]:
-    """Files under a folder whose suffix a reader knows, in order.
+    """Files under a folder with a suffix that a reader knows, in order.
 
     Raises:
         PoiseError: there is no such folder, or nothing in it.

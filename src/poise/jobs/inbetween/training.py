@@ -54,16 +54,19 @@ FRAMES = "frames.safetensors"
 class Inbetween:
     """Settings of one network's training.
 
-    net: transformer or rtn. final, validation: regular expressions in the names of clips that are kept
-    apart (see `eval.inbetween.Protocol`); final clips are never read by training or choices.
-    contacts: whose labels the network learns: Harvey et al.'s or Skeleton2Humanoid's, which tell from
-    steps alone, or "floor", of slow feet near it, for recordings whose feet slide.
-    ema: of the averaged weights that are used.
-    mirror: whether it learns from every clip in a mirror, too. stretch: windows are drawn up to so many
-    times faster and slower than recorded.
-    onto: a motion file on whose skeleton all clips are brought by `library_of`, which also cuts what
-    nobody can do alone on a floor. reading: how it reads them; given alone, all come onto the skeleton
-    that most seconds are on. By default clips of the most common skeleton are taken as they are.
+    Attributes:
+        net: transformer or rtn.
+        final, validation: regular expressions in the names of clips that are kept apart (see
+            `eval.inbetween.Protocol`); final clips are never read by training or choices.
+        contacts: the labels that the network learns: Harvey et al.'s or Skeleton2Humanoid's, which tell
+            from steps alone, or "floor", of slow feet near it, for recordings with sliding feet.
+        ema: of the averaged weights that are used.
+        mirror: whether it learns from every clip in a mirror, too.
+        stretch: windows are drawn up to so many times faster and slower than recorded.
+        onto: a motion file; `library_of` brings all clips onto its skeleton and cuts what no character
+            can do alone on a floor.
+        reading: how it reads them; given alone, all come onto the skeleton that most seconds are on. By
+            default clips of the most common skeleton are taken as they are.
     """
 
     net: Literal["transformer", "rtn"] = "transformer"
@@ -109,8 +112,8 @@ class Inbetween:
         """The same as public re-implementations have it: an LSTM of 768 units, clips in a mirror, too,
         an adversarial weight of 0.01, and gradients scaled down to 1.
 
-        Neither paper has published code of its training. Not expressed: critics whose windows differ
-        from 10 and 2 frames, and their other weights of losses, on which they disagree.
+        Neither paper has published code of its training. Not expressed: critics with windows other
+        than 10 and 2 frames, and their other weights of losses, on which they disagree.
         """
         own = cls.paper()
         rtn, how = (

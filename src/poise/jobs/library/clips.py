@@ -32,15 +32,22 @@ WORDS = (
 class LibraryConfig:
     """How a library is made.
 
-    min_frames: shorter clips are left out (PHC's converter: 10). min_cut_s: what is left of a cut clip
-    must last so long. rules: see `AloneRules`. words: see `WORDS`. max_unlike_deg: mean angle between
-    the limbs before and after retargeting beyond which a clip is left out.
-    keep: regular expressions of clips that are taken whole whatever the rules say. leave_out: of clips
-    that are not taken. skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
-    rates: (pattern, frames per second) pairs for files that state none or a wrong one. allow_pickle:
-    pickled files that are given by name are read too. level: feet are turned to stand flat on the
-    humanoid's soles, see `level_feet`, which motion that is not simulated has no need of. mirror: each
-    clip is taken in a mirror, too. backwards: of clips that are taken backwards, too; see `images`.
+    Attributes:
+        min_frames: shorter clips are left out (PHC's converter: 10).
+        min_cut_s: what is left of a cut clip must last so long.
+        rules: see `AloneRules`.
+        words: see `WORDS`.
+        max_unlike_deg: mean angle between the limbs before and after retargeting beyond which a clip is
+            left out.
+        keep: regular expressions of clips that are taken whole whatever the rules say.
+        leave_out: of clips that are not taken.
+        skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
+        rates: (pattern, frames per second) pairs for files that state none or a wrong one.
+        allow_pickle: pickled files that are given by name are read too.
+        level: feet are turned to stand flat on the humanoid's soles, see `level_feet`, which motion that
+            is not simulated has no need of.
+        mirror: each clip is taken in a mirror, too.
+        backwards: of clips that are taken backwards, too; see `images`.
     """
 
     min_frames: int = 10
@@ -237,7 +244,7 @@ def set_down(
 
     example: a clip on the same skeleton that tells how it stands.
     """
-    # As the humanoid can turn its joints, whose feet are rigid and turn about two axes alone.
+    # As the humanoid can turn its joints: its feet are rigid and turn about two axes alone.
     onto = target.example or target.skeleton
     on = place_on_body(
         clip, target.table, onto, example=example, clean=False, level=config.level, known=False
@@ -248,7 +255,7 @@ def set_down(
 def _alone(
     clip: Clip, target: Target, note: ClipNote, config: LibraryConfig, keep: bool
 ) -> tuple[Clip | None, ClipNote]:
-    """The longest stretch that needs no more than a floor."""
+    """The longest run of frames that needs no more than a floor."""
     found = () if keep else not_alone(clip, target.table, config.rules)
     first, stop = longest_alone(clip, found) if found else (0, clip.frames)
     if found:

@@ -28,8 +28,11 @@ _SUBJECT = re.compile(r"subject[ _-]?(\d+)", re.IGNORECASE)
 class MotionFile:
     """One file of a library.
 
-    path: where it lies. name: its folders from the library's own on and its stem, joined by "-" (a "-"
-    in the stem becomes "_"), and unique. subject: who moved, see `subject_of`.
+    Attributes:
+        path: where it lies.
+        name: its folders from the library's own on and its stem, joined by "-" (a "-" in the stem
+            becomes "_"), and unique.
+        subject: the performer, see `subject_of`.
     """
 
     path: Path
@@ -82,9 +85,9 @@ def is_motion(path: Path) -> bool:
 
 
 def subject_of(name: str) -> str:
-    """Who moves in the clip of this name.
+    """The performer of the clip of this name.
 
-    "cmu 02" for a take such as `02_01` below a folder whose name has "cmu" in it, "subject 1" where the
+    "cmu 02" for a take such as `02_01` below a folder with "cmu" in its name, "subject 1" where the
     name says so, else the folders before the last "-".
     """
     name = name.removesuffix(BACKWARDS).removesuffix(MIRRORED)

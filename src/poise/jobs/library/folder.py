@@ -1,7 +1,7 @@
 """A folder of motion files as one library on one humanoid, and whole performers held out of it.
 
 Perpetual Humanoid Control (Luo et al. 2023, section 4) trains on AMASS without the sequences in which
-somebody sits on furniture, hangs or is carried, by a list made by hand. Here rules tell them
+a performer sits on furniture, hangs or is carried, by a list made by hand. Here rules tell them
 (`kin.doctor`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules them.
 """
 
@@ -58,12 +58,13 @@ def library_of(
     or bone lengths (`retarget`), and lifted as a whole so that its feet stand (`fit_heights`). What no
     humanoid can do alone is cut off or left out: unreadable or no human, shorter than `min_frames`, in
     flight with another gravity, held above the floor, leaning on nothing, on several floors, a telling
-    word in its name. The longest stretch without such a spell stays.
+    word in its name. The longest run of frames without such a spell stays.
 
     Args:
         onto: the skeleton, a clip on it, a motion file, an MJCF body (`.xml`), or a skeleton with its
             body; by default the skeleton on which most seconds of the library are.
-        fps: frames per second of all clips. body: of the humanoid whose soles are set on the floor.
+        fps: frames per second of all clips.
+        body: of the humanoid; its soles are set on the floor.
         cache: a folder; a library of the same content and settings is taken from it at once.
         tell: is told how far it is.
 

@@ -1,4 +1,4 @@
-"""Clips of a library in a mirror and backwards: who turns left learns to turn right, too."""
+"""Clips of a library in a mirror and backwards: a turn to the left is learned to the right, too."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def images(clip: Clip, target: Target, config: LibraryConfig) -> list[Clip]:
 
 
 def mirror_image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
-    """A placed clip in a mirror, on the target again, whose sides differ a little in bones and soles.
+    """A placed clip in a mirror, on the target again: its sides differ a little in bones and soles.
 
     Raises:
         PoiseError: no joint's name tells a side.

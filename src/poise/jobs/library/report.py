@@ -13,12 +13,21 @@ State = Literal["kept", "cut", "left out"]
 class ClipNote:
     """One file of a library.
 
-    name, subject: see `MotionFile`. path: of the file. state: taken whole, in part, or not at all.
-    reason: why it was cut or left out, a clause. rule: that rule's name: unreadable, not human, short,
-    word, held, leaning, below, rate, unlike, by hand. seconds: of the file's motion; kept_s: what the
-    library has of it, (0, 0) for none. retargeted: it came from another skeleton. scale: of its steps.
-    direction_deg, slide_mm_s: see `RetargetReport`. lift_m: how far it was lifted onto the floor.
-    repairs: what was cleaned. notes: what its reader guessed.
+    Attributes:
+        name, subject: see `MotionFile`.
+        path: of the file.
+        state: taken whole, in part, or not at all.
+        reason: why it was cut or left out, a clause.
+        rule: that rule's name: unreadable, not human, short, word, held, leaning, below, rate, unlike,
+            by hand.
+        seconds: of the file's motion.
+        kept_s: what the library has of it, (0, 0) for none.
+        retargeted: it came from another skeleton.
+        scale: of its steps.
+        direction_deg, slide_mm_s: see `RetargetReport`.
+        lift_m: how far it was lifted onto the floor.
+        repairs: what was cleaned.
+        notes: what its reader guessed.
     """
 
     name: str
@@ -69,7 +78,7 @@ class LibraryReport:
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """Who moves in the library, in order."""
+        """The performers of the library, in order."""
         return tuple(sorted({c.subject for c in self.clips if c.state != "left out"}))
 
     def sentences(self, every: bool = False) -> list[str]:

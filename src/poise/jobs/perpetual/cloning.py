@@ -9,7 +9,7 @@ from poise.learn import CloneConfig
 #: Control steps that the clone sees of each frame of the library, and the most in all: a step is kept as
 #: 4 bytes for every number of observation and action, 3.4 kB for 20 bodies, so 2.2 GB.
 PER_FRAME, MOST = 16, 640_000
-#: The same where the teacher follows paths, whose feedback takes more to learn.
+#: The same for the LQR teacher: its feedback takes more to learn.
 PER_FRAME_OF_PATHS, MOST_OF_PATHS = 60, 1_000_000
 #: From so many control steps on, more rounds are of more use than more steps in each.
 MANY = 200_000
@@ -24,7 +24,8 @@ def clone_for(frames: int, worlds: int, paths: bool = False) -> CloneConfig:
     worlds and enough for some minutes of motion. A library of 31,000 frames gets 496,000 in 6 rounds: 4
     times as many, over which the regression takes 5 times as long.
 
-    paths: the teacher follows paths, near to which it must stay: less noise, more steps.
+    paths: the teacher is an LQR teacher on optimised trajectories and must stay near to them: less
+        noise, more steps.
     """
     each, most = (PER_FRAME_OF_PATHS, MOST_OF_PATHS) if paths else (PER_FRAME, MOST)
     plain, wanted = CloneConfig(), min(each * frames, most)

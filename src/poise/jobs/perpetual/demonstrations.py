@@ -1,7 +1,7 @@
-"""How coming back is learned: ways back of a library are more clips to track
-(`env.recovery.controller`).
+"""How coming back is learned: a library's recovery motions are more clips to track
+(`env.recovery.planner`).
 
-ways of the library -> demonstrations from wherever somebody lies or stands -> tracked like its clips
+recovery clips of the library -> recovery motions from states that lie or stand -> tracked like its clips
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def demonstrations(imitation: Imitation) -> Reference:
 
 
 def practised(imitation: Imitation, stage: Stage) -> Imitation:
-    """What a stage's characters practise: the library, in a stage that recovers with its ways back, and
-    as the primitive of recovery nothing else."""
+    """What a stage's characters practise: the library, in a stage that recovers with recovery motions
+    besides, and in the stage of the recovery primitive recovery motions alone."""
     if imitation.recovery_clips is None or stage.recovers is None:
         return imitation
     shown = demonstrations(imitation)
@@ -61,7 +61,7 @@ def practised(imitation: Imitation, stage: Stage) -> Imitation:
 
 def odds(imitation: Imitation, stage: Stage, library: Tensor, length: Tensor) -> Tensor:
     """Odds of the clips of what is `practised`, of `length (C,)` frames, from the odds `(L,)` of the
-    library's: `RecoveryPlan.demonstration_share` of all episodes are ways back, or all of them."""
+    library's: `RecoveryPlan.demonstration_share` of all episodes are recovery motions, or all are."""
     if imitation.recovery_clips is None or stage.recovers is None:
         return library
     length, share = length.cpu().double(), imitation.config.recovering.demonstration_share

@@ -42,8 +42,8 @@ def evaluate_clips(
     """Simulates `clips (E,)`, all by default, from their first frames with the deterministic policy.
 
     Args:
-        help_scale: what is left of the residual force's limits, or of those of each clip or moment of
-            the library, as the task's `help_by` says.
+        help_scale: what is left of the residual force's limits, or of those of each clip or motion bin
+            of the library, as the task's `help_by` says.
         on_batch: told how many of how many clips are done.
     """
     reference = imitation.reference

@@ -16,7 +16,9 @@ Kind = Literal["primitive", "single", "joint", "recovery", "composer"]
 class Stage:
     """One training after another, see `perpetual.plan`.
 
-    number: counts all stages of a run from 1. mixed: episodes of recovery are interleaved.
+    Attributes:
+        number: counts all stages of a run from 1.
+        mixed: episodes of recovery are interleaved.
     """
 
     kind: Kind
@@ -42,12 +44,17 @@ class Stage:
 class Progress:
     """What one iteration came to.
 
-    stage: the one that was trained, of whose `clips` (of the recovery primitive: trials) the last
-    evaluation saw `succeeded`, or None before the first. iteration: over all stages. share: of the whole
-    training, 0 to 1. help_n: N, what is left on the clip that has
-    most. results, recovery: evaluations that were made after this
-    iteration. following: the stage that begins now. trouble: what went wrong before this iteration,
-    which then was made again from the last checkpoint.
+    Attributes:
+        stage: the one that was trained.
+        iteration: over all stages.
+        share: of the whole training, 0 to 1.
+        clips: of the stage; of the recovery primitive, its trials.
+        succeeded: how many of the `clips` succeeded in the last evaluation; None before the first.
+        help_n: N, the help that is left on the clip that has most.
+        results, recovery: evaluations that were made after this iteration.
+        following: the stage that begins now.
+        trouble: why training diverged before this iteration, which then was made again from the last
+            checkpoint; empty without a divergence.
     """
 
     stage: Stage

@@ -54,12 +54,12 @@ class Earlier:
 
 def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    who learns, with which seed, and whether and how recovery is learned. Where it is, the policy stays
+    the networks, the seed, and whether and how recovery is learned. Where it is, the policy stays
     as it is, the first primitive of more, unless one network is to learn both. Observations are clipped
     no nearer than at `WIDE` deviations.
 
-    returns: the policy comes back by ways already, so that more primitives learn what it fails, and none
-    of its own is needed for recovery.
+    returns: the policy tracks recovery motions already, so that more primitives learn what it fails, and
+        none of its own is needed for recovery.
 
     Raises:
         PoiseError: the policy is made of primitives.
@@ -74,7 +74,7 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
     asked["recovering"] = replace(policy.recovering, demonstrations=wanted.recovering.demonstrations)
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
     if wanted.recovery:
-        # What the policy ended with is too careful for who learns something new.
+        # The step size that the policy ended with is too small for learning something new.
         ppo = replace(ppo, policy_lr=max(ppo.policy_lr, ANEW))
     if wanted.recovery and not wanted.single:
         # Primitives have the sizes of the network that becomes the first of them.
@@ -98,10 +98,12 @@ def clips_of(
 ) -> tuple[ClipLibrary, tuple[str, ...]]:
     """The clips of a folder on one skeleton, see `library_of`, and sentences on what became of them.
 
-    hold_out: clips and performers that are not learned from, see `split`. leave_out: regular expressions
-    of clips that are not even read. onto: a motion file or an MJCF body whose skeleton all clips come
-    onto, or the body of a policy; by default that on which most of the library is. config: how files
-    are read.
+    Args:
+        hold_out: clips and performers that are not learned from, see `split`.
+        leave_out: regular expressions of clips that are not even read.
+        onto: a motion file or an MJCF body, to give all clips its skeleton, or the body of a policy; by
+            default the skeleton on which most of the library is.
+        config: how files are read.
     """
     config = replace(config or LibraryConfig(), leave_out=tuple(leave_out))
     library, report = library_of(folder, onto, config=config, body=body, tell=tell)
@@ -122,8 +124,9 @@ def begin(
 ) -> Imitation:
     """Builds the task and writes the run file; a folder that holds another run is refused.
 
-    source: where the clips are from, by which `resume` knows them. earlier: the training that the run
-    goes on from; a single clip will do for that.
+    Args:
+        source: where the clips are from, by which `resume` knows them.
+        earlier: the training that the run goes on from; a single clip will do for that.
 
     Raises:
         PoiseError: a single clip, another run in the folder, a library on another skeleton than the

@@ -41,7 +41,7 @@ class Judged:
 def help_of_clips(imitation: Imitation, scale: float | Tensor, most: bool = False) -> float | Tensor:
     """What each clip of the library has left on average, or at most, `(C,)`.
 
-    scale: that of its moments `(G,)`, of clips `(C,)`, or the one that all have.
+    scale: that of its motion bins `(G,)`, of clips `(C,)`, or the one that all have.
     """
     if not isinstance(scale, Tensor) or imitation.config.help_by != "bin":
         return scale
@@ -49,7 +49,7 @@ def help_of_clips(imitation: Imitation, scale: float | Tensor, most: bool = Fals
 
 
 class Judge:
-    """Evaluates the policies of a run's stages and notes it in the ledger and the history."""
+    """Evaluates the policies of a run's stages and notes it in the stage record and the history."""
 
     def __init__(
         self,
@@ -81,8 +81,11 @@ class Judge:
 
         A stage ends by what is done without help: where an evaluation with what is left of it finds that
         nothing is gained any more, another one without decides what is solved and what the next stage
-        is to learn. scale: what is left, or what each clip or moment of the library has left. over: the
-        stage's time is.
+        is to learn.
+
+        Args:
+            scale: of the help that is left, of all or of each clip or motion bin of the library.
+            over: the stage's time is over.
         """
         if stage.kind == "recovery":
             return self._recovery(stage, policy, over)

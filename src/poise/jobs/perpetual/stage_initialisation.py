@@ -52,8 +52,10 @@ def begin_first(
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
-    folder: of the run, where the search for paths is kept. trained: a single network that goes on. As a
-    first primitive that recovers already it is done: its stage is over when it begins.
+    Args:
+        folder: of the run, where the trajectory optimisation is kept.
+        trained: a single network that goes on. As a first primitive that recovers already it is done:
+            its stage is over when it begins.
     """
     config: Perpetual = imitation.config
     stage = first_stage(config)
@@ -117,7 +119,9 @@ def begin_stage(
 ) -> WarmStart:  # fmt: skip
     """What a later stage starts from: one primitive more, a composer, or the same network.
 
-    before: what the last stage learned, with its critic, which goes on. owner: see `begin_composer`.
+    Args:
+        before: what the last stage learned, with its critic, which goes on.
+        owner: see `begin_composer`.
     """
     if stage.kind == "composer":
         return begin_composer(before, imitation, stage, owner, threads, dumps, tell)
@@ -142,7 +146,8 @@ def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmSt
 
 
 def begin_recovery(before: WarmStart, imitation: Imitation, number: int) -> WarmStart:
-    """The recovery primitive: as the one before it where it tracks ways back, else as any primitive."""
+    """The recovery primitive: a copy of the one before it where it tracks recovery motions, else as any
+    primitive."""
     config: Perpetual = imitation.config
     config = config if imitation.recovery_clips is None else replace(config, start="copy")
     return begin_primitive(before, config, number)
@@ -153,7 +158,7 @@ def begin_composer(
     dumps: Path | None, tell: TrainingCallbacks,
 ) -> WarmStart:  # fmt: skip
     """The composer over all primitives, taught at first to do as the primitive that learned the clip,
-    and as the one that recovers on ways back or for who is far.
+    and as the recovery primitive on recovery motions and for characters that are far.
 
     owner: `(C,)`, the primitive of each clip of the library.
     """
@@ -189,9 +194,14 @@ def begin_composer(
 class Owners:
     """Acts for each world as the primitive that learned its clip: a teacher for the composer.
 
-    owner: `(C,)`; clips beyond are ways back, on which the primitive acts that recovers: the last one,
-    or without one of its `own` the first. Where the task knows point goals it does for whoever is so far
-    from the reference, or fallen below it, that the goal is a point, which is what the composer can see.
+    On clips that `owner` does not name, which are recovery motions, the recovery primitive acts: the
+    last one, or without one of its `own` the first. Where the task knows point goals, the recovery
+    primitive also acts for a character that is so far from the reference, or fallen below it, that its
+    goal is a point, which is what the composer can see.
+
+    Args:
+        owner: `(C,)`, the primitive of each clip of the library.
+        own: recovery has a primitive of its own.
     """
 
     def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor, own: bool = True):

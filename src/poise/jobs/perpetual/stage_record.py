@@ -1,4 +1,4 @@
-"""What is known of the clips while a library is learned: who fails, who learned which, what did best."""
+"""What is known of a library's clips while it is learned: failures, owners, and the best policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The search for paths of a library, kept in the run folder so that a killed run goes on with it."""
+"""Trajectory optimisation of a library, kept in the run folder so that a killed run goes on with it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from poise.plan import Trajectories, TrajectoryOptimizer
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import Perpetual
 
-#: The file of a run folder with the paths of its clips, as far as they were found.
+#: The file of a run folder with the trajectories of its clips, as far as they were optimised.
 PATHS = "paths.safetensors"
 
 
 def find_paths(
     imitation: Imitation, folder: Path, threads: int, tell: TrainingCallbacks
 ) -> Trajectories:
-    """A path for every clip; goes on with what the folder holds of an unfinished search."""
+    """A trajectory for every clip; goes on with what the folder holds of an unfinished optimisation."""
     config: Perpetual = imitation.config
     assert config.trajopt is not None
     search = TrajectoryOptimizer(imitation.reference, config.sim, config.trajopt, threads)
@@ -27,7 +27,7 @@ def find_paths(
         state, meta = load_checkpoint(path)
         if meta.get("clips") != names or state["qpos"].shape != search.qpos.shape:
             raise PoiseError(
-                "it holds paths of other clips", path, "Remove it, or choose another folder"
+                "it holds trajectories of other clips", path, "Remove it, or choose another folder"
             )
         search.load_state(state)
     while not search.done:

@@ -56,8 +56,8 @@ class Crowd:
     """N characters of one world as the N worlds of a `Backend`, for an environment without help.
 
     Row 0 of what has a row per body is not the world but the character before, and is not to be read;
-    forces on bodies (`drive.xfrc_applied`) reach nobody. A restart of some characters begins the solver
-    anew for all.
+    forces on bodies (`drive.xfrc_applied`) have no effect. A restart of some characters begins the
+    solver anew for all.
     """
 
     def __init__(self, humanoid: Humanoid, sim: SimConfig, count: int):

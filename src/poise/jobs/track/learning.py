@@ -26,7 +26,7 @@ from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual
 
 #: Worlds, samples of a gradient step, and iterations from one evaluation to the next: a motion of
-#: seconds has fewer hard moments than a library.
+#: seconds has fewer hard motion bins than a library.
 WORLDS, MINIBATCH, EVERY = 512, 2048, 5
 #: Evaluations without success after which training would end by itself.
 NEVER = 1_000_000
@@ -77,5 +77,5 @@ def learn(
     result = train(
         imitation, folder, Until(minutes=minutes), on_iteration, threads, False, trained=tracker.policy
     )
-    # It knows its ways back as before, or nearly.
+    # It tracks its recovery motions as before, or nearly.
     return Learned(replace(tracker_of(folder, imitation), recovery_clips=tracker.recovery_clips), result)

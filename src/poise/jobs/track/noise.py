@@ -80,11 +80,15 @@ def noise_of(texts: Sequence[str]) -> tuple[Noise, ...]:
 class Rung:
     """What a tracker comes to at one level of noise, over all motions.
 
-    name, strength: of the level. motions: how many. succ: share done to the end of the input with
-    noise; succ_clean: share that stayed within 0.5 m of the motion without noise. mpjpe_mm: global
-    error against the input, up to the failure, mean over motions. off_mm: against the motion without
-    noise. noise_mm: how far the noise moved the bodies of the input. tracked: share of the seconds
-    before the first failure.
+    Attributes:
+        name, strength: of the level.
+        motions: how many.
+        succ: share done to the end of the input with noise.
+        succ_clean: share that stayed within 0.5 m of the motion without noise.
+        mpjpe_mm: global error against the input, up to the failure, mean over motions.
+        off_mm: against the motion without noise.
+        noise_mm: how far the noise moved the bodies of the input.
+        tracked: share of the seconds before the first failure.
     """
 
     name: str
@@ -129,7 +133,8 @@ def robustness(
     """Every motion tracked at every level of noise, once; the noise of a motion is that of its name.
 
     Args:
-        levels: a ladder, see `robustness_levels`, whose default it is. tell: is told of each level.
+        levels: a ladder, by default that of `robustness_levels`.
+        tell: is told of each level.
 
     Raises:
         PoiseError: no motion, or one that cannot be tracked without noise either.

@@ -69,12 +69,17 @@ _EXAMPLE, _WAYS = "example/", "ways/"
 class Tracker:
     """A policy with the body that it moves.
 
-    policy: acts deterministically on raw observations. humanoid: the body, its model with the physics
-    settings. example: a clip on the body's skeleton, which tells how it stands. config: the settings by
-    which it was trained. about: "clips" (names), "stage", "samples", "seconds", "help_n" (what help the
-    training still gave), "poise" (the version that wrote it). ways: by which the policy comes back
-    where it has lost a motion; None if it has not learned that. value: what its critic tells of a state,
-    by which `track.searching` looks ahead; None where the critic was not kept.
+    Attributes:
+        policy: acts deterministically on raw observations.
+        humanoid: the body, its model with the physics settings.
+        example: a clip on the body's skeleton, which tells how it stands.
+        config: the settings by which it was trained.
+        about: "clips" (names), "stage", "samples", "seconds", "help_n" (what help the training still
+            gave), "poise" (the version that wrote it).
+        recovery_clips: by which the policy comes back where it has lost a motion; None if it has not
+            learned that.
+        value: what its critic tells of a state, by which `track.searching` looks ahead; None where the
+            critic was not kept.
     """
 
     policy: PolicyBundle
@@ -123,7 +128,7 @@ def policy_of_run(file: RunFile) -> Tracker:
 
 
 def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
-    """The latest policy of a run in `folder`, whose task is built already."""
+    """The latest policy of the run in `folder`; `imitation` is its task."""
     i = imitation
     example, names = i.library.clips[0], i.library.names
     return _tracker(read_run(folder), i.humanoid, example, names, i.config, i.recovery_clips)

@@ -17,7 +17,7 @@ from poise.kin import qpos_to_clip
 from poise.motion import Clip, ClipLibrary, resample
 from poise.recipes.imitation import Imitation
 
-#: A motion that is lost more often is given up, and so is who has been away for so many s.
+#: A motion that is lost more often is given up, and so is one that the character has left for so many s.
 LOSSES, AWAY_S = 8, 30.0
 
 
@@ -43,11 +43,11 @@ class Losses:
 def with_returns(
     tracker: Tracker, placed: Placed, imitation: Imitation, threads: int
 ) -> tuple[Placed, Imitation, Replay, Losses] | None:
-    """Tracks a motion, and a way back wherever it is lost; None where it never is.
+    """Tracks a motion, and a recovery motion wherever it is lost; None where it never is.
 
     Returns:
-        the motion with the ways in it, as it was tracked, also as a task of its own; the actions that
-        track it; and when it was lost.
+        the motion with the recovery motions in it, as it was tracked, also as a task of its own; the
+        actions that track it; and when it was lost.
 
     Raises:
         PoiseError: the policy has not learned to come back.
@@ -55,7 +55,7 @@ def with_returns(
     if tracker.recovery_clips is None:
         raise PoiseError(
             "the policy has not learned to come back",
-            hint="Leave --recover out, or train one on a library in which somebody gets up",
+            hint="Leave --recover out, or train one on a library with a clip that gets up",
         )
     task = replace(imitation.task, help_by="all")
     env = replace(imitation, task=task).env(1, auto_reset=False, threads=threads, help_scale=0.0)

@@ -1,4 +1,4 @@
-"""What was found once, by a search or on ways back, is done again."""
+"""Actions that were found once, by a search or on recovery motions, are replayed."""
 
 from __future__ import annotations
 

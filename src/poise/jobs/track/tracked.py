@@ -67,7 +67,7 @@ class Tracked(Result):
     @property
     def failed_s(self) -> tuple[float, ...]:
         """Seconds at which the first character failed."""
-        return tuple(t for who, t in self.failures if who == 0)
+        return tuple(t for character, t in self.failures if character == 0)
 
     @cached_property
     def card(self) -> ScoreCard:

@@ -42,12 +42,16 @@ RULE = "phc"
 class TrackConfig:
     """How a motion is tracked.
 
-    noise, seed: what is done to the input first, see `motion.noise`. reset_on_fail: a character that
-    failed is put back onto the reference. recover: it gets up, comes back and goes on, while the motion
-    waits, see `env.recovery.controller`; for one character. smooth_hz: cut-off of a low-pass on
-    keypoints. count: characters who do the motion side by side in one world, see `track.crowd`. search:
-    a motion that the policy loses is looked for, see `plan.sampling`; for one character.
-    search_threads: of it, 0 is all cores. threads: of the physics.
+    Attributes:
+        noise, seed: what is done to the input first, see `motion.noise`.
+        reset_on_fail: a character that failed is put back onto the reference.
+        recover: it gets up, comes back and goes on, while the motion waits, see `env.goals.led`; for one
+            character.
+        smooth_hz: cut-off of a low-pass on keypoints.
+        count: characters that do the motion side by side in one world, see `track.crowd`.
+        search: a motion that the policy loses is looked for, see `plan.sampling`; for one character.
+        search_threads: of it, 0 is all cores.
+        threads: of the physics.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -140,7 +144,7 @@ def track(
             f"{float(about['help_n']):.0f} N; here nothing helps."
         )
     evaluation = Evaluation(card, rollouts, recordings)
-    times = tuple((who, frame / rate) for who, frame in frames)
+    times = tuple((character, frame / rate) for character, frame in frames)
     if losses is not None:
         times = tuple((0, t) for t in losses.lost)
     return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, found)
@@ -156,8 +160,8 @@ def loses(tracker: Tracker, imitation: Imitation) -> bool:
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
     """Motions on the tracker's body as one task; the report is that of the first.
 
-    Hinges whose range a motion leaves are widened where no action is measured by the ranges: whoever
-    begins beyond one would be thrown back into it.
+    Where a motion leaves the range of a hinge, the range is widened if no action is measured by it: a
+    character that begins beyond a range would be thrown back into it.
     """
     humanoid, config = tracker.humanoid, tracker.config
     motions = [p.qpos for p in placed]
@@ -200,7 +204,7 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
 
 
 def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
-    """Refuses a policy whose observations or actions are not those of its body here.
+    """Refuses a policy if its observations or actions are not those of its body here.
 
     Raises:
         PoiseError: it was trained for another body, or by another version of Poise.
@@ -218,7 +222,9 @@ def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
 class Keeper:
     """A policy that puts characters back onto the reference before it acts, where they failed.
 
-    resets: off, it only acts. fallen: (world, frame) of every failure that it mended.
+    Args:
+        resets: off, it only acts.
+        fallen: (world, frame) of every failure that it mended.
     """
 
     def __init__(self, env: ImitationEnv, policy: Acts, resets: bool):

@@ -69,7 +69,7 @@ def heal(clip: Clip) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
     In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, the height
-    above the floor, sliding feet. A step whose faults are not there changes nothing.
+    above the floor, sliding feet. A step changes nothing if its faults are not there.
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)

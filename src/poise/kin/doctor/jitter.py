@@ -51,7 +51,7 @@ def _usual(values: np.ndarray, ends: int, half: int) -> np.ndarray:
 def jitter_faults(clip: Clip) -> list[Fault]:
     """Bones that tremble, in mm of one end against the other, and a root path that does.
 
-    The joint is named whose own rotation trembles, not those that only ride on it.
+    The joint that is named is the one with a rotation that trembles, not those that only ride on it.
     """
     gap, least = round(GAP_S * clip.fps), WINDOW_FRAMES
     out = []

@@ -20,7 +20,7 @@ COMMON_S, ROLL_SPEED = 0.4, 0.04
 
 
 def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
-    """The clip whose root path is freed of the slip that all standing feet have in common.
+    """The clip with its root path freed of the slip that all standing feet have in common.
 
     The mean slip of the planted sole points, averaged over time, is taken off the root's horizontal
     velocity wherever feet were found to slide; slower slips than `ROLL_SPEED` stay.

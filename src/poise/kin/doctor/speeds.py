@@ -1,4 +1,4 @@
-"""Joint speeds beyond what a human reaches, repaired over the shortest possible stretch."""
+"""Joint speeds beyond what a human reaches, repaired over as few frames as possible."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CLEARLY_LESS = 0.7
 
 @dataclass(frozen=True)
 class SpeedRepair:
-    """Frames `start` to `stop` (inclusive) of one joint whose speed was brought into the human range.
+    """Frames `start` to `stop` (inclusive) of one joint; its speed was brought into the human range.
 
     way: "interpolated", "held" (at an end of the clip) or "smoothed". before, after: largest speed,
     rad/s. change_deg: the largest turn away from what the file says.
@@ -64,7 +64,7 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
     """The clip with turns faster than a human joint repaired, and every repair.
 
     Steps above the limit are gathered into spells. A spell is replaced by a slerp over the shortest
-    stretch around it whose ends can be joined at half the limit; at an end of the clip the joint is
+    stretch around it with ends that can be joined at half the limit; at an end of the clip the joint is
     held. Where no stretch of `LONGEST_S` does, or where it would lead clearly farther from the file
     (a real turn, only too fast), the joint is smoothed there, as little as it takes.
     """

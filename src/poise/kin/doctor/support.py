@@ -78,7 +78,7 @@ class Support:
         """How far (m) the whole clip is above (below: negative) its floor, 0 where that is not sure.
 
         The soles must say so by more than `SOLE_M`, or by more than `SUNK_M` downwards if the joints and
-        tips, whose places are known, are under the floor as well.
+        tips, of which the places are known, are under the floor as well.
         """
         lift = self.fit.lift_m
         under = float((self.low.min(-1) < -UNDER_M).mean())

@@ -2,8 +2,8 @@
 
 What touches depends on what is asked, so there are four rules; all know a foot by points on it.
 
-- `contact_labels`: which points touch a floor whose height is known: low and slow.
-- `standing_labels`: the same in recordings whose floors differ and whose feet slide.
+- `contact_labels`: which points touch a floor of known height: low and slow.
+- `standing_labels`: the same in recordings with different floors and sliding feet.
 - `rest_height`, `stance_heights`, `lowest_and_slow`: when feet rest, to tell where the floor is.
 - `bearing`: how much either end of a sole bears, to hold it.
 
@@ -30,7 +30,7 @@ from poise.spatial import quat_rotate
 #: m/s: a point that touches is slower than the first; a whole foot that stands, than the second.
 TOUCH_SPEED, STAND_SPEED = 0.35, 0.4
 #: Height (m) over the ground under which slow toes and wrists touch it, in retargeting, and under which
-#: points of a sole are near it, in examinations (whose floor is guessed).
+#: points of a sole are near it, in examinations (with a floor that is guessed).
 TOUCH_M, NEAR_M = {"foot": 0.05, "hand": 0.1}, 0.04
 #: Cosine of the tilt up to which a standing sole is level (20 degrees).
 LEVEL = 0.94
@@ -111,9 +111,9 @@ def standing_labels(
     """Contact `(T, F)` bool of the foot joints `(T, F, 3)` m of each clip, at heights told by the clips.
 
     Rules that know only steps (`motion.windows.step_contacts`) hardly ever find a foot standing in
-    recordings whose feet slide by a few centimetres per second. Here a joint's own standing height, the
-    lowest tenth of its slow frames in all clips, counts, and per clip within 4 cm below and 6 cm above
-    of it, since floors differ; low is what is less than `above` m above that, slow as in
+    recordings with feet that slide by a few centimetres per second. Here a joint's own standing height,
+    the lowest tenth of its slow frames in all clips, counts, and per clip within 4 cm below and 6 cm
+    above of it, since floors differ; low is what is less than `above` m above that, slow as in
     `contact_labels`.
     """
     usual = torch.stack([_standing(torch.cat([_slow(c[:, k], fps, speed) for c in clips]))

@@ -93,7 +93,7 @@ def hold_feet(clip: Clip, table: BodyTable, ground: float = 0.0) -> tuple[Clip, 
     Feet that are dragged on purpose are left alone. Soles under the floor are lifted out of it, too.
 
     Args:
-        table: the body whose soles they are; feet without a box have no sole.
+        table: the body with the soles; feet without a box have no sole.
         ground: height (m) of the floor.
     """
     if clip.frames < 3:

@@ -38,7 +38,7 @@ def analytic_ik(
     names: Sequence[str] | None = None,
     rotations: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Generalized coordinates `(T, 7 + hinges)` of a humanoid whose joints lie where they are asked to.
+    """Generalized coordinates `(T, 7 + hinges)` of a humanoid with joints where they are asked to lie.
 
     Args:
         positions: `(T, N, 3)` m, world, of the joints in `names`.

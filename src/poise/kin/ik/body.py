@@ -16,7 +16,7 @@ from poise.kin.ik.vectors import frame_of, rotate, square_to
 from poise.motion import Skeleton
 from poise.spatial import normalize, quat_to_matrix
 
-#: A rest pose whose elbow or knee is bent less than this (rad) does not tell the plane it bends in.
+#: An elbow or knee that is bent less than this (rad) at rest does not tell the plane it bends in.
 REST_BEND = math.radians(10.0)
 
 

@@ -21,7 +21,7 @@ class Frames:
     """World frames `(T, 3, 3)` of rows from the positions `p (T, P, 3)` of one motion.
 
     frames: row -> its frame, columns x, y, z; square except where an error of the paper is kept.
-    knee_parent: rows of shins whose parent's frame the paper states otherwise (Eq. 20).
+    knee_parent: rows of shins for which the paper states the parent's frame otherwise (Eq. 20).
     """
 
     def __init__(self, p: Tensor, body: IkBody, config: IkConfig, at_rest: bool = False):

@@ -96,7 +96,7 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
         clip: a motion of the skeleton. world: its joints in the world, where they are known already.
 
     Raises:
-        PoiseError: a rest pose in which nobody stands and no clip, or legs of no length.
+        PoiseError: a rest pose that does not stand and no clip, or legs of no length.
     """
     roles.require()
     _check_hips(roles)
@@ -110,10 +110,10 @@ def common_pose(roles: Roles, clip: Clip | None = None, world: World | None = No
         evidence = "its rest pose stands"
     elif clip is not None and world is not None:
         local = mean_pose(roles, clip, world)
-        evidence = "nobody stands as in its rest pose; the mean pose of the motion was taken"
+        evidence = "its rest pose does not stand; the mean pose of the motion was taken"
     else:
         raise PoiseError(
-            "nobody stands as in the rest pose of this skeleton, so a motion must show how it stands",
+            "the rest pose of this skeleton does not stand, so a motion must show how it stands",
             roles.skeleton.source.path,
             "Give a clip on it instead of the skeleton alone",
         )

@@ -97,13 +97,13 @@ class RetargetReport:
             f"The deepest joint is {self.depth_max_mm[1]:.0f} mm under the ground "
             f"({self.depth_max_mm[0]:.0f} in the source)."
         )
-        for names, whose, what in (
+        for names, side, what in (
             (joints.still(), "target", "follow what carries them"),
             (joints.unused(), "source", "move nothing"),
         ):
             if names:
                 more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-                out.append(f"{', '.join(names[:6])}{more} of the {whose} {what}.")
+                out.append(f"{', '.join(names[:6])}{more} of the {side} {what}.")
         return out
 
 

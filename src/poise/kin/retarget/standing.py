@@ -65,7 +65,7 @@ def body_axes(roles: Roles, pos: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rest_axes(roles: Roles) -> Tensor | None:
-    """wxyz that turns the rest pose to stand and face +x, None where nobody could stand so."""
+    """wxyz that turns the rest pose to stand and face +x, None where no human could stand so."""
     pos = torch.tensor(roles.skeleton.rest_positions())
     left, up = body_axes(roles, pos)
     # The nearest axis of the file: a rest pose stands, or lies as a whole.

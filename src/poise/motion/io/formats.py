@@ -229,7 +229,7 @@ def home_suffix(clip: Clip) -> str:
 
 
 def check_writable(path: Path) -> None:
-    """Refuses a file whose suffix names no format that can be written here, before any work is done."""
+    """Refuses a file if its suffix names no format that can be written here, before any work is done."""
     if _writer(path) is write_usd:
         pxr_package()
 

@@ -15,7 +15,7 @@ from poise.motion.io.text import shown
 from poise.motion.skeleton import Skeleton
 from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
 
-# As for BVH: a joint whose place stays within this share of the skeleton's size is rigid.
+# As for BVH: a joint is rigid if its place stays within this share of the skeleton's size.
 _RIGID_SHARE = 6e-4
 _TRAVEL_SHARE = 20 * _RIGID_SHARE
 _HUMAN_M = (0.3, 4.0)

@@ -89,7 +89,7 @@ def _mirrored(name: str, names: tuple[str, ...]) -> str | None:
 def smooth_path(
     rng: np.random.Generator, frames: int, shape: tuple[int, ...], fps: float, tau_s: float
 ) -> np.ndarray:
-    """`(T, *shape)`, unit Gaussian noise whose autocorrelation is exp(-(t / tau)^2 / 2); white for 0.
+    """`(T, *shape)`, unit Gaussian noise of autocorrelation exp(-(t / tau)^2 / 2); white for 0.
 
     White noise through a Gaussian of deviation tau / sqrt(2), scaled back to unit variance.
     """

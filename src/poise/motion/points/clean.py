@@ -62,7 +62,7 @@ def runs(mask: np.ndarray) -> list[tuple[int, int]]:
 
 
 def longest_stretch(missing: np.ndarray, longest_gap: int) -> tuple[int, int]:
-    """`(start, stop)` of the longest stretch of frames whose gaps can be filled.
+    """`(start, stop)` of the longest run of frames with gaps that can be filled.
 
     missing: `(T, K)`. Gaps of more than `longest_gap` frames in any column interrupt it, and so do
     missing
@@ -88,7 +88,7 @@ def fill(values: np.ndarray) -> np.ndarray:
 
 
 def smooth(values: np.ndarray, fps: float, cutoff_hz: float) -> np.ndarray:
-    """Values `(T, ...)` through a zero-phase Gaussian low-pass whose gain at `cutoff_hz` is 1/sqrt(2).
+    """Values `(T, ...)` through a zero-phase Gaussian low-pass, its gain 1/sqrt(2) at `cutoff_hz`.
 
     The gain of a Gaussian of width sigma (s) at f is exp(-2 pi^2 sigma^2 f^2). The ends are continued
     point-symmetrically, which keeps their speed.

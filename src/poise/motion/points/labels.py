@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 Found = dict[str, tuple[int, ...]]
-"""Place of the body -> indices of the keypoints whose mean it is."""
+"""Place of the body -> indices of the keypoints; the place is their mean."""
 
 SIDES = ("left", "right")
 

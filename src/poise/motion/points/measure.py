@@ -34,8 +34,8 @@ class Rest:
     """The skeleton while it is measured: joints in order, and where each one's track is.
 
     offsets: joint -> m in its parent's frame at rest. tips: joint -> tip in its frame.
-    points: joint -> place of the body whose track it follows. foot: side -> cluster of the foot, place
-    -> m from the ankle.
+    points: joint -> place of the body with the track that it follows.
+    foot: side -> cluster of the foot, place -> m from the ankle.
     """
 
     parents: dict[str, str | None] = field(default_factory=dict)

@@ -160,7 +160,7 @@ class Solver:
             self.quat[hand] = quat_mul(shortest_arc(now, seen), self.quat[lower])
 
     def _hinged(self, upper: str, lower: str, end: str, axis: Tensor, hint: Tensor | None) -> None:
-        """Two bones with a hinge between them, whose rest axis is `axis (3)`.
+        """Two bones with a hinge of the rest axis `axis (3)` between them.
 
         The upper one points at the hinge's track, and twists so that the bend lies about the hinge's
         axis as far as there is a bend (`hint` adds to it); the lower one goes on by the smallest turn.
@@ -222,7 +222,7 @@ def steady_twist(shown: Tensor, fps: float) -> Tensor:
     right = right + prior * torch.tensor([1.0, 0.0], dtype=shown.dtype)
     diagonal = weight + prior + between * 2.0
     diagonal[0], diagonal[-1] = diagonal[0] - between, diagonal[-1] - between
-    # The upper band, whose first number stands outside the matrix; a single frame has none.
+    # The upper band; its first number stands outside the matrix, and a single frame has none.
     bands = np.stack((np.full(len(diagonal), -between), diagonal.numpy()))
     z = solveh_banded(bands[-len(diagonal) :], right.numpy())
     return torch.atan2(torch.tensor(z[:, 1]), torch.tensor(z[:, 0]))

@@ -16,7 +16,7 @@ from poise.recipes.perpetual.shapes import BodyShapes
 from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
-#: Deviations from the mean at which observations are clipped where who lies must be told from who leans.
+#: Deviations from the mean at which observations are clipped, so that lying is told from leaning.
 WIDE = 30.0
 
 
@@ -28,16 +28,20 @@ Recovers = Literal["primitive", "composer"]
 class RecoveryPlan:
     """How recovery is learned and judged.
 
-    share: of the whole training, what the recovery primitive has at least; of a single network it is
-    taken from the part without recovery. falls: different fallen characters to begin from.
-    primitive: which of them recovers: one of its "own", after those that track, or the "first", where
-    that is a policy that goes on and can come back already.
-    ways: demonstrations of coming back, made of the library's own clips where somebody gets up in it and
-    somebody walks, see `env.recovery.controller`; 0 learns to come back to a point, as the paper does.
-    demonstration_share: of the episodes of who tracks and recovers, how many are of them. trials: of
-    each kind of fail-state at every evaluation of a stage that learns recovery. final_trials: with the
-    finished policy. seconds: within which who is back is counted; the last one decides. enough: share
-    of all trials with which recovery is learned.
+    Attributes:
+        share: of the whole training, what the recovery primitive has at least; of a single network it is
+            taken from the part without recovery.
+        falls: different fallen characters to begin from.
+        primitive: which of them recovers: one of its "own", after those that track, or the "first",
+            where that is a policy that goes on and can come back already.
+        demonstrations: how many recovery motions are made of the library's own clips, where some get up
+            and some walk, see `env.recovery.planner`; 0 learns to come back to a point, as the paper
+            does.
+        demonstration_share: of the episodes of a stage that tracks and recovers, how many are of them.
+        trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
+        final_trials: with the finished policy.
+        seconds: a character counts as back within each of these times; the last one decides.
+        enough: share of all trials with which recovery is learned.
     """
 
     share: float = 0.15
@@ -69,46 +73,52 @@ class RecoveryPlan:
 class Perpetual:
     """Settings of one run.
 
-    goal: what is told of the next frame, "rotations" and places or "keypoints", which are places alone.
-    shape: limb lengths and masses are observed, too. shapes: the bodies that are learned; more than one
-    are observed in any case. action: "absolute" as in the paper, or "additive"
-    to the reference's angles. faithful: where the paper and its code disagree about Eq. 2 and about
-    recovery.
-    energy: weight of the energy penalty, 0 for none; by default that of the code's composer, since with
-    ten times as much falling early would pay, see `phc_reward.energy_term`. energy_form: of the "paper",
-    squares of the hinges' power, or of the "code", its amount.
-    style: the motion prior, None for none.
-    termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
-    "code". first: share of the episodes that begin on frame 0, as evaluations do.
-    recovery: fallen and far characters get up and come back, by a primitive of its own and in the
-    composer's training; `recovering` says how. Without, nobody learns it.
-    multiplicative: off, there is one network of a primitive's size and nothing that combines.
-    progressive: off, all primitives and the composer learn together from the beginning, on all clips.
-    single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
-    `ppo.policy_hidden` and a composer of `composer_hidden`.
-    max_primitives: no more than so many; fewer where nothing fails any more. That of recovery is one
-    more.
-    start: a primitive begins as a "copy" of the one before it, or "random". lateral: whether it sees the
-    hidden layers of the earlier ones. combine, weights: see `nets.Composer`.
-    composer_clone: the composer first imitates for each clip the primitive that learned it.
-    expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits the
-    frames of the library where that is None, see `jobs.perpetual.cloning`.
-    trajopt: the expert follows trajectories that need no help, which are optimised first, see
-    `plan.trajopt`; None takes inverse dynamics, which need help.
-    help_start: N and N m, what the residual force may give at first; 0 does without. In each stage it
-    has ended at the share `help_share` of the stage's time, or before by success. help_by: success
-    is that of each "bin" of a clip, a second or so, which keeps or loses help of its own, of each
-    "clip", or of "all" episodes.
-    adaptive_sampling: share of the episodes (but for those on frame 0) that begin up to two seconds
-    before where others lately failed; the rest begin anywhere, as in the paper. adaptive_over: such
-    places of the "clip" that was drawn, or of the whole "library", so that more is seen of long and
-    hard clips. residual_std: deviation of the noise on the residual action, in units of the limits.
-    shares: where in the training the first and the last primitive end at the latest; with recovery, of
-    what `recovering.share` leaves. evaluate_every: iterations between evaluations of the stage's clips;
-    0 has them take a tenth of the control steps. cooling: share of a stage's longest time, at its end,
-    in which the policy's step size falls evenly to a tenth; for steps of a fixed size,
-    `ppo.kl_target=None`. mining, convergence: what fails is trained more; when a stage has learned what
-    it can.
+    Attributes:
+        goal: what is told of the next frame, "rotations" and places or "keypoints", which are places
+            alone.
+        shape: limb lengths and masses are observed, too.
+        shapes: the bodies that are learned; more than one are observed in any case.
+        action: "absolute" as in the paper, or "additive" to the reference's angles.
+        faithful: where the paper and its code disagree about Eq. 2 and about recovery.
+        energy: weight of the energy penalty, 0 for none; by default that of the code's composer, since
+            with ten times as much falling early would pay, see `phc_reward.energy_term`.
+        energy_form: of the "paper", squares of the hinges' power, or of the "code", its amount.
+        style: the motion prior, None for none.
+        termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
+            "code".
+        first: share of the episodes that begin on frame 0, as evaluations do.
+        recovery: fallen and far characters get up and come back, by a primitive of its own and in the
+            composer's training; `recovering` says how. Without, it is not learned.
+        multiplicative: off, there is one network of a primitive's size and nothing that combines.
+        progressive: off, all primitives and the composer learn together from the start, on all clips.
+        single: one larger network of the widths `single_hidden` on all clips, in place of primitives of
+            `ppo.policy_hidden` and a composer of `composer_hidden`.
+        max_primitives: no more than so many; fewer where nothing fails any more. That of recovery is one
+            more.
+        start: a primitive begins as a "copy" of the one before it, or "random".
+        lateral: whether it sees the hidden layers of the earlier ones.
+        combine, weights: see `nets.Composer`.
+        composer_clone: the composer first imitates for each clip the primitive that learned it.
+        expert: the first primitive begins as a clone of a scripted expert, by `clone`, or by what suits
+            the frames of the library where that is None, see `jobs.perpetual.cloning`.
+        trajopt: the expert follows trajectories that need no help, which are optimised first, see
+            `plan.trajopt`; None takes inverse dynamics, which need help.
+        help_start: N and N m, what the residual force may give at first; 0 does without. In each stage
+            it has ended at the share `help_share` of the stage's time, or before by success.
+        help_by: success is that of each "bin" of a clip, a second or so, which keeps or loses help of
+            its own, of each "clip", or of "all" episodes.
+        adaptive_sampling: share of the episodes (but for those on frame 0) that begin up to two seconds
+            before where others lately failed; the rest begin anywhere, as in the paper.
+        adaptive_over: such places of the "clip" that was drawn, or of the whole "library", so that more
+            is seen of long and hard clips.
+        residual_std: deviation of the noise on the residual action, in units of the limits.
+        shares: where in the training the first and the last primitive end at the latest; with recovery,
+            of what `recovering.share` leaves.
+        evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of
+            the control steps.
+        cooling: share of a stage's longest time, at its end, in which the policy's step size falls
+            evenly to a tenth; for steps of a fixed size, `ppo.kl_target=None`.
+        mining, convergence: what fails is trained more; when a stage has learned what it can.
     """
 
     goal: Literal["rotations", "keypoints"] = "rotations"
@@ -190,7 +200,7 @@ class Perpetual:
             what = "cooling is for steps of a fixed size, and kl_target adapts them"
             raise PoiseError(what, "Perpetual", "Set kl_target=None, or leave cooling out")
         if self.trajopt is not None and self.shapes.count > 1:
-            what = "paths are searched for one body, and there are several shapes"
+            what = "trajectories are optimised for one body, and there are several shapes"
             raise PoiseError(what, "Perpetual", "Leave one of the two out")
         if self.ppo.learn_std:
             raise PoiseError("primitives keep their action noise", "Perpetual", "Set learn_std=False")
@@ -215,9 +225,9 @@ class Perpetual:
         """Settings for hours on a CPU: actions add to the reference's angles, with noise in radians
         that no joint's range scales; there is no motion prior; the discount looks further ahead; and a
         stage has more evaluations before it counts as learned. Many worlds make large batches: what one
-        hard moment of many tells is lost in small ones, with steps large enough to learn it. Half of
-        the episodes begin before hard moments, those of the whole library, and the others anywhere.
-        Observations are clipped far out, since who lies on the floor is far from the mean of walks."""
+        hard motion bin of many tells is lost in small ones, with steps large enough to learn it.
+        Adaptive sampling over the whole library draws half of the starts; the others are anywhere.
+        Observations are clipped far out, since lying on the floor is far from the mean of walks."""
         ppo = replace(
             cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3,
             obs_clip=WIDE,
@@ -236,8 +246,9 @@ class Perpetual:
         code's, see `code`. Of the two ways in which a primitive begins (Sec. 3.2), lateral connections
         to random weights are taken; start="copy", lateral=False is the other.
 
-        Not expressed: the SMPL body with its gains (kd = 0.1 kp here as there), a composer whose weights
-        only have to be positive (softmax), and an episode that is worth nothing after its last frame.
+        Not expressed: the SMPL body with its gains (kd = 0.1 kp here as there), a composer with
+        weights that only have to be positive (softmax), and an episode that is worth nothing after its
+        last frame.
         """
         own: dict[str, Any] = {
             "faithful": "paper", "energy_form": "paper", "termination": "relaxed",

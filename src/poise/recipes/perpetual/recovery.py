@@ -13,23 +13,23 @@ from poise.env import Reference
 from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
 from poise.recipes.perpetual.config import Perpetual
 
-#: Of those of who stands, between which the root's height and above which the body's top stay in a clip
+#: Shares of the standing heights, between which the root and above which the body's top stay in a clip
 #: that walks or stands.
 HEIGHT, TOP = (0.85, 1.15), 0.85
-#: Share of a library's frames that are lower than who stands; jumps are rarer than crawling.
+#: Share of a library's frames that are lower than standing; jumps are rarer than crawling.
 STANDS = 0.7
-#: m/s: nobody runs faster, and limbs do not move faster about the root, on average.
+#: m/s: in a walk the root is no faster, and limbs move no faster about the root, on average.
 ROOT_SPEED, LIMB_SPEED = 2.5, 0.7
 #: s: shorter clips are no walk.
 SECONDS = 1.0
 
 
 def walking_clips(reference: Reference) -> Tensor:
-    """`(C,)` bool on the CPU: clips of somebody who walks or stands, for the recovery primitive.
+    """`(C,)` bool on the CPU: clips that walk or stand, for the recovery primitive.
 
-    In all frames the root is about as high, and the body about as tall, as of who stands, nobody runs
-    fast, and on average the limbs move about the root no faster than in a walk. All clips if there is no
-    such one.
+    In all frames the root is about as high, and the body about as tall, as in standing, the root does
+    not move fast, and on average the limbs move about the root no faster than in a walk. All clips if
+    there is no such one.
     """
     pos, vel = (getattr(reference.pose, k).cpu() for k in ("pos", "linvel"))
     height, top = pos[:, 0, 2], pos[:, :, 2].amax(-1)
@@ -61,12 +61,12 @@ def standing(reference: Reference) -> tuple[int, int]:
 
 
 def _standing(heights: Tensor) -> Tensor:
-    """The height, m, of who stands, of the heights `(F,)` in all frames of a library."""
+    """The standing height, m, of the heights `(F,)` in all frames of a library."""
     return heights.kthvalue(1 + int(STANDS * (len(heights) - 1))).values
 
 
 def known_recovery_clips(config: Perpetual, reference: Reference) -> RecoveryClips | None:
-    """What a library knows of coming back; None where recovery is not learned by it."""
+    """The recovery clips of a library; None where recovery is not learned by it."""
     if not (config.recovery and config.recovering.demonstrations) or config.shapes.count > 1:
         return None
     return find_recovery_clips(reference, standing(reference), walking_clips(reference))

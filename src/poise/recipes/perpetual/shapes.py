@@ -8,7 +8,7 @@ as everywhere (`body.scaling.Strength`).
 
 Every clip is retargeted onto the bodies that do it, so that feet stand where they stood, and counts as a
 clip of its own, "walk@3" on body 3: episodes, hard negatives and evaluations need know nothing of it. A
-world takes the body of the clip whose episode it begins (`env.body_assignment`).
+world takes the body of the clip when it begins an episode of it (`env.body_assignment`).
 
     imitation = shaped(build(library, config), BodyShapes(count=8), lambda body: task(config, body))
 """
@@ -45,9 +45,12 @@ GROUPS: tuple[tuple[str, ...], ...] = (
 class BodyShapes:
     """The bodies of a training.
 
-    count: S bodies, of which the first is the library's own; 1 is that alone. low, high: between which
-    the sizes of the parts are drawn, 1 being the library's. per_clip: on how many bodies each clip is
-    done, the first among them; 0 for all. Memory goes with it: about 2 kB a frame. seed: of the draws.
+    Attributes:
+        count: S bodies, of which the first is the library's own; 1 is that alone.
+        low, high: between which the sizes of the parts are drawn, 1 being the library's.
+        per_clip: on how many bodies each clip is done, the first among them; 0 for all. Memory goes with
+            it: about 2 kB a frame.
+        seed: of the draws.
     """
 
     count: int = 1

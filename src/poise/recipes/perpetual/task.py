@@ -19,8 +19,8 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 
 What is ours: the first primitive begins as a clone of a scripted expert, a residual force helps at first
 and is taken away clip by clip (`control.SuccessHelp`), and the composer begins by imitating for each
-clip the primitive that learned it, and the recovery primitive for who is far. At the end of every stage
-there is no help.
+clip the primitive that learned it, and the recovery primitive for characters that are far. At the end of
+every stage there is no help.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = ["RECIPE", "Perpetual", "RecoveryPlan", "build", "stage_task", "task"]
 
 def task(config: Perpetual, humanoid: Humanoid, guided: bool = False) -> TaskConfig:
     """Imitation as terms, as the finished policy knows it: with point goals if it learned recovery by
-    them. guided: it learned ways back, which are tracked as all motions."""
+    them. guided: it learned recovery motions, which are tracked as all motions."""
     return stage_task(config, humanoid, "composer" if config.recovery and not guided else None)
 
 
@@ -97,8 +97,8 @@ def _help(config: Perpetual) -> SuccessHelp:
     """When help becomes less.
 
     Half of all episodes succeed, which last 5 s on average, where 76 % come through the two seconds by
-    which a moment is judged. There are many more moments than clips, so that each is decided less often
-    and by more.
+    which a motion bin is judged. There are many more bins than clips, so that each is decided less often
+    and by more episodes.
     """
     if config.help_by == "bin":
         return SuccessHelp(lower_at=0.8, raise_at=0.6, factor=0.93)
@@ -136,7 +136,7 @@ def build(library: Clips, config: Perpetual | None = None, table: BodyTable | No
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     recovery_clips = known_recovery_clips(config, reference)
     if recovery_clips is None:
-        # Who knows ways back must practise a point goal by a primitive of its own.
+        # Without recovery clips a point goal is practised by a primitive of its own.
         config = replace(config, recovering=replace(config.recovering, primitive="own"))
     own = task(config, humanoid, guided=recovery_clips is not None)
     built = Imitation(library, humanoid, reference, report, config, own, recovery_clips)

@@ -176,7 +176,7 @@ def _times(durations: np.ndarray, path: Path) -> tuple[np.ndarray, bool]:
 
 
 def _even(clip: Clip, times: np.ndarray, path: Path) -> Clip:
-    """The clip, whose frames last `times (T - 1)` s, at even steps of their median."""
+    """The clip, with frames that last `times (T - 1)` s, at even steps of their median."""
     at = np.concatenate(([0.0], np.cumsum(times)))
     count = max(2, int(np.floor(at[-1] * clip.fps + 1e-3)) + 1)
     if count > 100 * clip.frames:

@@ -42,8 +42,8 @@ _BONES = (
     ("wrist_*", "elbow_*", (0.0, -0.25, 0.01)),
 )
 _TIPS = (("toe_*", (0.07, 0.0, 0.0)), ("head", (0.0, 0.18, 0.0)), ("wrist_*", (0.0, -0.17, 0.0)))
-# Turns of a joint from its parent's frame inwards: axis on the right side, then the coordinates whose
-# sum is the angle. On the left, turns about X and Y are mirrored. Of two lists the first that the
+# Turns of a joint from its parent's frame inwards: axis on the right side, then the coordinates that
+# add up to the angle. On the left, turns about X and Y are mirrored. Of two lists the first that the
 # file has is taken.
 _Turn = tuple[tuple[float, float, float], tuple[str, ...]]
 _TURNS: dict[str, tuple[tuple[_Turn, ...], ...]] = {

@@ -11,7 +11,7 @@ import torch
 from poise.motion.io.bvh.file import POSITIONS, BvhFile
 from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
 
-# A joint whose position channels stay within this share of the skeleton's size is rigid: about
+# A joint is rigid if its position channels stay within this share of the skeleton's size: about
 # 1 mm on a person, whatever the unit.
 _RIGID_SHARE = 6e-4
 
@@ -20,8 +20,8 @@ _RIGID_SHARE = 6e-4
 class Places:
     """What the position channels amount to, in file units.
 
-    offsets `(J, 3)`: one rigid offset per joint. root_pos `(T, 3)`. travel: the joint whose
-    channels carry the travel, or None. strays: `(joint, largest distance)` from the offset.
+    offsets `(J, 3)`: one rigid offset per joint. root_pos `(T, 3)`. travel: the joint with the
+    channels that carry the travel, or None. strays: `(joint, largest distance)` from the offset.
     extra: what a writer must know to restore the channels.
     """
 
@@ -138,7 +138,7 @@ def _from_world(
     moves: dict[int, np.ndarray],
     tolerance: float,
 ) -> list[int]:
-    """Joints whose channels are world positions; `moves` gets them in the parent's frame."""
+    """Joints with channels that are world positions; `moves` gets them in the parent's frame."""
     pos, quat = [torch.tensor(root_pos)], [torch.tensor(rot[:, 0])]
     found: list[int] = []
     for j, up in enumerate(parents):

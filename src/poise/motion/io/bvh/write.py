@@ -117,7 +117,7 @@ def _places(
     kept: dict[str, np.ndarray],
 ) -> dict[int, np.ndarray]:
     """`(T, 3)` position channels of the root, of the joint that carries the travel, and of joints
-    whose channels hold world positions."""
+    with channels that hold world positions."""
     parents, turns, bones = skeleton.parents, torch.tensor(rot), torch.tensor(offsets)
     out = {0: root_pos}
     pos, _ = forward_kinematics(parents, bones, torch.tensor(root_pos), turns)

@@ -21,7 +21,7 @@ MAX_OBJECTS = 100_000
 MAX_CHANNELS = 10_000
 """The same for the channels of one animation: up to three for each joint, and some more."""
 MAX_ELEMENTS = 40_000_000
-"""Files whose accessors ask for more elements than this, all together, are refused."""
+"""Files with accessors that ask for more elements than this, all together, are refused."""
 MAX_EMBEDDED_BYTES = 4 * MAX_FILE_BYTES // 3 + 64
 """Longer `data:` addresses cannot hold a buffer of the allowed size."""
 
@@ -34,7 +34,7 @@ _DATA_URI = "data:"
 class GltfFile:
     """A parsed document with its buffers, which are fetched when they are first needed.
 
-    doc: the JSON, whose `_PARTS` are lists of objects for certain; what these hold is not checked.
+    doc: the JSON; its `_PARTS` are lists of objects for certain; what these hold is not checked.
     blob: the GLB's binary chunk.
     """
 

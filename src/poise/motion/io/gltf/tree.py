@@ -158,7 +158,8 @@ def choose_joints(
     nodes above them belong to the joints.
 
     Args:
-        targeted: nodes with translation or rotation channels. moving: those whose channels vary.
+        targeted: nodes with translation or rotation channels.
+        moving: those with channels that vary.
     """
     skin = _skin_joints(tree, file, targeted)
     wanted = set(skin) if skin else _biggest_tree(tree, targeted)

@@ -224,7 +224,7 @@ def _rest_matrices(clip: Clip, plan: _Plan) -> np.ndarray:
 
 
 def _add_figure(out: _Document, clip: Clip, plan: _Plan) -> None:
-    """The skin, and a mesh whose vertices each follow one joint."""
+    """The skin, and a mesh; each of its vertices follows one joint."""
     first = len(plan.above)
     rest = _rest_matrices(clip, plan)
     inverse = np.linalg.inv(rest)

@@ -161,7 +161,7 @@ def no_text(flat: np.ndarray) -> bool:
 
 
 def first_member(head: bytes) -> bytes:
-    """The name of the first file in a zip whose first bytes are `head`, empty if it is no zip."""
+    """The name of the first file in a zip that begins with `head`, empty if it is no zip."""
     if not head.startswith(ZIP_MAGIC) or len(head) < 30:
         return b""
     return head[30 : 30 + int.from_bytes(head[26:28], "little")]

@@ -102,7 +102,7 @@ def _made_dict(pairs: Any = ()) -> dict[Any, Any]:
 
 
 def plain_dict(keys: list[Any], values: list[Any]) -> dict[Any, Any]:
-    """A dict whose keys are text, bytes or whole numbers: others could take for ever to hash."""
+    """A dict with keys of text, bytes or whole numbers: others could take for ever to hash."""
     if not all(isinstance(key, str | int | bytes) for key in keys):
         raise ValueError("a key is no text")
     return dict(zip(keys, values, strict=True))

@@ -59,7 +59,7 @@ _TIPS = {
 }
 
 PELVIS = (0.0, -0.22, 0.03)
-"""m, the pelvis in the model's own frame, whose origin lies near the chest: it stands at
+"""m, the pelvis in the model's own frame, which has its origin near the chest: the pelvis stands at
 `trans + PELVIS`."""
 
 
@@ -145,7 +145,7 @@ LAYOUTS = _layouts()
 
 
 def layout_of_width(width: int) -> Layout | None:
-    """The layout whose `poses` have `width` numbers a frame."""
+    """The layout with `poses` of `width` numbers a frame."""
     return next((layout for layout in LAYOUTS if layout.width == width), None)
 
 

@@ -102,7 +102,7 @@ def c3d_points(path: Path) -> RawPoints:
 
 
 def _check_header(path: Path) -> int:
-    """The file's size; a header whose counts do not fit into it is refused before it is read."""
+    """The file's size; a header with counts that do not fit into it is refused before it is read."""
     size = check_file(path)
     with path.open("rb") as file:
         head = file.read(_BLOCK)

@@ -43,7 +43,7 @@ class RawPoints:
     notes: tuple[str, ...] = ()
 
 
-# The places whose bones make up a body's height, as the guesses know their names.
+# The places with the bones that make up a body's height, as the guesses know their names.
 _TREE = {"hips": None, "neck": "hips", "head": "neck"}
 _TREE |= {f"{s} {part}": above for s in SIDES for part, above in (("hip", "hips"),)}
 _TREE |= {f"{s} knee": f"{s} hip" for s in SIDES} | {f"{s} ankle": f"{s} knee" for s in SIDES}
