@@ -24,7 +24,8 @@ def print_card(card: ScoreCard) -> None:
         (label, "-" if math.isnan(value) else f"{value:,.4g}", unit, _verdict(verdict))
         for label, value, unit, verdict in rows_of(card)
     ]
-    title = f"{card.clip or 'run'}: {card.episodes} episodes, {card.frames:,} frames"
+    episodes = "1 episode" if card.episodes == 1 else f"{card.episodes} episodes"
+    title = f"{card.clip or 'run'}: {episodes}, {card.frames:,} frames"
     table(title, ("", "value", "unit", "verdict"), rows)
     say(sentence(card.to_dict()))
 

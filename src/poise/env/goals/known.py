@@ -42,7 +42,7 @@ class BufferedGoal(Goal):
         self._wait = torch.zeros_like(self.at)
         self._ahead = self.buffer.packed(self._every, self.at)
         self._hinges = self.buffer.qpos[:, 0, 7:].clone()
-        # Worlds whose next frame may have changed since it was looked up.
+        # Worlds with a next frame that may have changed since it was looked up.
         self._stale = torch.zeros(num_envs, dtype=torch.bool, device=device)
 
     def local(self, qpos: Tensor) -> Tensor:

@@ -84,7 +84,8 @@ def _notes(
     qpos: np.ndarray, humanoid: Humanoid, moved: RetargetReport | None, widens: bool
 ) -> tuple[str, ...]:
     out = []
-    if moved is not None:
+    # A skeleton with other joints but the same bones is worth no sentence.
+    if moved is not None and (abs(moved.scale - 1.0) > 0.005 or moved.direction_deg > 0.05):
         out.append(
             "The clip is on another skeleton than the policy's body: it was retargeted at "
             f"{moved.scale:.2f} of its size, its bones {moved.direction_deg:.1f} degrees off on average."

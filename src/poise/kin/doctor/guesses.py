@@ -109,7 +109,7 @@ def _rest(clip: Clip, anatomy: Anatomy) -> Guess:
 
 
 def _lean(down: float) -> str:
-    return f"hang by {down:.0f} degrees" if down >= 1 else f"rise by {-down:.0f} degrees"
+    return f"hang by {down:.0f} degrees" if down >= 1 else f"rise by {max(0.0, -down):.0f} degrees"
 
 
 def _sides(clip: Clip, anatomy: Anatomy) -> Guess:
