@@ -90,5 +90,5 @@ def test_bfloat16_products_learn_as_well():
 
 
 def test_unknown_products_are_told():
-    with pytest.raises(PoiseError, match="products cannot be in 'float8'"):
+    with pytest.raises(PoiseError, match="products cannot be 'float8'"):
         PPOConfig(products="float8")  # type: ignore[arg-type]

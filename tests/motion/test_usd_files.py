@@ -176,7 +176,7 @@ def test_refusals(pxr: Any, tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_a_fault_within_the_library_is_a_refusal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pxr: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Damaged binary files fail anywhere in OpenUSD, long after they were opened."""
     from poise.motion.io.usd import read

@@ -155,8 +155,12 @@ def inserted_rest_frames(rot: np.ndarray) -> tuple[int, str]:
     if from_rest[0] > np.radians(0.5) or from_rest.mean() > _REST_ANGLE:
         return 0, ""
     root, joints = steps[:, 0], steps[:, 1:].mean(-1) if steps.shape[1] > 1 else steps[:, 0]
-    root_jumps = root[0] > 6.0 * np.median(root[1:12]) + np.radians(5.0)
-    joints_jump = joints[0] > 6.0 * np.median(joints[1:12]) + np.radians(2.0)
+    # What is usual shows behind the frames that ease, which turn fast themselves.
+    usual_root, usual = (
+        min(np.median(x[1:12]), np.median(x[20:]) if len(x) > 24 else np.inf) for x in (root, joints)
+    )
+    root_jumps = root[0] > 6.0 * usual_root + np.radians(5.0)
+    joints_jump = joints[0] > 6.0 * usual + np.radians(2.0)
     if not (root_jumps or joints_jump):
         return 0, ""
     easing = 0
