@@ -12,11 +12,12 @@ from torch import Tensor
 from poise.env import ImitationEnv
 from poise.env.goals import DisplacedGoal, GeneratorGoal, Goal, StreamGoal, extrapolated
 from poise.env.goals.goal import FADE_S
+from poise.env.plugins import Plugin
 from poise.errors import PoiseError
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
-from poise.sim import difference, make_backend
+from poise.sim import Backend, difference, make_backend
 from toy_human import swing
 
 
@@ -237,3 +238,48 @@ def test_goals_without_clips_say_so(task: Imitation) -> None:
         with pytest.raises(PoiseError, match="a StreamGoal follows no clips"):
             ask()
     env.close()
+
+
+def test_plug_ins_of_a_task_are_made_for_each_environment_and_asked_together(task: Imitation) -> None:
+    class Waits(Plugin):
+        """Worlds wait in every other step; counts its steps."""
+
+        def __init__(self, goal: Goal, backend: Backend):
+            self.steps = torch.zeros(goal.num_envs, dtype=torch.long)
+
+        def held(self) -> Tensor:
+            return self.steps % 2 == 1
+
+        def tick(self) -> None:
+            self.steps += 1
+
+    class Ticks(Plugin):
+        """Is told of every step, and says nothing."""
+
+        def __init__(self, goal: Goal, backend: Backend):
+            self.ticks = 0
+
+        def tick(self) -> None:
+            self.ticks += 1
+
+    own = replace(task, task=replace(task.task, plugins=(Ticks, Waits), auto_reset=False))
+    env, other = (own.env(1, auto_reset=False, threads=1) for _ in range(2))
+    zero = torch.zeros(1, dtype=torch.long)
+    env.reset_to(zero, zero)
+    for _ in range(6):
+        env.step(still(env))
+    ticks, waits = env.plugin(Ticks), env.plugin(Waits)
+    assert ticks is not None and waits is not None and ticks.ticks == 6 and int(env.frame) == 3
+    assert other.plugin(Ticks) is not ticks and other.plugin(Ticks).ticks == 0  # type: ignore[union-attr]
+    env.close()
+    other.close()
+
+
+def test_a_streams_lowest_root_is_that_of_all_its_frames(task: Imitation) -> None:
+    goal = StreamGoal(task.humanoid, task.reference.rate_hz)
+    pose = task.reference.qpos[0]
+    for k in range(100):
+        goal.push(torch.cat((pose[:2], pose[2:3] - 0.2 * (k == 3), pose[3:])))
+    goal.at[:] = 98
+    low = goal.layout.place(goal.now()).low
+    assert float(low) == pytest.approx(float(pose[2]) - 0.2, abs=1e-6)

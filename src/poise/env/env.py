@@ -14,7 +14,7 @@ from poise.env.actuation import Actuation
 from poise.env.frame import FIELDS, Frame, Pose, placed
 from poise.env.goals.goal import Goal
 from poise.env.make import goal_of, plugins_of
-from poise.env.plugins import Ended, Plugin
+from poise.env.plugins import Ended, Plugin, combined
 from poise.env.reference import Reference
 from poise.env.snapshot import Snapshot, put, take
 from poise.env.step_log import StepLog
@@ -80,9 +80,9 @@ class ImitationEnv:
         self.imitation = torch.zeros(n, device=here)
         self.help, self.plugins = plugins_of(task, self.goal, backend, seed)
         # Only plug-ins that change a hook are asked by it.
-        self._holding, self._targeting, self._judging, self._logging = (
+        self._holding, self._ticking, self._targeting, self._judging, self._logging = (
             tuple(p for p in self.plugins if getattr(type(p), hook) is not getattr(Plugin, hook))
-            for hook in ("held", "targets", "judged", "log")
+            for hook in ("held", "tick", "targets", "judged", "log")
         )
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
@@ -207,9 +207,7 @@ class ImitationEnv:
 
     def _held(self) -> Tensor | None:
         """`(N,)` bool, worlds with goals that wait in the next step."""
-        for plugin in self._holding:
-            return plugin.held()
-        return None
+        return combined((p.held() for p in self._holding), torch.logical_or)
 
     # --- stepping -----------------------------------------------------------------------------
 
@@ -233,7 +231,7 @@ class ImitationEnv:
         (self._guard or self.backend).step(self.substeps)
         self.age += 1
         waited = self._held()
-        for plugin in self._holding:
+        for plugin in self._ticking:
             plugin.tick()
         ref, ahead = goal.advance(waited, self._held())
         final, scores, ends, self._style = self._terms.judge(self._sources.of(ref, ahead))
@@ -251,7 +249,7 @@ class ImitationEnv:
         log = StepLog(self.terms, self.imitation, self.wrench, limit, more)
         if task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)
-            counted = next((c for p in self.plugins if (c := p.counted()) is not None), None)
+            counted = combined((p.counted() for p in self.plugins), torch.logical_and)
             ended = Ended(ids, failed, terminated, self.age, goal, row, counted)
             for plugin in self.plugins:
                 plugin.count(ended)
@@ -260,8 +258,9 @@ class ImitationEnv:
                 obs = self._obs.copy_(final)
                 fresh = self._sources.of(goal.now(ids), goal.ahead(1, ids), ids)
                 obs[ids] = self._terms.observe(fresh)
-        elif self._watched():
-            obs = final = self._observe()
+        if self._watched():
+            obs = self._observe()
+            final = final if task.auto_reset else obs
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
 
     def _watched(self) -> bool:

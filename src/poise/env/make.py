@@ -48,4 +48,5 @@ def plugins_of(
             # Falls are those of the first body, which all worlds still have.
             _ = clock.falls
         out.append(BodyAssignment(backend, goal.bodies))
-    return budget, (*out, *([clock] if clock else []), *task.plugins)
+    own = (make(goal, backend) for make in task.plugins)
+    return budget, (*out, *([clock] if clock else []), *own)

@@ -5,7 +5,7 @@ An environment holds a tuple of them and names none. A plug-in overrides the hoo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -128,3 +128,12 @@ class Plugin:
     def rows(self) -> dict[str, Tensor]:
         """What it knows of each world, `(N, ...)` by name: tensors that a snapshot copies in place."""
         return {}
+
+
+def combined(masks: Iterable[Tensor | None], how: Callable[[Tensor, Tensor], Tensor]) -> Tensor | None:
+    """What several plug-ins say of the worlds, `(N,)` bool each, as one; None where none does."""
+    out: Tensor | None = None
+    for mask in masks:
+        if mask is not None:
+            out = mask if out is None else how(out, mask)
+    return out

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -13,6 +13,10 @@ from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
 from poise.env.plugins import Plugin
 from poise.env.recovery.config import Recovery
 from poise.errors import PoiseError
+from poise.sim import Backend
+
+if TYPE_CHECKING:
+    from poise.env.goals import Goal
 
 
 class Acts(Protocol):
@@ -61,7 +65,7 @@ class TaskConfig:
     recovery: falls and getting up, being far and coming back as part of the episodes, see
         `poise.env.recovery.config`; None for episodes that begin and stay on their clip.
     observables: more of what terms can ask a frame for, by name, see `env.observables`.
-    plugins: more parts of the environment, see `env.plugins`.
+    plugins: make more parts of an environment, each of its goal and backend, see `env.plugins`.
     """
 
     obs: tuple[ObsTerm, ...]
@@ -80,7 +84,7 @@ class TaskConfig:
     auto_reset: bool = True
     recovery: Recovery | None = None
     observables: Mapping[str, Observable] = field(default_factory=dict)
-    plugins: tuple[Plugin, ...] = ()
+    plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
 
     def __post_init__(self) -> None:
         if self.help_by not in ("all", "clip", "bin"):

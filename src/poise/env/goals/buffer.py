@@ -33,12 +33,14 @@ class FrameBuffer:
         self.qpos[..., 3] = 1.0
         self.qvel = torch.zeros(num_envs, size, nv, dtype=torch.float64, device=device)
         self.count = torch.zeros(num_envs, dtype=torch.long, device=device)
+        #: `(N,)` the lowest root height so far, m.
+        self.low = torch.full((num_envs,), torch.inf, dtype=torch.float64, device=device)
         #: `(N,)` index of the last frame of all, where that is known; else far away.
         self.last = torch.full_like(self.count, 2**62)
 
     def clear(self, ids: Tensor) -> None:
         """Worlds `ids (n,)` know no frame."""
-        self.count[ids], self.last[ids] = 0, 2**62
+        self.count[ids], self.last[ids], self.low[ids] = 0, 2**62, torch.inf
 
     def append(self, ids: Tensor, qpos: Tensor, still: Tensor | None = None) -> None:
         """One more frame `qpos (n, 7 + n)` in worlds `ids (n,)`.
@@ -51,6 +53,7 @@ class FrameBuffer:
         none = at == 0 if still is None else (at == 0) | still
         self.qvel[ids, at % self.size] = torch.where(none.unsqueeze(-1), 0.0, qvel)
         self.qpos[ids, at % self.size] = qpos
+        self.low[ids] = torch.minimum(self.low[ids], qpos[:, 2])
         self.count[ids] += 1
 
     def coordinates(self, ids: Tensor, index: Tensor) -> Start:
@@ -70,10 +73,11 @@ class FrameBuffer:
         qpos, qvel = (x.cpu() for x in self.coordinates(ids, index))
         pose = self.poser.live(qpos, qvel)
         end = (index >= self.last[ids]).float().cpu()
-        low = self.qpos[ids, 0, 2].float().cpu()
+        low = torch.where(self.low[ids].isfinite(), self.low[ids], 0.0).float().cpu()
         place = torch.stack((torch.zeros_like(end), low, end, torch.zeros_like(end)), 1)
         return self.layout.pack(pose, place).to(self.device)
 
     def rows(self) -> dict[str, Tensor]:
         """Its tensors, a row per world."""
-        return {"qpos": self.qpos, "qvel": self.qvel, "count": self.count, "last": self.last}
+        names = ("qpos", "qvel", "count", "last", "low")
+        return {name: getattr(self, name) for name in names}

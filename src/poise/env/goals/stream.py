@@ -103,6 +103,9 @@ class StreamGoal(BufferedGoal):
             self._stalled[fresh] = True
             self._note(fresh, f"has stalled for {STALL_S:g} s; the goal comes to rest")
 
+    def rows(self) -> dict[str, Tensor]:
+        return {**super().rows(), "stalled": self._stalled}
+
     def _note(self, ids: Tensor, what: str) -> None:
         which = "" if self.num_envs == 1 else f" of world {int(ids[0])}"
         more = f" and {len(ids) - 1} more" if len(ids) > 1 else ""
