@@ -30,7 +30,7 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.runs import RUN_FILE
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker, tracker_of
+from poise.jobs.tracker import Tracker, tracker_of
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary

@@ -5,7 +5,7 @@
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
 that need none. Ctrl-C and --resume as in `poise train perpetual`; the policy is written with
-`poise.jobs.track.policy.save_tracker` and measured by `perpetual.py`.
+`poise.jobs.tracker.save_tracker` and measured by `perpetual.py`.
 """
 
 from __future__ import annotations

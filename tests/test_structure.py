@@ -28,7 +28,7 @@ EXPLAINED = {
         "kin/ik/paper.py:paper_humanoid", "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
     ),
     "for users of the library": (
-        "jobs/imitate.py:imitate", "jobs/track/clips.py:track_clip", "env/gym.py:GymVectorEnv",
+        "jobs/imitate.py:imitate", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/contacts.py:add_contact_sensors",

@@ -17,7 +17,7 @@ from poise.jobs.perpetual.run import Earlier, begin, going_on, resume, train
 from poise.jobs.perpetual.stage_initialisation import Owners, staged
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
-from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
+from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
 from poise.nets import Composer
 from poise.recipes.perpetual import Perpetual, build
@@ -194,18 +194,18 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     """With a policy that hardly stands, so that it is lost; what comes out holds together."""
     config = TrackConfig(recover=True)
     with pytest.raises(PoiseError, match="has not learned to come back"):
-        track(tracker, swing(4.0, name="long"), config)
+        track(swing(4.0, name="long"), tracker, config)
     made = build(lively(), tiny(recovery=True, **PLAIN))
     able = replace(tracker, recovery_clips=made.recovery_clips)
     clip = swing(4.0, name="long")
-    done = track(able, clip, config)
-    again = track(able, clip, config)
+    done = track(clip, able, config)
+    again = track(clip, able, config)
     assert (done.evaluation.recordings[0].qpos == again.evaluation.recordings[0].qpos).all()
     assert done.losses is not None and done.failures[0] == (0, done.losses.lost[0])
     frames = len(done.evaluation.recordings[0].qpos)
     assert frames == int(done.imitation.reference.length[0]) == len(done.placed.qpos)
     # Up to where it was lost everything is as without.
-    plain = track(able, clip)
+    plain = track(clip, able)
     upto = round(done.losses.lost[0] * 30)
     a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
     assert abs(a - b).max() < 1e-9

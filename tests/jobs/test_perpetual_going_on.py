@@ -13,7 +13,7 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import Earlier, begin, going_on, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
+from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.spatial import quat_mul

@@ -135,6 +135,13 @@ class Body:
         return configured(BodyConfig(), {k.partition(".")[2]: v for k, v in values.items()})
 
 
+def check_range(name: str, value: float | None, low: float, high: float = 2**31 - 1) -> None:
+    """Refuses an option --`name` that does not lie in `low` to `high`; None was not given."""
+    if value is not None and not low <= value <= high:
+        where = f"be at least {low:g}" if high == 2**31 - 1 else f"lie in {low:g} to {high:g}"
+        raise PoiseError(f"--{name} must {where}, got {value}")
+
+
 def check_device(name: str) -> None:
     """Refuses a device on which nothing could run, before anything is read or made."""
     if name != "cpu":

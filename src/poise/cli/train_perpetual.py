@@ -24,7 +24,7 @@ from poise.errors import PoiseError
 if TYPE_CHECKING:
     from poise.cli.options import Training
     from poise.cli.train import Options
-    from poise.jobs.track.policy import Tracker
+    from poise.jobs.tracker import Tracker
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
 

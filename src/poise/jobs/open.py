@@ -24,7 +24,7 @@ from poise.jobs.run_file import (
     run_folder,
 )
 from poise.jobs.runs import Evaluation, episode, evaluate, reopen, score, trained_policy
-from poise.jobs.track.policy import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
+from poise.jobs.tracker import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
 from poise.learn import PolicyBundle, load_checkpoint
 from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.recipes.perpetual.config import config_of as perpetual_config

@@ -1,6 +1,6 @@
 """A policy goes on to learn the one motion that it loses.
 
-    tracked = track(tracker, clip)
+    tracked = track(clip, tracker)
     if tracked.failures:
         tracker = learn(tracker, tracked.placed, Path("out/learned"), minutes=10)
 
@@ -19,7 +19,7 @@ from poise.jobs.perpetual.progress import Progress
 from poise.jobs.perpetual.result import PerpetualResult
 from poise.jobs.perpetual.run import Earlier, begin, going_on, train
 from poise.jobs.track.placement import Placed, place
-from poise.jobs.track.policy import Tracker, tracker_of
+from poise.jobs.tracker import Tracker, tracker_of
 from poise.kin.doctor.clean import clean_clip
 from poise.learn import Until
 from poise.motion import ClipLibrary

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.track.policy import Tracker
 from poise.jobs.track.tracking import TrackConfig, track
+from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
@@ -178,7 +178,7 @@ def write_robustness(result: Robustness, folder: Path) -> dict[str, Path]:
 
 def _row(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig) -> tuple[float, ...]:
     """Success, success without noise, errors and share of one motion, in the order of `Rung`."""
-    done = track(tracker, motion, config)
+    done = track(motion, tracker, config)
     card, clean = done.evaluation.card, done.clean
     seconds = (int(done.imitation.reference.length[0]) - 1) / done.imitation.reference.rate_hz
     tracked = done.failed_s[0] / seconds if done.failed_s else 1.0

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
 
 from poise.env import Acts
-from poise.jobs.track.policy import Tracker
-from poise.jobs.track.replay import Replay
+from poise.jobs.tracker import Tracker
 from poise.plan import SamplingConfig, SamplingControl, SamplingResult
 from poise.recipes.imitation import Imitation
 
 
-def search(
+def look_for(
     tracker: Tracker,
     imitation: Imitation,
     config: SamplingConfig,
@@ -45,3 +47,20 @@ def sentence(found: SamplingResult, config: SamplingConfig, rate_hz: float) -> s
 def replay(found: SamplingResult, policy: Acts) -> Replay:
     """Does what was found, and from where it was lost what the policy does."""
     return Replay(found.actions[: found.reached].clone(), policy)
+
+
+@dataclass(eq=False)
+class Replay:
+    """Actions `(T, A)` one after another, for the one character that they were made for; after them
+    acts the policy, if there is one."""
+
+    actions: Tensor
+    policy: Acts | None = None
+    step: int = 0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """The next one, `(1, A)`; `obs` is looked at by the policy alone."""
+        at, self.step = self.step, self.step + 1
+        if at >= len(self.actions) and self.policy is not None:
+            return self.policy.act(obs)
+        return self.actions[at : at + 1]

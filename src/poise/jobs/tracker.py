@@ -57,7 +57,7 @@ class TrackerMeta(PolicyMeta):
 #: What a policy file calls itself, and the version of what stands in it.
 KIND, VERSION = "tracker", 1
 #: The policy that comes with Poise.
-SHIPPED = Path(__file__).parents[2] / "data/tracker.safetensors"
+SHIPPED = Path(__file__).parents[1] / "data/tracker.safetensors"
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300
 #: The largest number of half precision.
