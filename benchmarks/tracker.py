@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from poise.body import BodyConfig
-from poise.cli.callbacks import beginning
-from poise.cli.perpetual_shown import training as shown
-from poise.jobs.library.folder import LibraryConfig
+from poise.cli.train_perpetual import training as shown
+from poise.cli.training import beginning
+from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.run import begin, clips_of, resume, train
 from poise.learn import ConvergenceConfig, Until
 from poise.plan import TrajOptConfig

@@ -21,8 +21,8 @@ from poise.version import __version__
 
 if TYPE_CHECKING:
     from poise.jobs.imitate import Imitated, imitate
-    from poise.jobs.inbetween import Inbetween
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
+    from poise.jobs.inbetween.training import Inbetween
     from poise.jobs.open import Run, open_run
     from poise.jobs.track import TrackConfig, Tracked, track
     from poise.motion import Clip, ClipLibrary
@@ -36,7 +36,7 @@ _PLACES = {
     "Clip": "poise.motion",
     "ClipLibrary": "poise.motion",
     "Imitated": "poise.jobs.imitate",
-    "Inbetween": "poise.jobs.inbetween",
+    "Inbetween": "poise.jobs.inbetween.training",
     "Inbetweened": "poise.jobs.inbetween.fill",
     "Perpetual": "poise.recipes.perpetual",
     "ResidualForce": "poise.recipes",

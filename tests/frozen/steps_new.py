@@ -24,9 +24,10 @@ from poise.jobs.deliver import deliver
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.demonstrations import odds, practised
-from poise.jobs.perpetual.progress import Stage
 from poise.jobs.perpetual.stage_initialisation import staged
-from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
+from poise.jobs.perpetual.stage_order import Stage
+from poise.jobs.run_file import learning_curve
+from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, Tracked, imitation_of, track, write
 from poise.jobs.track.noise import noise_of
 from poise.jobs.track.placement import place
@@ -261,7 +262,7 @@ def job_track(folder: Path) -> dict[str, np.ndarray]:
 
 def job_track_search(folder: Path) -> dict[str, np.ndarray]:
     search = SamplingConfig(characters=64, retries=2, rounds=2)
-    done = track(aside(0.6), open_run().tracker, TrackConfig(search=search, search_threads=1))
+    done = track(aside(0.6), open_run().tracker, TrackConfig(search=search, threads=1))
     assert done.found is not None and done.found.whole
     return _tracked(done, folder)
 

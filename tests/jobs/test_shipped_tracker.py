@@ -11,7 +11,7 @@ from poise.env import Reference
 from poise.eval.recovery import KINDS
 from poise.jobs.library.files import subject_of
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.recovery import try_recovery
+from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import SHIPPED, Tracker

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 
 from poise import __version__
 from poise.errors import PoiseError
+from poise.settings import plain
 
 #: Exit codes beside 0 (done) and 1 (a fault of Poise or of the machine).
 REFUSED, LOST, INTERRUPTED = 2, 3, 130
@@ -70,17 +70,6 @@ def document(
             "error": told,
         }
     )
-
-
-def plain(value: Any) -> Any:
-    """JSON data: paths as text, tuples as lists, NaN and infinity as null."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
 
 
 def failure(problem: BaseException) -> tuple[int, PoiseError]:

@@ -196,12 +196,10 @@ class Training:
         for name, value in (("limit", chosen.help_limit), ("start", chosen.help_start)):
             if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise PoiseError(f"--help-{name} must be a number of at least 0 newtons, got {value:g}")
-        numbers = {"envs": chosen.num_envs, "seed": chosen.seed}
-        numbers |= {"threads": self.threads, "iterations": self.iterations}
-        for name, value in numbers.items():
-            low = 0 if name in ("threads", "seed") else 1
-            if value is not None and not low <= value < 2**31:
-                raise PoiseError(f"--{name} must be a whole number of at least {low}, got {value}")
+        check_range("envs", chosen.num_envs, 1)
+        check_range("seed", chosen.seed, 0)
+        check_range("threads", self.threads, 0)
+        check_range("iterations", self.iterations, 1)
         check_device(self.device)
 
     def settings(

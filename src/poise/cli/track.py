@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.answer import INTERRUPTED, LOST, Answer
-from poise.cli.console import say, tell
+from poise.cli.console import print_card, say, tell
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import claimed, may_deliver, may_write, places
-from poise.cli.progress import clock, showing, working
-from poise.cli.results import print_card
+from poise.cli.progress import clock, left, showing, working
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.progress import Progress
+    from poise.jobs.perpetual.stage_order import Progress
     from poise.jobs.track import TrackConfig, Tracked
     from poise.jobs.tracker import Tracker
     from poise.motion import Clip
@@ -113,7 +112,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     """Opens the policy, reads, tracks, writes; says where the character failed. folder: of the results,
     where that is settled."""
     o = options
-    from poise.jobs.runs import RUN_FILE
+    from poise.jobs.run_file import RUN_FILE
 
     out, motion = places(o.out) if folder is None else (folder, None)
     goes_on = o.learn > 0 and (out / "learned" / RUN_FILE).exists()
@@ -183,15 +182,14 @@ def follow(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tr
                 shown.close()
                 bars.append(shown.enter_context(showing("searching")))
             share, spent = done / steps, time.monotonic() - began
-            left = f", {clock(spent * (1 / share - 1))} left" if share else ""
-            bars[0](share, f"{100 * share:.0f} % searched{left}")
+            bars[0](share, f"{100 * share:.0f} % searched, {left(spent, share)}")
 
         return track(given, tracker, config, on_search=show)
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
-    from poise.cli.perpetual_shown import times
+    from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
 
     o, when, rate = options, tracked.failures[0][1], tracker.config.sim.control_hz

@@ -13,6 +13,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import (
@@ -23,7 +25,7 @@ from poise.jobs.run_file import (
     learning_curve,
     run_folder,
 )
-from poise.jobs.runs import Evaluation, episode, evaluate, reopen, score, trained_policy
+from poise.jobs.runs import Evaluation, evaluate, reopen, score, trained_policy
 from poise.jobs.tracker import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
 from poise.learn import PolicyBundle, load_checkpoint
 from poise.learn.model import MODEL, InbetweenModel, load_model
@@ -136,7 +138,8 @@ class Run:
             raise PoiseError(f"the run has clips 0 to {len(names) - 1}, got {clip}", self.path)
         if not 0 <= frame < int(self.task.reference.length[clip]) - 1:
             raise PoiseError(f"'{names[clip]}' has no step after its frame {frame}", self.path)
-        return episode(self.task, *self.trained, clip, frame)
+        starts = torch.tensor([clip]), torch.tensor([frame])
+        return evaluate(self.task, *self.trained, starts=starts)
 
     def clip(self, clip: int | str = 0) -> Clip:
         """The simulated motion of one of the run's clips on the skeleton that it came on."""

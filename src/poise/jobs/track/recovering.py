@@ -1,22 +1,24 @@
-"""A motion that is lost and found again: the character gets up, comes back and goes on."""
+"""What is done about a motion that is lost: it is looked for by many characters at once
+(`plan.sampling`), or the character gets up, comes back and goes on."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv, Reference
+from poise.env import Acts, ImitationEnv, Reference
 from poise.env.goals.led import TRACKS, LedGoal
 from poise.errors import PoiseError
 from poise.eval import simulate
 from poise.jobs.track.placement import Placed
-from poise.jobs.track.searching import Replay
 from poise.jobs.tracker import Tracker
 from poise.kin import qpos_to_clip
 from poise.motion import Clip, ClipLibrary, resample
+from poise.plan import SamplingConfig, SamplingControl, SamplingResult
 from poise.recipes.imitation import Imitation
 
 #: A motion that is lost more often is given up, and so is one that the character has left for so many s.
@@ -43,7 +45,7 @@ class Losses:
 
 
 def with_returns(
-    tracker: Tracker, placed: Placed, imitation: Imitation, threads: int
+    tracker: Tracker, placed: Placed, imitation: Imitation
 ) -> tuple[Placed, Imitation, Replay, Losses] | None:
     """Tracks a motion, and a recovery motion wherever it is lost; None where it never is.
 
@@ -60,7 +62,7 @@ def with_returns(
             hint="Leave --recover out, or train one on a library with a clip that gets up",
         )
     task = replace(imitation.task, help_by="all")
-    env = replace(imitation, task=task).env(1, auto_reset=False, threads=threads, help_scale=0.0)
+    env = replace(imitation, task=task).env(1, auto_reset=False, threads=1, help_scale=0.0)
     try:
         zero = torch.zeros(1, dtype=torch.long)
         env.reset_to(zero, zero)
@@ -122,3 +124,56 @@ def _held(clip: Clip, rate: float, of: list[int]) -> Clip:
     clip = resample(clip, rate)
     rows = np.minimum(of, clip.frames - 1)
     return clip.replaced(root_pos=clip.root_pos[rows], rot=clip.rot[rows])
+
+
+def look_for(
+    tracker: Tracker,
+    imitation: Imitation,
+    config: SamplingConfig,
+    clip: int = 0,
+    threads: int = 0,
+    show: Callable[[int, int], None] | None = None,
+) -> SamplingResult:
+    """Looks for one of a task's motions with the tracker's policy, without help.
+
+    threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
+    """
+    # Worlds that lose the motion may go bad; they are left behind.
+    env = imitation.bare(rewards=True).env(
+        config.characters, auto_reset=False, threads=threads, help_scale=0.0, guard=False
+    )
+    try:
+        return SamplingControl(env, tracker.policy, config, tracker.value, clip).run(show)
+    finally:
+        env.close()
+
+
+def sentence(found: SamplingResult, config: SamplingConfig, rate_hz: float) -> str:
+    """What the search came to."""
+    much = f"{config.characters} characters looked for it, {found.tries:,} control steps, without help"
+    if found.whole:
+        return f"The policy alone loses the motion; {much}, and found it to its end."
+    at = found.reached / rate_hz
+    return f"The policy alone loses the motion; {much}, and came as far as {at:.1f} s."
+
+
+def replay(found: SamplingResult, policy: Acts) -> Replay:
+    """Does what was found, and from where it was lost what the policy does."""
+    return Replay(found.actions[: found.reached].clone(), policy)
+
+
+@dataclass(eq=False)
+class Replay:
+    """Actions `(T, A)` one after another, for the one character that they were made for; after them
+    acts the policy, if there is one."""
+
+    actions: Tensor
+    policy: Acts | None = None
+    step: int = 0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """The next one, `(1, A)`; `obs` is looked at by the policy alone."""
+        at, self.step = self.step, self.step + 1
+        if at >= len(self.actions) and self.policy is not None:
+            return self.policy.act(obs)
+        return self.actions[at : at + 1]

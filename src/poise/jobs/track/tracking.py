@@ -18,16 +18,15 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import record, score_rollouts
-from poise.eval.judged import judge
+from poise.eval import run_episodes
+from poise.eval.rolloutset import judge
 from poise.jobs.open import Run, open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.runs import Evaluation
+from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track.crowd import Crowd, places
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.points import fitted, follow, points_of
-from poise.jobs.track.recovering import with_returns
-from poise.jobs.track.searching import look_for, replay, sentence
+from poise.jobs.track.recovering import look_for, replay, sentence, with_returns
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
@@ -59,8 +58,7 @@ class TrackConfig:
         smooth_hz: cut-off of a low-pass on keypoints.
         count: characters that do the motion side by side in one world, see `track.crowd`.
         search: a motion that the policy loses is looked for, see `plan.sampling`; for one character.
-        search_threads: of it, 0 is all cores.
-        threads: of the physics.
+        threads: cores of the search, 0 is all of them.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -70,8 +68,7 @@ class TrackConfig:
     smooth_hz: float | None = None
     count: int = 1
     search: SamplingConfig | None = None
-    search_threads: int = 0
-    threads: int = 1
+    threads: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST:
@@ -131,32 +128,21 @@ def track(
         imitation = side_by_side(imitation, config.count)
     acts, losses, found = tracker.policy, None, None
     if config.search and loses(tracker, imitation):
-        found = look_for(tracker, imitation, config.search, 0, config.search_threads, on_search)
+        found = look_for(tracker, imitation, config.search, 0, config.threads, on_search)
         acts = replay(found, acts)
         notes.append(sentence(found, config.search, imitation.reference.rate_hz))
-    if config.recover and (back := with_returns(tracker, placed, imitation, config.threads)):
+    if config.recover and (back := with_returns(tracker, placed, imitation)):
         placed, imitation, acts, losses = back
     all_of_them = torch.arange(config.count)
     starts, sim = torch.zeros_like(all_of_them), imitation.config.sim
     crowd = Crowd(imitation.humanoid, sim, config.count) if config.count > 1 else None
-    env = imitation.env(
-        1, None, False, config.threads, help_scale=0.0, guard=crowd is None, backend=crowd
-    )
-    try:
-        if config.reset_on_fail:
-            acts = Keeper(env, acts)
-        rollouts, recordings = record(env, acts, all_of_them, starts, cycles=1)
-    finally:
-        env.close()
+    env = imitation.env(1, None, False, 1, help_scale=0.0, guard=crowd is None, backend=crowd)
+    if config.reset_on_fail:
+        acts = Keeper(env, acts)
+    rollouts, recordings = run_episodes(lambda _: env, acts, all_of_them, starts, cycles=1)
     about, rate = tracker.about, imitation.reference.rate_hz
-    card = score_rollouts(
-        rollouts,
-        rule=RULE,
-        method=tracker.config.method + (", searched" if found else ""),
-        seconds=float(about.get("seconds", 0.0)),
-        samples=int(about.get("samples", 0)),
-        seed=tracker.config.seed,
-    )
+    method = tracker.config.method + (", searched" if found else "")
+    card = scored(rollouts, imitation, about, RULE, method)
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
     mended = acts.fallen if isinstance(acts, Keeper) else ()
