@@ -11,7 +11,6 @@ from typing import Any
 
 from poise import __version__
 from poise.errors import PoiseError
-from poise.settings import plain
 
 #: Exit codes beside 0 (done) and 1 (a fault of Poise or of the machine).
 REFUSED, LOST, INTERRUPTED = 2, 3, 130
@@ -56,6 +55,8 @@ def document(
     verb: str, inputs: Sequence[Path], answer: Answer, error: PoiseError | None
 ) -> dict[str, Any]:
     """The document of `--json`, the same for every verb; numbers that are not finite become null."""
+    from poise.settings import plain
+
     told = None if error is None else {"what": error.what, "where": error.where, "hint": error.hint}
     return plain(
         {

@@ -26,7 +26,6 @@ from poise.eval import (
 from poise.jobs.run_file import (
     FINAL,
     RUN_FILE,
-    RunFile,
     body_facts,
     held_run,
     latest_policy,
@@ -72,11 +71,6 @@ def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str
     elif file.meta.get("character") != imitation.humanoid.identity:
         raise PoiseError("the folder holds a run of another body", folder, "Choose another folder")
     return imitation
-
-
-def reopen(file: RunFile) -> Imitation:
-    """The task of an existing run, rebuilt from its file alone."""
-    return build(file.library(), config_of(file.meta["config"], file.path))
 
 
 def train(
