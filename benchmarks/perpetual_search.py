@@ -1,4 +1,4 @@
-"""What many characters find of the motions that the policy alone loses (`jobs.track.searching`)."""
+"""What many characters find of the motions that the policy alone loses (`jobs.track.recovering`)."""
 
 from __future__ import annotations
 
