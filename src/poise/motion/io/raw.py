@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_frames, check_poses, check_rate
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import (
     Guess,
@@ -20,7 +20,6 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS, listed
-from poise.motion.limits import check_poses, check_rate
 from poise.motion.skeleton import Channel, Skeleton, Source
 from poise.spatial import forward_kinematics, normalize, unwrap_quats
 
@@ -178,11 +177,7 @@ def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[f
 def _check(raw: RawMotion) -> None:
     if len(raw.names) > MAX_JOINTS:
         raise PoiseError(f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed", raw.path)
-    if len(raw.root_pos) < 2:
-        count = len(raw.root_pos)
-        raise PoiseError(
-            f"the clip has {count} frame{'' if count == 1 else 's'}; motion needs at least 2", raw.path
-        )
+    check_frames(len(raw.root_pos), raw.path)
     if not np.abs(raw.offsets).max() > 0:
         raise PoiseError("no bone of the skeleton has any length (all offsets are zero)", raw.path)
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_frames
 from poise.motion.io.numpy.arrays import numeric, refuse_bad, require
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import CUT_OFF, append_numbers, at_line, decode, listed, read_bytes, shown
@@ -108,9 +108,7 @@ def read_mot(path: Path, options: ReadOptions) -> Clip:
     table = np.frombuffer(values, dtype=np.float64).reshape(-1, len(names))
     columns = dict(zip(names, table.T, strict=True))
     require(columns, ("time", *_PELVIS), path, "this OpenSim motion")
-    if len(table) < 2:
-        plural = "" if len(table) == 1 else "s"
-        raise PoiseError(f"the clip has {len(table)} frame{plural}; motion needs at least 2", path)
+    check_frames(len(table), path)
     steps = np.diff(columns["time"])
     step = float(steps.mean())
     if not (step > 0 and np.abs(steps / step - 1).max() < 0.05):

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.clip import check_poses
 from poise.motion.io.gltf.file import GltfFile
 from poise.motion.io.gltf.tracks import Take, Track
 from poise.motion.io.text import MAX_VALUE
-from poise.motion.limits import check_poses
 
 _SLOW_HZ = 12.0
 _USUAL_HZ = 30.0

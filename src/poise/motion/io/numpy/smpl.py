@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_poses
 from poise.motion.info import sampled
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
@@ -27,7 +27,6 @@ from poise.motion.io.raw import (
     vectors_from_z_up,
 )
 from poise.motion.io.text import listed
-from poise.motion.limits import check_poses
 from poise.motion.skeleton import Channel
 from poise.spatial import forward_kinematics, quat_mul, rotvec_to_quat
 

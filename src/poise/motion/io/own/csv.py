@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_rate
 from poise.motion.io.numpy.arrays import refuse_bad, require
 from poise.motion.io.own.record import (
     loads,
@@ -31,7 +31,6 @@ from poise.motion.io.text import (
     shown,
     write_whole,
 )
-from poise.motion.limits import check_rate
 from poise.motion.skeleton import Skeleton
 
 VERSION = 1

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_rate
 from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
 from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import MAX_JOINTS, shown
-from poise.motion.limits import check_rate
 
 HUMANML3D = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_poses, check_rate
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
 from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
-from poise.motion.limits import check_poses, check_rate
 from poise.motion.points import FitConfig, fit_clip
 from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of

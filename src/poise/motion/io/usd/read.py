@@ -11,11 +11,10 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_poses
 from poise.motion.io.nodes import base_of, checked_unit, rigid_bones, unique_names
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, check_file, listed, shown
-from poise.motion.limits import check_poses
 from poise.spatial import matrix_to_quat
 
 _EVEN_TIME = 0.01
