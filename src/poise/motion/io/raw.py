@@ -37,6 +37,9 @@ class ReadOptions:
     take: str | None = None
 
 
+UNSTATED = ReadOptions()
+
+
 @dataclass(frozen=True)
 class RawMotion:
     """One motion in its file's own unit and axes.

@@ -1,15 +1,12 @@
-"""Bounded reading of text files, numbers with the place of every mistake, files written whole."""
+"""Bounded reading of text files, words for errors, files written whole."""
 
 from __future__ import annotations
 
 import os
 import secrets
 import stat
-from array import array
 from collections.abc import Iterable
 from pathlib import Path
-
-import numpy as np
 
 from poise.errors import PoiseError
 
@@ -149,48 +146,6 @@ def shown(token: object) -> str:
     text = token.decode("utf-8", "replace") if isinstance(token, bytes) else str(token)
     text = "".join(c if c.isprintable() else "?" for c in text)
     return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
-
-
-def number(token: str | bytes, where: str) -> float:
-    """One finite number; anything else is refused with its place."""
-    try:
-        if ("_" if isinstance(token, str) else b"_") in token:  # type: ignore[operator]
-            raise ValueError
-        value = float(token)
-    except ValueError:
-        raise PoiseError(f"{shown(token)} is not a number", where) from None
-    if not abs(value) <= MAX_VALUE:
-        raise PoiseError(f"{shown(token)} is not a usable number", where)
-    return value
-
-
-def append_numbers(values: array[float], tokens: list[bytes], where: str) -> None:
-    """Adds the numbers of one row in one go; on a mistake, names the token at fault.
-
-    NaN and inf pass, so that the caller can name the joint and frame.
-    """
-    size = len(values)
-    try:
-        # Python reads "1_000" as a number; motion files do not.
-        if b"_" in b"".join(tokens):
-            raise ValueError
-        values.extend(map(float, tokens))
-    except ValueError:
-        del values[size:]
-        for token in tokens:
-            try:
-                float(token.replace(b"_", b"x"))
-            except ValueError:
-                raise PoiseError(f"{shown(token)} is not a number", where) from None
-
-
-def first_bad(table: np.ndarray) -> tuple[int, int] | None:
-    """(row, column) of the first value that is not finite or is absurdly large, else None."""
-    bad = ~(np.abs(table) <= MAX_VALUE)
-    if not bad.any():
-        return None
-    row, column = np.argwhere(bad)[0]
-    return int(row), int(column)
 
 
 def listed(items: Iterable[object], limit: int = 8) -> str:

@@ -12,16 +12,8 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
 from poise.motion.io.acclaim.asf import ROTATIONS, TRAVEL, AsfFile, fixed_axes_quat, parse_asf
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
-from poise.motion.io.text import (
-    CUT_OFF,
-    append_numbers,
-    at_line,
-    decode,
-    first_bad,
-    listed,
-    read_bytes,
-    shown,
-)
+from poise.motion.io.tables import append_numbers, first_bad
+from poise.motion.io.text import CUT_OFF, at_line, decode, listed, read_bytes, shown
 from poise.motion.skeleton import Channel
 from poise.spatial import quat_conj, quat_mul
 

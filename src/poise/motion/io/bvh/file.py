@@ -9,17 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.tables import append_numbers, first_bad, number
 from poise.motion.io.text import (
     CUT_OFF,
     MAX_HEADER_WORDS,
     MAX_JOINTS,
     MAX_NAME,
     MAX_VALUE,
-    append_numbers,
     at_line,
     decode,
-    first_bad,
-    number,
     read_bytes,
     shown,
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from array import array
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +20,11 @@ from poise.motion.io.own.record import (
     source_to_json,
 )
 from poise.motion.io.raw import ReadOptions
+from poise.motion.io.tables import BLANK, number, number_table
 from poise.motion.io.text import (
     CUT_OFF,
-    append_numbers,
     at_line,
     decode,
-    number,
     read_bytes,
     shown,
     write_whole,
@@ -37,7 +35,6 @@ VERSION = 1
 MARK = "# poise motion csv"
 """The first line of the format, before its version."""
 _TIME_SLACK = 0.01
-_BLANK = b" \t,;"
 
 
 def write_csv(clip: Clip, path: str | Path) -> None:
@@ -173,7 +170,7 @@ def _order(lines: list[bytes], first: int, skeleton: Skeleton, path: Path) -> li
 def _table(lines: list[bytes], first: int, order: list[int], path: Path) -> np.ndarray:
     """`(T, 4 + 4 J)` the numbers in the order of `columns`."""
     width, *at = order
-    rows = [line for line in lines[first + 1 :] if line.strip(_BLANK)]
+    rows = [line for line in lines[first + 1 :] if line.strip(BLANK)]
     if not rows:
         raise PoiseError("the file has no frames", path, CUT_OFF)
     try:
@@ -182,21 +179,8 @@ def _table(lines: list[bytes], first: int, order: list[int], path: Path) -> np.n
         table = np.zeros((0, 0))
     if table.shape != (len(rows), width):
         # Line by line is slower, but finds the place of the mistake.
-        table = _line_by_line(lines, first, width, path)
+        table = number_table(lines, first + 1, width, path, b",")
     return table[:, at]
-
-
-def _line_by_line(lines: list[bytes], first: int, width: int, path: Path) -> np.ndarray:
-    values: array[float] = array("d")
-    for i in range(first + 1, len(lines)):
-        if not lines[i].strip(_BLANK):
-            continue
-        tokens = lines[i].split(b",")
-        if len(tokens) != width:
-            what = f"the row has {len(tokens)} values; there are {width} columns"
-            raise PoiseError(what, at_line(path, i + 1))
-        append_numbers(values, tokens, at_line(path, i + 1))
-    return np.frombuffer(values, dtype=np.float64).reshape(-1, width)
 
 
 def _check_times(times: np.ndarray, fps: float, path: Path) -> None:

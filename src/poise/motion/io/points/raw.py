@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from poise.motion.clip import Clip, check_poses, check_rate
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
 from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
+from poise.motion.io.refused import FLAT_HINT
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
 from poise.motion.points import FitConfig, fit_clip
@@ -19,8 +22,8 @@ from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
 from poise.motion.skeleton import Source
 
-FLAT_HINT = "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file"
-"""What to do with 2D keypoints."""
+UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""Metres in a unit, as tables of points call it."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,18 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     )  # fmt: skip
 
 
-def points_clip(raw: RawPoints, options: ReadOptions) -> Clip:
-    """The clip of a skeleton that follows the file's keypoints, see `fit_clip`."""
-    return fit_clip(assemble_points(raw, options), FitConfig(smooth_hz=options.smooth_hz))
+def as_clip(points: Callable[..., RawPoints]) -> Callable[..., Clip]:
+    """The reader of clips that a reader of points makes: a skeleton follows them, see `fit_clip`.
+
+    points: takes a path and `ReadOptions`, or named arrays before them.
+    """
+
+    def read(*given: Any) -> Clip:
+        options: ReadOptions = given[-1]
+        raw = assemble_points(points(*given), options)
+        return fit_clip(raw, FitConfig(smooth_hz=options.smooth_hz))
+
+    return read
 
 
 def _of(raw: RawPoints) -> Source:
