@@ -41,11 +41,11 @@ def refuse_robot(path: Path, options: ReadOptions) -> NoReturn:
         head = file.read(1 << 16)
     columns = _robot_columns(head)
     if columns is not None:
-        what = (
-            f"its rows of {columns} numbers are a robot's root pose and {columns - _ROOT} joint angles "
-        )
         raise PoiseError(
-            f"{what}(qpos), which mean nothing without the robot's model", path, _HUMAN_HINT
+            f"its rows of {columns} numbers are a robot's root pose and {columns - _ROOT} joint angles "
+            "(qpos), which mean nothing without the robot's model",
+            path,
+            _HUMAN_HINT,
         )
     if head.startswith(_HDF5_MAGIC):
         raise PoiseError(

@@ -61,12 +61,12 @@ def check_file(path: Path, limit: int = MAX_FILE_BYTES) -> int:
     return info.st_size
 
 
-def read_head(path: Path, size: int = 4096) -> bytes:
+def read_head(path: Path) -> bytes:
     """The first bytes of a file, after `check_file`."""
     check_file(path)
     try:
         with path.open("rb") as file:
-            return file.read(size)
+            return file.read(4096)
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
 
