@@ -15,9 +15,10 @@ from poise.motion.io.text import shown
 from poise.motion.skeleton import Skeleton
 from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
 
-# As for BVH: a joint is rigid if its place stays within this share of the skeleton's size.
-_RIGID_SHARE = 6e-4
-_TRAVEL_SHARE = 20 * _RIGID_SHARE
+RIGID_SHARE = 6e-4
+"""A joint is rigid if its place stays within this share of the skeleton's size: about 1 mm on a person,
+whatever the unit."""
+_TRAVEL_SHARE = 20 * RIGID_SHARE
 _HUMAN_M = (0.3, 4.0)
 
 
@@ -113,18 +114,13 @@ def rigid_bones(
     travel = _travel_joint(parents, offsets, paths, root_pos, size)
     still = None
     if travel is not None:
-        moves = np.abs(root_pos - root_pos[0]).max() > _RIGID_SHARE * size
+        moves = np.abs(root_pos - root_pos[0]).max() > RIGID_SHARE * size
         still = None if moves else root_pos[0].tolist()
-        root, hips = names[0], names[travel]
-        notes.append(
-            f"Both the root '{root}' and '{hips}' travel; the path of both became the root's"
-            if moves
-            else f"The root '{root}' stands still: the travel of '{hips}' became the root's path"
-        )
+        notes.append(travel_note(names[0], names[travel], bool(moves)))
         offsets[travel] = 0.0
-        root_pos = _lifted(parents, offsets, root_pos, rot, travel, paths.pop(travel))
+        root_pos = lifted(parents, offsets, root_pos, rot, travel, paths.pop(travel))
     strays = ((j, float(np.linalg.norm(p - offsets[j], axis=-1).max())) for j, p in paths.items())
-    loose = tuple((names[j], stray) for j, stray in strays if stray > _RIGID_SHARE * size)
+    loose = tuple((names[j], stray) for j, stray in strays if stray > RIGID_SHARE * size)
     return Bones(offsets, root_pos, rot, travel, still, loose)
 
 
@@ -143,7 +139,7 @@ def _travel_joint(
     weight = [1] * len(parents)
     for j in range(len(parents) - 1, 0, -1):
         weight[parents[j]] += weight[j]
-    still = np.abs(root_pos - root_pos[0]).max() <= _RIGID_SHARE * size
+    still = np.abs(root_pos - root_pos[0]).max() <= RIGID_SHARE * size
     joint, only = 0, True
     while True:
         heavy = [j for j, p in enumerate(parents) if p == joint and 2 * weight[j] > weight[0]]
@@ -151,12 +147,19 @@ def _travel_joint(
         if not heavy or not (only or still):
             return None
         joint = heavy[0]
-        slack = (_RIGID_SHARE if only else _TRAVEL_SHARE) * size
+        slack = (RIGID_SHARE if only else _TRAVEL_SHARE) * size
         if np.linalg.norm(paths[joint] - offsets[joint], axis=-1).max() > slack:
             return joint
 
 
-def _lifted(
+def travel_note(root: str, joint: str, both: bool) -> str:
+    """The sentence about the joint that carries the travel instead of the root, or together with it."""
+    if both:
+        return f"Both the root '{root}' and '{joint}' travel; the path of both became the root's"
+    return f"The root '{root}' stands still: the travel of '{joint}' became the root's path"
+
+
+def lifted(
     parents: Sequence[int],
     offsets: np.ndarray,
     root_pos: np.ndarray,

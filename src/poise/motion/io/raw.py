@@ -19,7 +19,7 @@ from poise.motion.io.guess import (
     stated_unit,
     teleports,
 )
-from poise.motion.io.text import MAX_JOINTS, listed
+from poise.motion.io.text import MAX_JOINTS
 from poise.motion.skeleton import Channel, Skeleton, Source
 from poise.spatial import forward_kinematics, normalize, unwrap_quats
 
@@ -227,8 +227,3 @@ def _rest(raw: RawMotion) -> np.ndarray:
         if parent >= 0:
             out[j] = out[parent] + raw.offsets[j]
     return out
-
-
-def zero_length_note(names: list[str]) -> str:
-    """The sentence about joints that lie on their parents."""
-    return f"Bones of no length lead to {listed(names)}"
