@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-#: Bare lower-case names by the part they mean, best first; a share below 1 behind a colon says that other
-#: programs mean another part by the same word.
+#: Bare lower-case names by the part they mean, best first; a share below 1, behind a colon, says that
+#: other programs mean another part by the same word.
 _NAMED = {
     "hips": "hips pelvis hip root:0.6 torso:0.3",
     "spine": (
@@ -45,63 +45,13 @@ FINGERS = {
 #: 3ds Max Biped counts its fingers from the thumb: Finger0, Finger01, Finger02, Finger1, ...
 _BIPED_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 #: Words of joints that carry no part of the body: tips, twist bones, control rigs, faces, clothes.
-_HELPERS = frozenset(
-    [
-        "end",
-        "nub",
-        "tip",
-        "top",
-        "site",
-        "effector",
-        "rigmesh",
-        "mesh",
-        "twist",
-        "roll",
-        "ik",
-        "fk",
-        "pole",
-        "target",
-        "ctrl",
-        "control",
-        "helper",
-        "sec",
-        "adj",
-        "eye",
-        "jaw",
-        "hair",
-        "skirt",
-        "breast",
-        "bust",
-        "tongue",
-        "brow",
-        "eyebrow",
-        "lip",
-        "cheek",
-        "ear",
-        "nose",
-        "weapon",
-        "gun",
-        "prop",
-        "attach",
-        "socket",
-        "cloth",
-        "tail",
-        "hat",
-        "holster",
-        "corrective",
-        "correctiveroot",
-        "mch",
-        "org",
-        "interaction",
-        "center",
-        "hipjoint",
-        "buttock",
-        "lid",
-        "eyelid",
-        "face",
-        "teeth",
-    ]
+_HELPER_WORDS = (
+    "end nub tip top site effector rigmesh mesh twist roll ik fk pole target ctrl control helper sec "
+    "adj eye jaw hair skirt breast bust tongue brow eyebrow lip cheek ear nose weapon gun prop attach "
+    "socket cloth tail hat holster corrective correctiveroot mch org interaction center hipjoint "
+    "buttock lid eyelid face teeth"
 )
+_HELPERS = frozenset(_HELPER_WORDS.split())
 #: Words that say nothing about the part.
 _NOISE = frozenset(
     ("j", "bip", "biped", "def", "c", "valve", "valvebiped", "jnt", "bone", "b", "skel", "avg", "smplhf")
