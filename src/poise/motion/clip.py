@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.skeleton import Skeleton
-from poise.spatial import forward_kinematics
+from poise.motion.skeleton import Skeleton, posed
 
 MIN_FPS, MAX_FPS = 0.1, 2000.0
 """Frames per second that motion can have; others are damage, and ask for endless frames."""
@@ -109,10 +108,7 @@ class Clip:
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """World joint positions `(T, J, 3)` m and rotations `(T, J, 4)` wxyz."""
-        pos, quat = forward_kinematics(
-            self.skeleton.parents, torch.tensor(self.skeleton.offsets), *self.tensors()
-        )
-        return pos.numpy(), quat.numpy()
+        return posed(self.skeleton.parents, self.skeleton.offsets, self.root_pos, self.rot)
 
     def positions(self) -> np.ndarray:
         """World joint positions `(T, J, 3)` m."""

@@ -8,18 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from poise.errors import PoiseError
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import guess_unit, guess_up
 from poise.motion.io.raw import ReadOptions, vectors_from_z_up
 from poise.motion.io.text import shown
-from poise.motion.skeleton import Skeleton
-from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
+from poise.motion.skeleton import Skeleton, posed
+from poise.spatial import forward_kinematics, matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
 
 RIGID_SHARE = 6e-4
 """A joint is rigid if its place stays within this share of the skeleton's size: about 1 mm on a person,
 whatever the unit."""
 _TRAVEL_SHARE = 20 * RIGID_SHARE
 _HUMAN_M = (0.3, 4.0)
+_SHEAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,27 @@ def base_of(nodes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Base:
 def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors `v (..., 3)` turned by one rotation."""
     return quat_rotate(torch.tensor(q).expand(*v.shape[:-1], 4), torch.tensor(v)).numpy()
+
+
+def turn_and_scale(
+    axes: np.ndarray, what: str, where: str, hint: str | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations `(..., 4)` wxyz and scales `(..., 3)` of matrices `(..., 3, 3)`.
+
+    what: how a sentence calls them.
+
+    Raises:
+        PoiseError: a matrix that flattens, mirrors or shears space.
+    """
+    scale = np.linalg.norm(axes, axis=-2)
+    if scale.min() < 1e-9:
+        raise PoiseError(f"its {what} flattens space", where)
+    turn = axes / scale[..., None, :]
+    if np.linalg.det(turn).min() < 0:
+        raise PoiseError(f"its {what} mirrors space, which a body cannot do", where)
+    if np.abs(np.swapaxes(turn, -1, -2) @ turn - np.eye(3)).max() > _SHEAR:
+        raise PoiseError(f"its {what} shears space", where, hint)
+    return matrix_to_quat(torch.tensor(turn)).numpy(), scale
 
 
 def rigid_bones(
@@ -168,10 +191,8 @@ def lifted(
     path: np.ndarray,
 ) -> np.ndarray:
     """The root's path with a joint's own travel added: p_root + R_parent p_joint(t)."""
-    _, quat = forward_kinematics(
-        parents, torch.tensor(offsets), torch.tensor(root_pos), torch.tensor(rot)
-    )
-    moved = quat_rotate(quat[:, parents[joint]], torch.tensor(path).expand(len(rot), 3))
+    above = torch.tensor(posed(parents, offsets, root_pos, rot)[1][:, parents[joint]])
+    moved = quat_rotate(above, torch.tensor(path).expand(len(rot), 3))
     return root_pos + moved.numpy()
 
 
@@ -226,12 +247,7 @@ def checked_unit(
     if len(bones.rot) < 2 or not np.abs(bones.offsets).max() > 0:
         return stated
     at = sampled(len(bones.rot))
-    pos = forward_kinematics(
-        parents,
-        torch.tensor(bones.offsets),
-        torch.tensor(bones.root_pos[at]),
-        torch.tensor(bones.rot[at]),
-    )[0].numpy()
+    pos, _ = posed(parents, bones.offsets, bones.root_pos[at], bones.rot[at])
     up = guess_up(names, pos, pos[0])
     if options.up_axis is None and up.value != up_axis and "uncertain" not in up.note:
         notes.append(

@@ -20,8 +20,8 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS
-from poise.motion.skeleton import Channel, Skeleton, Source
-from poise.spatial import forward_kinematics, normalize, unwrap_quats
+from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions
+from poise.spatial import normalize, unwrap_quats
 
 
 @dataclass(frozen=True)
@@ -198,10 +198,7 @@ def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
 def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple[Guess, Guess]:
     """The vertical and the metres per unit, stated or guessed, each with its evidence."""
     at = sampled(len(rot))
-    offsets = torch.tensor(raw.offsets)
-    pos = forward_kinematics(
-        raw.parents, offsets, torch.tensor(raw.root_pos[at]), torch.tensor(rot[at])
-    )[0].numpy()
+    pos, _ = posed(raw.parents, raw.offsets, raw.root_pos[at], rot[at])
     height, how = body_height(raw.names, raw.parents, raw.offsets, pos)
     if not height > 0:
         raise PoiseError("the skeleton has no height (all joints lie in one place)", raw.path)
@@ -216,14 +213,5 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
     elif raw.up_axis is not None:
         up = Guess(raw.up_axis)
     else:
-        up = guess_up(raw.names, pos, _rest(raw))
+        up = guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets))
     return up, unit
-
-
-def _rest(raw: RawMotion) -> np.ndarray:
-    """`(J, 3)` joint places with all rotations at identity, file units."""
-    out = np.zeros_like(raw.offsets)
-    for j, parent in enumerate(raw.parents):
-        if parent >= 0:
-            out[j] = out[parent] + raw.offsets[j]
-    return out
