@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -175,3 +175,9 @@ def posed(
     """World positions `(T, J, 3)` and rotations `(T, J, 4)` of arrays, see `forward_kinematics`."""
     pos, quat = forward_kinematics(parents, *(torch.tensor(x) for x in (offsets, root_pos, rot)))
     return pos.numpy(), quat.numpy()
+
+
+def triple(v: Iterable[float]) -> tuple[float, float, float]:
+    """Three numbers as plain ones."""
+    x, y, z = (float(c) for c in v)
+    return x, y, z

@@ -20,7 +20,7 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.edits import resample
-from poise.motion.skeleton import Skeleton
+from poise.motion.skeleton import Skeleton, triple
 from poise.spatial import (
     axis_heading,
     forward_kinematics,
@@ -208,8 +208,7 @@ def facing_axis(bank: FrameBank) -> tuple[float, float, float]:
     if float(axis.norm()) < 1e-6:
         axis = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
         axis = axis - (axis @ up) * up
-    x, y, z = normalize(axis).tolist()
-    return x, y, z
+    return triple(normalize(axis).tolist())
 
 
 def window_starts(first: Tensor, window: int, offset: int, strict: bool = True) -> Tensor:

@@ -20,7 +20,7 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS
-from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions
+from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
 from poise.spatial import normalize, unwrap_quats
 
 
@@ -135,7 +135,7 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
         raw.names,
         raw.parents,
         vectors_to_z_up(raw.offsets, axis) * scale,
-        tuple((j, _metres(tip, axis, scale)) for j, tip in raw.ends),
+        tuple((j, triple(vectors_to_z_up(np.array(tip), axis) * scale)) for j, tip in raw.ends),
         Source(
             format=raw.format,
             path=str(raw.path),
@@ -172,11 +172,6 @@ def _rate(raw: RawMotion) -> str:
     return next((n for n in raw.notes if "frame rate" in n), BY_FORMAT)
 
 
-def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[float, float, float]:
-    x, y, z = (vectors_to_z_up(np.array(tip), axis) * scale).tolist()
-    return x, y, z
-
-
 def _check(raw: RawMotion) -> None:
     if len(raw.names) > MAX_JOINTS:
         raise PoiseError(f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed", raw.path)
@@ -208,10 +203,7 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
         unit = Guess(raw.unit_m)
     else:
         unit = guess_unit(height, how, raw.unit_hint, raw.path)
-    if options.up_axis is not None:
-        up = Guess(options.up_axis.upper())
-    elif raw.up_axis is not None:
-        up = Guess(raw.up_axis)
-    else:
-        up = guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets))
-    return up, unit
+    stated = options.up_axis or raw.up_axis
+    if stated is not None:
+        return Guess(stated.upper()), unit
+    return guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets)), unit

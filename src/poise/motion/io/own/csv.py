@@ -13,7 +13,6 @@ from poise.motion.clip import Clip, check_rate
 from poise.motion.io.numpy.arrays import refuse_bad, require
 from poise.motion.io.own.record import (
     loads,
-    make_clip,
     make_skeleton,
     refuse_overrides,
     source_from_json,
@@ -103,7 +102,9 @@ def read_csv(path: Path, options: ReadOptions) -> Clip:
     refuse_bad(rot, "the rotation", path, skeleton.names)
     name = loads(f'{{"name":{header["name"]}}}', path, "name")["name"]
     cyclic = header["cyclic"] == "true"
-    return make_clip(skeleton, root_pos, rot, options.fps or rate, str(name), cyclic, path)
+    # What a clip refuses is told with the file, once the clip bears the file's name.
+    clip = Clip(skeleton, root_pos, rot, options.fps or rate, path.stem, cyclic)
+    return clip.replaced(name=str(name))
 
 
 def _place(path: Path, key: str) -> str:

@@ -62,7 +62,8 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     """
     _check(raw)
     check_rate(float(options.fps or raw.fps), raw.path)
-    probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, _of(raw))
+    source = Source(format=raw.format, path=str(raw.path))
+    probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, source)
     bones = _body(probe)
     notes = list(raw.notes)
     up, unit = _up(bones, options, raw), _unit(bones, options, raw)
@@ -100,10 +101,6 @@ def as_clip(points: Callable[..., RawPoints]) -> Callable[..., Clip]:
         return fit_clip(raw, FitConfig(smooth_hz=options.smooth_hz))
 
     return read
-
-
-def _of(raw: RawPoints) -> Source:
-    return Source(format=raw.format, path=str(raw.path))
 
 
 def _check(raw: RawPoints) -> None:
@@ -172,20 +169,18 @@ def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, 
     height, how = body_height(names, parents, _offsets(parents, pos), pos)
     if not height > 0:
         raise PoiseError("all keypoints lie in one place", raw.path)
-    if options.unit_m is not None:
-        return stated_unit(height, options.unit_m, raw.path)
-    if raw.unit_m is not None:
-        # A stated unit that makes a giant or a doll is a mistake of the file; the sentence tells.
-        return stated_unit(height, raw.unit_m, raw.path)
+    # A stated unit that makes a giant or a doll is a mistake, the file's too; the sentence tells.
+    stated = raw.unit_m if options.unit_m is None else options.unit_m
+    if stated is not None:
+        return stated_unit(height, stated, raw.path)
     return guess_unit(height, how, None, raw.path)
 
 
 def _up(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
     names, _, pos = bones
-    if options.up_axis is not None:
-        return Guess(options.up_axis.upper())
-    if raw.up_axis is not None:
-        return Guess(raw.up_axis)
+    stated = options.up_axis or raw.up_axis
+    if stated is not None:
+        return Guess(stated.upper())
     return guess_up(names, pos, np.median(pos - pos[:, :1], axis=0))
 
 
