@@ -112,11 +112,11 @@ def _resolve_places(file: BvhFile, rot: np.ndarray) -> _Places:
     if offsets[0].any() and any(c in POSITIONS for c in joints[0].channels or ()):
         out.notes.append("The root's OFFSET is not added to its position channels")
     offsets[0] = 0.0
-    out.travel = _travel_joint(parents, moves, tolerance)
-    path = None if out.travel is None else moves.pop(out.travel)
-    if path is not None:
-        moves_too = not _still(out.root_pos, tolerance)
-        out.notes.append(travel_note(names[0], names[int(out.travel or 0)], moves_too))
+    travel = out.travel = _travel_joint(parents, moves, tolerance)
+    path = np.zeros(0) if travel is None else moves.pop(travel)
+    if travel is not None:
+        both = not _still(out.root_pos, tolerance)
+        out.notes.append(travel_note(names[0], names[travel], both))
     loose = any(np.abs(m - np.median(m, axis=0)).max() > tolerance for m in moves.values())
     world = _from_world(parents, offsets, out.root_pos, rot, moves, tolerance) if loose else []
     if world:
@@ -125,8 +125,11 @@ def _resolve_places(file: BvhFile, rot: np.ndarray) -> _Places:
         out.notes.append(f"The position channels of {these} hold places in the world")
     for j, places in moves.items():
         _keep_rigid(out, j, names[j], places, tolerance)
-    if out.travel is not None and path is not None:
-        _lift_travel(out, parents, rot, path)
+    if travel is not None:
+        out.extra.append((f"offset:{travel}", _text(offsets[travel])))
+        out.extra.append(("root_position", _text(out.root_pos[0])))
+        offsets[travel] = 0.0
+        out.root_pos = lifted(parents, offsets, out.root_pos, rot, travel, path)
     return out
 
 
@@ -167,17 +170,6 @@ def _travel_joint(parents: Sequence[int], moves: dict[int, np.ndarray], toleranc
         joint = children[0]
         if joint in moves and not _still(moves[joint], tolerance):
             return joint
-
-
-def _lift_travel(out: _Places, parents: Sequence[int], rot: np.ndarray, path: np.ndarray) -> None:
-    """Moves the travel of joint `out.travel` into the root's path; its own offset becomes zero."""
-    travel = int(out.travel or 0)
-    out.extra += [
-        (f"offset:{travel}", _text(out.offsets[travel])),
-        ("root_position", _text(out.root_pos[0])),
-    ]
-    out.offsets[travel] = 0.0
-    out.root_pos = lifted(parents, out.offsets, out.root_pos, rot, travel, path)
 
 
 def _from_world(
