@@ -10,7 +10,7 @@ out as published; only the heading's local axis and the contact thresholds are c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -92,11 +92,14 @@ class FrameBank:
         first = self.first.tolist()
         rows = torch.cat([torch.arange(first[c], first[c + 1]) for c in kept])
         sizes = torch.tensor([0] + [first[c + 1] - first[c] for c in kept])
-        names = tuple(self.clips[c] for c in kept)
-        return FrameBank(
-            self.names, self.parents, self.fps, self.root[rows], self.rot[rows], self.offsets[kept],
-            sizes.cumsum(0), names, self.feet, self.facing, self.ends,
-        )  # fmt: skip
+        return replace(
+            self,
+            root=self.root[rows],
+            rot=self.rot[rows],
+            offsets=self.offsets[kept],
+            first=sizes.cumsum(0),
+            clips=tuple(self.clips[c] for c in kept),
+        )
 
 
 def pack_frames(
@@ -134,9 +137,7 @@ def pack_frames(
         facing or (0.0, 0.0, 0.0),
         one.ends,
     )
-    if facing is None:
-        object.__setattr__(bank, "facing", facing_axis(bank))
-    return bank
+    return bank if facing else replace(bank, facing=facing_axis(bank))
 
 
 def at_rate(clip: Clip, fps: float) -> Clip:
