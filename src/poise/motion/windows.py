@@ -36,7 +36,7 @@ CONTACT_LIMITS = {"harvey": 2e-6, "two-stage": 2e-3}
 #: The heading of LAFAN1: the root's local Y axis of the file, which is local Z in Poise's axes.
 LAFAN1_FACING = (0.0, 0.0, 1.0)
 _SAME_RATE = 0.01
-#: Frames whose places are computed at once, and frames that tell where a body faces.
+#: How many frames are computed at once, and how many tell where a body faces.
 _CHUNK, _MOST_FRAMES = 8192, 4000
 
 
