@@ -34,8 +34,8 @@ from poise.motion.noise import (
     scaled,
     side_pairs,
 )
-from poise.motion.noise.kinds import smooth_path, spell_mask, wandering_path
-from poise.motion.noise.missing import last_seen
+from poise.motion.noise.base import smooth_path, spell_mask, wandering_path
+from poise.motion.noise.kinds import last_seen
 from poise.motion.points.clean import smooth
 from poise.spatial import quat_angle, quat_conj, quat_mul
 from toy_human import human, swing

@@ -257,9 +257,9 @@ def test_results_of_the_motion_diffusion_model(data_dir: Path) -> None:
     data = {"motion": np.zeros((2, 22, 3, 9)), "lengths": np.array([9, 12])}
     assert mdm_points(data, path).positions.shape == (9, 22, 3)
     with pytest.raises(PoiseError, match="states 12 of 9 frames"):
-        mdm_points(data, path, 1)
+        mdm_points(data, path, ReadOptions(take="1"))
     with pytest.raises(PoiseError, match="none with index 2"):
-        mdm_points(data, path, 2)
+        mdm_points(data, path, ReadOptions(take="2"))
 
 
 def write_c3d(path: Path, positions: np.ndarray, names: tuple[str, ...], unit: str = "mm") -> None:

@@ -164,6 +164,7 @@ def test_a_stage_of_another_tool(pxr: Any, tmp_path: Path) -> None:
             "joint 'Hips': its transform is no usable number",
         ),
         (STAGE.replace('"Hips/LeftFoot"]', '"LeftFoot"]'), "its joints are not one tree"),
+        (STAGE.replace("restTransforms", "otherTransforms"), "do not give every joint a place"),
     ],
 )
 def test_refusals(pxr: Any, tmp_path: Path, text: str, message: str) -> None:

@@ -20,11 +20,10 @@ from poise.motion.windows import (
     step_contacts,
     still_root,
     train_statistics,
-    tree_positions,
     window_starts,
     without_still_root,
 )
-from poise.spatial import quat_rotate
+from poise.spatial import forward_kinematics, quat_rotate
 from toy_human import human, swing
 
 
@@ -72,8 +71,8 @@ def test_windows_are_centred_and_face_along_x_at_the_tenth_frame() -> None:
     assert torch.allclose(ahead[:, 1], torch.zeros(2, dtype=torch.float64), atol=1e-12)
     assert bool((ahead[:, 0] > 0.9).all())
     # Turning moves nothing inside the window: all distances stay.
-    before = tree_positions(bank.parents, offsets, flat, rot)
-    after = tree_positions(bank.parents, offsets, turned, quats)
+    before = forward_kinematics(bank.parents, offsets, flat, rot)[0]
+    after = forward_kinematics(bank.parents, offsets, turned, quats)[0]
     apart = [(x[:, :, 3] - x[:, 9:10, 7]).norm(dim=-1) for x in (before, after)]
     assert torch.allclose(*apart, atol=1e-12)
     # The twice-turned window is the once-turned one: the heading is +X already.
@@ -85,7 +84,7 @@ def test_statistics_are_those_of_all_frames_of_all_windows() -> None:
     mean, std = train_statistics(bank, chunk=2)
     root, rot, offsets = cut(bank, window_starts(bank.first, 50, 20), 50)
     root, rot = faced(centred(root), rot, bank.facing)
-    pos = tree_positions(bank.parents, offsets, root, rot).flatten(0, 1)
+    pos = forward_kinematics(bank.parents, offsets, root, rot)[0].flatten(0, 1)
     assert torch.allclose(mean, pos.mean(0), atol=1e-10)
     assert torch.allclose(std, pos.std(0, correction=0), atol=1e-7)
     # The root is centred on the ground; the published mean of the hips is (0, height, 0) for that.

@@ -7,8 +7,15 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion import Skeleton
-from poise.motion.windows import foot_joints, tree_positions
-from poise.spatial import axis_angle_to_quat, normalize, quat_angle, quat_conj, quat_mul
+from poise.motion.windows import foot_joints
+from poise.spatial import (
+    axis_angle_to_quat,
+    forward_kinematics,
+    normalize,
+    quat_angle,
+    quat_conj,
+    quat_mul,
+)
 from poise.synth.footlock import lock_feet
 from poise.synth.gaps import check_keyframes, split_gaps
 from poise.synth.seams import fade, meet, sampled
@@ -126,7 +133,7 @@ def test_feet_stay_where_they_stand_and_nothing_else_moves() -> None:
     free = torch.ones(31, dtype=torch.bool)
     free[[0, 30]] = False
     held = lock_feet(s, feet, root, rot, contact, free, 30.0)
-    before, after = (tree_positions(s.parents, offsets, root, r) for r in (rot, held))
+    before, after = (forward_kinematics(s.parents, offsets, root, r)[0] for r in (rot, held))
     left = feet[0]
     assert float(torch.diff(before[5:20, left], dim=0).norm(dim=-1).max()) > 2e-3
     assert float(torch.diff(after[6:19, left], dim=0).norm(dim=-1).max()) < 1e-4
@@ -145,5 +152,5 @@ def test_a_spell_that_touches_a_keyframe_stands_where_the_keyframe_does() -> Non
     free = torch.ones(31, dtype=torch.bool)
     free[0] = False
     held = lock_feet(s, feet, root, rot, contact, free, 30.0)
-    pos = tree_positions(s.parents, offsets, root, held)
+    pos = forward_kinematics(s.parents, offsets, root, held)[0]
     assert float((pos[:10, feet[0]] - pos[0, feet[0]]).norm(dim=-1).max()) < 2e-3

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from poise.motion.windows import foot_joints, tree_positions
+from poise.motion.windows import foot_joints
+from poise.spatial import forward_kinematics
 from poise.synth.footlock import lock_feet
 from poise.synth.steps import CLEAR_M, LEAST_M, missing_steps, rises
 from toy_human import swing, turn
@@ -92,7 +93,7 @@ def test_kept_feet_that_are_apart_step_instead_of_sliding() -> None:
     free = torch.ones(31, dtype=torch.bool)
     free[[0, 30]] = False
     held = lock_feet(skeleton, feet, root, rot, torch.ones(31, 4, dtype=torch.bool), free, FPS)
-    before, after = (tree_positions(skeleton.parents, offsets, root, r) for r in (rot, held))
+    before, after = (forward_kinematics(skeleton.parents, offsets, root, r)[0] for r in (rot, held))
     assert torch.equal(held[0], rot[0]) and torch.equal(held[30], rot[30])
     low, moving = [], []
     for toe in (feet[1], feet[3]):

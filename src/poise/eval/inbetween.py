@@ -20,10 +20,10 @@ from poise.motion.windows import (
     faced,
     step_contacts,
     train_statistics,
-    tree_world,
     window_starts,
 )
 from poise.nets.transition import Filled, Known, TransitionNet
+from poise.spatial import forward_kinematics
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def test_set(held_out: FrameBank, statistics: Tensor, protocol: Protocol) -> Tes
         raise PoiseError(f"no clip of {protocol.name} has more than {protocol.test_window} frames")
     root, rot, offsets = cut(held_out, starts, protocol.test_window)
     root, rot = faced(centred(root), rot, held_out.facing, protocol.past - 1)
-    pos, quat = tree_world(held_out.parents, offsets, root, rot)
+    pos, quat = forward_kinematics(held_out.parents, offsets, root, rot)
     return TestSet(
         protocol, root, rot, pos, quat, offsets[:, 0], statistics, held_out.feet, held_out.parents,
         held_out.fps,
@@ -145,7 +145,7 @@ def deviation(train: FrameBank, protocol: Protocol) -> Tensor:
 def score(test: TestSet, filled: Filled, length: int, seconds: float = 0.0) -> Row:
     """The figures of transitions of all windows of a test set."""
     pos, quat = test.truth(length)
-    mine, turned = tree_world(
+    mine, turned = forward_kinematics(
         test.parents, test.offsets[:, None], filled.root.to(pos), filled.rot.to(pos)
     )
     return Row(

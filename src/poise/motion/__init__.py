@@ -1,10 +1,9 @@
 """Motion data: skeletons, frozen clips, libraries of clips, and the files they come from."""
 
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, ClipLibrary
 from poise.motion.edits import ground_shift, resample, shifted, trim
 from poise.motion.info import describe, standing_height
 from poise.motion.io import read_clip, write_bvh, write_clip
-from poise.motion.library import ClipLibrary
 from poise.motion.roles import Role, Roles, find_roles
 from poise.motion.skeleton import Channel, Skeleton, Source
 

@@ -1,16 +1,48 @@
-"""A motion: one skeleton, one root path, one local rotation per joint and frame."""
+"""A motion: one skeleton, one root path, one local rotation per joint and frame; and several of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.limits import check_rate
-from poise.motion.skeleton import Skeleton
-from poise.spatial import forward_kinematics
+from poise.motion.skeleton import Skeleton, posed
+
+MIN_FPS, MAX_FPS = 0.1, 2000.0
+"""Frames per second that motion can have; others are damage, and ask for endless frames."""
+MAX_POSES = 20_000_000
+"""Frames times joints of the longest motion that is read (22 joints at 120 Hz: two hours)."""
+
+
+def check_rate(fps: float, where: str | Path | None = None) -> None:
+    """Refuses a frame rate that no motion has, NaN and 0 too."""
+    if not MIN_FPS <= fps <= MAX_FPS:
+        raise PoiseError(
+            f"the frame rate must be from {MIN_FPS:g} to {MAX_FPS:g} per second, got {fps:.6g}",
+            where,
+            "State the right one with --fps F" if isinstance(where, Path) else None,
+        )
+
+
+def check_frames(frames: int, where: str | Path | None = None) -> None:
+    """Refuses a clip of less than two frames, which shows no motion."""
+    if frames < 2:
+        plural = "" if frames == 1 else "s"
+        raise PoiseError(f"the clip has {frames} frame{plural}; motion needs at least 2", where)
+
+
+def check_poses(frames: int, joints: int, where: str | Path | None = None) -> None:
+    """Refuses motion that is too long to be held in memory several times over."""
+    if frames * joints > MAX_POSES:
+        raise PoiseError(
+            f"it has {frames} frames of {joints} joints, more than the {MAX_POSES} poses that are read",
+            where,
+            "Cut it shorter, or state a lower rate with --fps F",
+        )
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:
@@ -46,11 +78,7 @@ class Clip:
                 f"{self.root_pos.shape} and {self.rot.shape}",
                 self.name,
             )
-        if frames < 2:
-            raise PoiseError(
-                f"the clip has {frames} frame{'' if frames == 1 else 's'}; motion needs at least 2",
-                self.name,
-            )
+        check_frames(frames, self.name)
         check_rate(self.fps, self.name)
         if not np.isfinite(self.root_pos).all():
             frame = int(np.argwhere(~np.isfinite(self.root_pos))[0][0])
@@ -80,10 +108,7 @@ class Clip:
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """World joint positions `(T, J, 3)` m and rotations `(T, J, 4)` wxyz."""
-        pos, quat = forward_kinematics(
-            self.skeleton.parents, torch.tensor(self.skeleton.offsets), *self.tensors()
-        )
-        return pos.numpy(), quat.numpy()
+        return posed(self.skeleton.parents, self.skeleton.offsets, self.root_pos, self.rot)
 
     def positions(self) -> np.ndarray:
         """World joint positions `(T, J, 3)` m."""
@@ -92,3 +117,62 @@ class Clip:
     def replaced(self, **changes: object) -> Clip:
         """A copy with fields replaced."""
         return replace(self, **changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class ClipLibrary:
+    """Clips of one hierarchy, sampled by time.
+
+    clips: at least one clip; all share joint names and parents (bone lengths may differ).
+    weights: `(C,)` sampling weights; by default each clip counts by its duration.
+    """
+
+    clips: tuple[Clip, ...]
+    weights: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.clips:
+            raise PoiseError("a library needs at least one clip")
+        first = self.clips[0].skeleton
+        for clip in self.clips[1:]:
+            if clip.skeleton.names != first.names or clip.skeleton.parents != first.parents:
+                raise PoiseError(
+                    f"its joints differ from those of '{self.clips[0].name}'",
+                    clip.name,
+                    "Give one library clips of one hierarchy",
+                )
+        if not self.weights:
+            object.__setattr__(self, "weights", tuple(c.seconds for c in self.clips))
+        if len(self.weights) != len(self.clips) or min(self.weights) < 0 or sum(self.weights) <= 0:
+            raise PoiseError(
+                f"a library of {len(self.clips)} clips needs as many weights, none negative and not "
+                f"all zero, got {self.weights}"
+            )
+
+    @classmethod
+    def of(cls, clips: Clip | Sequence[Clip]) -> ClipLibrary:
+        """A library from one clip or several."""
+        return cls((clips,) if isinstance(clips, Clip) else tuple(clips))
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __iter__(self) -> Iterator[Clip]:
+        return iter(self.clips)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The clips' names in order."""
+        return tuple(c.name for c in self.clips)
+
+    @property
+    def seconds(self) -> float:
+        """Total duration in seconds."""
+        return sum(c.seconds for c in self.clips)
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """`count` draws of (clip index, time in s), clips by weight, times uniform in the clip."""
+        p = np.asarray(self.weights) / sum(self.weights)
+        which = rng.choice(len(self.clips), size=count, p=p)
+        lengths = np.array([c.seconds for c in self.clips])
+        return which, rng.uniform(0.0, 1.0, count) * lengths[which]

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
-from poise.motion.limits import check_rate
+from poise.motion.clip import Clip, check_rate
 from poise.spatial import slerp
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from poise.motion.clip import Clip
+from poise.motion.skeleton import line_to_root
 
 _NOT_JOINTS = ("end", "nub", "top", "tip", "mesh", "index")
 # Ankle to head joint along the bones, and ankle to neck, as shares of a person's height.
@@ -53,17 +54,9 @@ def body_height(
 
 def _way(parents: Sequence[int], lengths: np.ndarray, a: int, b: int) -> float:
     """Length of the bones on the way between two joints."""
-    up_a, up_b = _ancestors(parents, a), _ancestors(parents, b)
+    up_a, up_b = line_to_root(parents, a), line_to_root(parents, b)
     shared = set(up_a) & set(up_b)
     return float(sum(lengths[j] for j in (*up_a, *up_b) if j not in shared))
-
-
-def _ancestors(parents: Sequence[int], joint: int) -> list[int]:
-    out = []
-    while joint >= 0:
-        out.append(joint)
-        joint = parents[joint]
-    return out
 
 
 def sampled(frames: int, count: int = 60) -> np.ndarray:

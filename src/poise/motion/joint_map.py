@@ -77,7 +77,7 @@ def map_joints(source: Skeleton, target: Skeleton, stated: Mapping[str, str] | N
         found.require()
     direct = dict(_direct(*roles))
     direct.update({b: a for a, b in extra})
-    if _same_tree(source, target) and not stated:
+    if (source.names, source.parents) == (target.names, target.parents) and not stated:
         direct = {j: j for j in range(len(target))}
     _check_order(source, target, direct)
     rows = [_row(j, direct, *roles) for j in range(len(target))]
@@ -85,21 +85,17 @@ def map_joints(source: Skeleton, target: Skeleton, stated: Mapping[str, str] | N
     return JointMap(*roles, kept, tuple((a, b) for b, a in direct.items()))
 
 
-def _same_tree(a: Skeleton, b: Skeleton) -> bool:
-    return a.names == b.names and a.parents == b.parents
-
-
 def _stated(
     source: Skeleton, target: Skeleton, stated: Mapping[str, str]
 ) -> tuple[dict[str, str], dict[str, str], list[tuple[int, int]]]:
     """Roles that the user's pairs fix in both skeletons, and pairs that bear no role."""
-    guessed_source, guessed_target = (
-        (find_roles(s) for s in (source, target)) if stated else (None, None)
-    )
     in_source: dict[str, str] = {}
     in_target: dict[str, str] = {}
     extra: list[tuple[int, int]] = []
     ends: dict[str, str] = {}
+    if not stated:
+        return in_source, in_target, extra
+    guessed_source, guessed_target = find_roles(source), find_roles(target)
     for a, b in stated.items():
         if b in ends and b in target.names:
             raise PoiseError(f"both '{ends[b]}' and '{a}' were mapped to '{b}'; one joint moves each")
@@ -113,7 +109,6 @@ def _stated(
             in_source[a] = b
             continue
         _known(target, b, "target")
-        assert guessed_source is not None and guessed_target is not None
         pair = source.index(a), target.index(b)
         role = guessed_source.role(pair[0]) or guessed_target.role(pair[1])
         if role is None or split_role(role)[1] in SHARED:

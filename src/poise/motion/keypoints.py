@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.limits import check_rate
+from poise.motion.clip import check_rate
 from poise.motion.skeleton import Source
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.noise.kinds import side_pairs
+from poise.motion.noise.base import side_pairs
 from poise.motion.windows import FrameBank
 
 #: A rest pose is not upright if its sides differ in height by more than this share of their distance.

@@ -6,45 +6,29 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-#: Bare lower-case names by the part they mean, best first; a share below 1 says that other programs mean
-#: another part by the same word.
-_WORDS: dict[str, dict[str, float]] = {
-    "hips": {"hips": 1, "pelvis": 1, "hip": 1, "root": 0.6, "torso": 0.3},
-    "spine": {
-        **{"spine": 1, "chest": 1, "abdomen": 1, "thorax": 1, "upperchest": 1, "lowerback": 1},
-        **{"upperback": 1, "torso": 0.9, "back": 1, "waist": 1, "midspine": 1, "spineupper": 1},
-        **{"spinelower": 1, "abdomenlower": 1, "abdomenupper": 1, "chestlower": 1, "chestupper": 1},
-        **{"belly": 1, "sternum": 0.8, "ribs": 0.8, "lumbar": 1, "spinemid": 1, "spinemiddle": 1},
-    },
-    "neck": {"neck": 1, "lowerneck": 1, "upperneck": 1, "neckbase": 1, "necklower": 1, "neckupper": 1},
-    "head": {"head": 1, "skull": 1},
-    "clavicle": {
-        "clavicle": 1,
-        "collar": 1,
-        "collarbone": 1,
-        "clav": 1,
-        "scapula": 0.9,
-        "shoulder": 0.8,
-    },
-    "upper_arm": {
-        **{"upperarm": 1, "arm": 1, "humerus": 1, "shldr": 1, "uparm": 1, "shoulder": 0.8, "bicep": 1},
-        **{"shldrbend": 1, "armupper": 1},
-    },
-    "forearm": {
-        **{"forearm": 1, "lowerarm": 1, "elbow": 1, "radius": 1, "ulna": 1, "lowarm": 1, "loarm": 1},
-        **{"forearmbend": 1, "armlower": 1},
-    },
-    "hand": {"hand": 1, "wrist": 1, "palm": 0.4},
-    "thigh": {
-        **{"thigh": 1, "upleg": 1, "upperleg": 1, "femur": 1, "hip": 1, "thighbend": 1, "legupper": 1},
-        **{"leg": 0.4},
-    },
-    "shin": {
-        **{"shin": 1, "leg": 1, "lowerleg": 1, "calf": 1, "tibia": 1, "knee": 1, "lowleg": 1},
-        **{"loleg": 1, "leglower": 1, "crus": 1},
-    },
-    "foot": {"foot": 1, "ankle": 1, "talus": 0.9},
-    "toes": {"toe": 1, "toes": 1, "toebase": 1, "ball": 1, "football": 1, "foot": 0.3, "bigtoe": 0.9},
+#: Bare lower-case names by the part they mean, best first; a share below 1, behind a colon, says that
+#: other programs mean another part by the same word.
+_NAMED = {
+    "hips": "hips pelvis hip root:0.6 torso:0.3",
+    "spine": (
+        "spine chest abdomen thorax upperchest lowerback upperback torso:0.9 back waist midspine "
+        "spineupper spinelower abdomenlower abdomenupper chestlower chestupper belly sternum:0.8 "
+        "ribs:0.8 lumbar spinemid spinemiddle"
+    ),
+    "neck": "neck lowerneck upperneck neckbase necklower neckupper",
+    "head": "head skull",
+    "clavicle": "clavicle collar collarbone clav scapula:0.9 shoulder:0.8",
+    "upper_arm": "upperarm arm humerus shldr uparm shoulder:0.8 bicep shldrbend armupper",
+    "forearm": "forearm lowerarm elbow radius ulna lowarm loarm forearmbend armlower",
+    "hand": "hand wrist palm:0.4",
+    "thigh": "thigh upleg upperleg femur hip thighbend legupper leg:0.4",
+    "shin": "shin leg lowerleg calf tibia knee lowleg loleg leglower crus",
+    "foot": "foot ankle talus:0.9",
+    "toes": "toe toes toebase ball football foot:0.3 bigtoe:0.9",
+}
+_WORDS = {
+    kind: {word: float(share or 1) for word, _, share in (w.partition(":") for w in words.split())}
+    for kind, words in _NAMED.items()
 }
 #: Words of fingers; a name that holds one is of that finger.
 FINGERS = {
@@ -61,39 +45,13 @@ FINGERS = {
 #: 3ds Max Biped counts its fingers from the thumb: Finger0, Finger01, Finger02, Finger1, ...
 _BIPED_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 #: Words of joints that carry no part of the body: tips, twist bones, control rigs, faces, clothes.
-_HELPERS = frozenset(
-    (
-        *(
-            "end",
-            "nub",
-            "tip",
-            "top",
-            "site",
-            "effector",
-            "rigmesh",
-            "mesh",
-            "twist",
-            "roll",
-            "ik",
-            "fk",
-        ),
-        *("pole", "target", "ctrl", "control", "helper", "sec", "adj", "eye", "jaw", "hair", "skirt"),
-        *("breast", "bust", "tongue", "brow", "eyebrow", "lip", "cheek", "ear", "nose", "weapon", "gun"),
-        *("prop", "attach", "socket", "cloth", "tail", "hat", "holster", "corrective", "correctiveroot"),
-        *(
-            "mch",
-            "org",
-            "interaction",
-            "center",
-            "hipjoint",
-            "buttock",
-            "lid",
-            "eyelid",
-            "face",
-            "teeth",
-        ),
-    )
+_HELPER_WORDS = (
+    "end nub tip top site effector rigmesh mesh twist roll ik fk pole target ctrl control helper sec "
+    "adj eye jaw hair skirt breast bust tongue brow eyebrow lip cheek ear nose weapon gun prop attach "
+    "socket cloth tail hat holster corrective correctiveroot mch org interaction center hipjoint "
+    "buttock lid eyelid face teeth"
 )
+_HELPERS = frozenset(_HELPER_WORDS.split())
 #: Words that say nothing about the part.
 _NOISE = frozenset(
     ("j", "bip", "biped", "def", "c", "valve", "valvebiped", "jnt", "bone", "b", "skel", "avg", "smplhf")

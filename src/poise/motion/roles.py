@@ -10,7 +10,7 @@ import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.role_words import FINGERS, convention_of, name_words
-from poise.motion.skeleton import Skeleton
+from poise.motion.skeleton import Skeleton, line_to_root
 
 SIDES = ("left", "right")
 LEG = ("thigh", "shin", "foot", "toes")
@@ -209,11 +209,7 @@ class _Finder:
 
     def _line(self, joint: int) -> list[int]:
         """Joints from the root down to `joint`."""
-        out: list[int] = []
-        while joint >= 0:
-            out.insert(0, joint)
-            joint = self.skeleton.parents[joint]
-        return out
+        return [*line_to_root(self.skeleton.parents, joint)[::-1]]
 
     def _common(self, a: int, b: int) -> int:
         """The lowest joint that carries both (or is one of them)."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from poise.errors import PoiseError, did_you_mean
+from poise.spatial import forward_kinematics
 
 #: Bones that differ by less (m) are the same; files round their numbers.
 SAME_M = 1e-4
@@ -125,12 +128,12 @@ class Skeleton:
         except ValueError:
             raise PoiseError(f"there is no joint '{name}'. {did_you_mean(name, self.names)}") from None
 
-    def same_bones(self, other: Skeleton, atol: float = SAME_M) -> bool:
-        """Whether the other skeleton has the same joints and bones, to within `atol` m."""
+    def same_bones(self, other: Skeleton) -> bool:
+        """Whether the other skeleton has the same joints and bones, to within `SAME_M`."""
         if (self.names, self.parents) != (other.names, other.parents):
             return False
         # The root's offset is no bone.
-        return bool(np.allclose(self.offsets[1:], other.offsets[1:], rtol=0.0, atol=atol))
+        return bool(np.allclose(self.offsets[1:], other.offsets[1:], rtol=0.0, atol=SAME_M))
 
     def children(self, joint: int) -> tuple[int, ...]:
         """Indices of the joints with the parent `joint`."""
@@ -138,21 +141,43 @@ class Skeleton:
 
     def ancestors(self, joint: int) -> tuple[int, ...]:
         """Indices of the joints above `joint`, its parent first."""
-        out: list[int] = []
-        joint = self.parents[joint]
-        while joint >= 0:
-            out.append(joint)
-            joint = self.parents[joint]
-        return tuple(out)
+        return line_to_root(self.parents, joint)[1:]
 
     def rest_positions(self) -> np.ndarray:
         """`(J, 3)` m, joint positions with every rotation at identity and the root at the origin."""
-        out = np.zeros((len(self), 3))
-        for j, parent in enumerate(self.parents):
-            if parent >= 0:
-                out[j] = out[parent] + self.offsets[j]
-        return out
+        return rest_positions(self.parents, self.offsets)
 
     def with_source(self, **changes: object) -> Skeleton:
         """The same skeleton with fields of its `Source` replaced."""
         return replace(self, source=replace(self.source, **changes))  # type: ignore[arg-type]
+
+
+def line_to_root(parents: Sequence[int], joint: int) -> tuple[int, ...]:
+    """The joint and those above it, up to the root."""
+    out = [joint]
+    while parents[out[-1]] >= 0:
+        out.append(parents[out[-1]])
+    return tuple(out)
+
+
+def rest_positions(parents: Sequence[int], offsets: np.ndarray) -> np.ndarray:
+    """`(J, 3)` joint positions with every rotation at identity and the root at the origin."""
+    out = np.zeros((len(parents), 3))
+    for j, parent in enumerate(parents):
+        if parent >= 0:
+            out[j] = out[parent] + offsets[j]
+    return out
+
+
+def posed(
+    parents: Sequence[int], offsets: np.ndarray, root_pos: np.ndarray, rot: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """World positions `(T, J, 3)` and rotations `(T, J, 4)` of arrays, see `forward_kinematics`."""
+    pos, quat = forward_kinematics(parents, *(torch.tensor(x) for x in (offsets, root_pos, rot)))
+    return pos.numpy(), quat.numpy()
+
+
+def triple(v: Iterable[float]) -> tuple[float, float, float]:
+    """Three numbers as plain ones."""
+    x, y, z = (float(c) for c in v)
+    return x, y, z

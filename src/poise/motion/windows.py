@@ -10,7 +10,7 @@ out as published; only the heading's local axis and the contact thresholds are c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.edits import resample
-from poise.motion.skeleton import Skeleton
+from poise.motion.skeleton import Skeleton, triple
 from poise.spatial import (
     axis_heading,
     forward_kinematics,
@@ -36,6 +36,8 @@ CONTACT_LIMITS = {"harvey": 2e-6, "two-stage": 2e-3}
 #: The heading of LAFAN1: the root's local Y axis of the file, which is local Z in Poise's axes.
 LAFAN1_FACING = (0.0, 0.0, 1.0)
 _SAME_RATE = 0.01
+#: How many frames are computed at once, and how many tell where a body faces.
+_CHUNK, _MOST_FRAMES = 8192, 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +72,12 @@ class FrameBank:
         """Index of the clip to which each frame index belongs."""
         return torch.searchsorted(self.first, frame, right=True) - 1
 
-    def positions(self, chunk: int = 8192) -> Tensor:
+    def positions(self) -> Tensor:
         """Global joint positions `(F, J, 3)` m."""
         parts = []
-        for rows in torch.arange(self.frames).split(chunk):
+        for rows in torch.arange(self.frames).split(_CHUNK):
             offsets = self.offsets[self.clip_of(rows)]
-            parts.append(tree_positions(self.parents, offsets, self.root[rows], self.rot[rows]))
+            parts.append(forward_kinematics(self.parents, offsets, self.root[rows], self.rot[rows])[0])
         return torch.cat(parts)
 
     def only(self, wanted: Callable[[str], bool]) -> FrameBank:
@@ -90,36 +92,24 @@ class FrameBank:
         first = self.first.tolist()
         rows = torch.cat([torch.arange(first[c], first[c + 1]) for c in kept])
         sizes = torch.tensor([0] + [first[c + 1] - first[c] for c in kept])
-        names = tuple(self.clips[c] for c in kept)
-        return FrameBank(
-            self.names, self.parents, self.fps, self.root[rows], self.rot[rows], self.offsets[kept],
-            sizes.cumsum(0), names, self.feet, self.facing, self.ends,
-        )  # fmt: skip
-
-
-def tree_positions(parents: Sequence[int], offsets: Tensor, root: Tensor, rot: Tensor) -> Tensor:
-    """Global positions `(..., J, 3)`; offsets `(J, 3)` or one set per leading index `(..., J, 3)`."""
-    return tree_world(parents, offsets, root, rot)[0]
-
-
-def tree_world(
-    parents: Sequence[int], offsets: Tensor, root: Tensor, rot: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Global positions `(..., J, 3)` and rotations `(..., J, 4)`; offsets as in `tree_positions`."""
-    moved = offsets.movedim(-2, 0)
-    return forward_kinematics(parents, moved, root, rot)  # type: ignore[arg-type]
+        return replace(
+            self,
+            root=self.root[rows],
+            rot=self.rot[rows],
+            offsets=self.offsets[kept],
+            first=sizes.cumsum(0),
+            clips=tuple(self.clips[c] for c in kept),
+        )
 
 
 def pack_frames(
     clips: Sequence[Clip],
     fps: float = 30.0,
     facing: tuple[float, float, float] | None = None,
-    feet: Sequence[str] | None = None,
 ) -> FrameBank:
     """Clips of one hierarchy as one bank at `fps`; a root that never turns gives way to its child.
 
     facing: the root's local heading axis; by default the one along which the feet point on average.
-    feet: names of ankles and toes; by default joints with names that say so.
 
     Raises:
         PoiseError: no clips, clips of different hierarchies, or no feet that could be found by name.
@@ -134,7 +124,6 @@ def pack_frames(
             raise PoiseError("the clips do not share a skeleton", clip.name, hint)
     rot = [unwrap_quats(normalize(torch.tensor(c.rot))) for c in clips]
     sizes = torch.tensor([0] + [c.frames for c in clips])
-    joints = foot_joints(one) if feet is None else tuple(one.index(name) for name in feet)
     bank = FrameBank(
         one.names,
         one.parents,
@@ -144,13 +133,11 @@ def pack_frames(
         torch.stack([torch.tensor(c.skeleton.offsets) for c in clips]),
         sizes.cumsum(0),
         tuple(c.name for c in clips),
-        joints,
+        foot_joints(one),
         facing or (0.0, 0.0, 0.0),
         one.ends,
     )
-    if facing is None:
-        object.__setattr__(bank, "facing", facing_axis(bank))
-    return bank
+    return bank if facing else replace(bank, facing=facing_axis(bank))
 
 
 def at_rate(clip: Clip, fps: float) -> Clip:
@@ -204,13 +191,14 @@ def foot_joints(skeleton: Skeleton) -> tuple[int, ...]:
     return tuple(dict.fromkeys(j for pair in pairs for j in pair))
 
 
-def facing_axis(bank: FrameBank, most: int = 4000) -> tuple[float, float, float]:
+def facing_axis(bank: FrameBank) -> tuple[float, float, float]:
     """The root's local axis along which the feet point, upright on average, of length 1.
 
     The mean over frames of R^-1 (toe - ankle), made orthogonal to the mean of R^-1 up.
     """
-    rows = torch.arange(0, bank.frames, max(1, bank.frames // most))
-    pos = tree_positions(bank.parents, bank.offsets[bank.clip_of(rows)], bank.root[rows], bank.rot[rows])
+    rows = torch.arange(0, bank.frames, max(1, bank.frames // _MOST_FRAMES))
+    offsets = bank.offsets[bank.clip_of(rows)]
+    pos, _ = forward_kinematics(bank.parents, offsets, bank.root[rows], bank.rot[rows])
     inverse = quat_conj(bank.rot[rows, 0])
     ahead = torch.zeros_like(bank.root[rows])
     for ankle, toe in zip(bank.feet[::2], bank.feet[1::2], strict=False):
@@ -221,8 +209,7 @@ def facing_axis(bank: FrameBank, most: int = 4000) -> tuple[float, float, float]
     if float(axis.norm()) < 1e-6:
         axis = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
         axis = axis - (axis @ up) * up
-    x, y, z = normalize(axis).tolist()
-    return x, y, z
+    return triple(normalize(axis).tolist())
 
 
 def window_starts(first: Tensor, window: int, offset: int, strict: bool = True) -> Tensor:
@@ -261,18 +248,16 @@ def faced(
     return quat_rotate(back, root), turned
 
 
-def step_contacts(
-    points: Tensor, rule: Literal["harvey", "two-stage"] = "harvey", dim: int = -3
-) -> Tensor:
+def step_contacts(points: Tensor, rule: Literal["harvey", "two-stage"] = "harvey") -> Tensor:
     """Contact `(..., T, F)` bool of foot joints `(..., T, F, 3)` m at 30 fps, told from steps alone.
 
     harvey: |p(t+1) - p(t)|^2 < 0.02 cm^2 (4.2 cm/s). two-stage: sum of |dx| < 0.2 cm. The last frame
     repeats the one before; heights do not matter. The two disagree on purpose.
     """
-    step = torch.diff(points, dim=dim)
+    step = torch.diff(points, dim=-3)
     size = step.square().sum(-1) if rule == "harvey" else step.abs().sum(-1)
     label = size < CONTACT_LIMITS[rule]
-    return torch.cat((label, label.narrow(dim + 1, label.shape[dim + 1] - 1, 1)), dim + 1)
+    return torch.cat((label, label[..., -1:, :]), -2)
 
 
 def train_statistics(
@@ -286,7 +271,7 @@ def train_statistics(
     for part in starts.split(chunk):
         root, rot, offsets = cut(bank, part, window)
         root, rot = faced(centred(root), rot, bank.facing, at)
-        pos = tree_positions(bank.parents, offsets, root, rot)
+        pos, _ = forward_kinematics(bank.parents, offsets, root, rot)
         total = total + pos.sum((0, 1))
         square = square + pos.square().sum((0, 1))
     count = len(starts) * window

@@ -1,6 +1,5 @@
 """Rotations and rigid transforms: torch, quaternions wxyz, any leading batch dimensions."""
 
-from poise.spatial.constants import GRAVITY
 from poise.spatial.directions import (
     across,
     best_rotation,
@@ -34,6 +33,9 @@ from poise.spatial.rotations import (
     unwrap_quats,
 )
 from poise.spatial.tree import forward_kinematics, matrix_kinematics
+
+GRAVITY = 9.81
+"""Standard gravity, m/s^2."""
 
 __all__ = [
     "GRAVITY",

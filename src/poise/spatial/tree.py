@@ -18,7 +18,8 @@ def forward_kinematics(
 
     Args:
         parents: parent index per joint, -1 for the root; parents come before children.
-        offsets: `(J, 3)` m, the joint's place in its parent's frame (the root's is ignored).
+        offsets: `(J, 3)` m, the joint's place in its parent's frame (the root's is ignored); it
+            may have leading dimensions that broadcast with those of `root_pos`.
         root_pos: `(..., 3)` m, world.
         rot: `(..., J, 4)` wxyz, local to the parent; the root's is the world rotation.
 
@@ -32,7 +33,7 @@ def forward_kinematics(
             pos.append(root_pos)
             quat.append(rot[..., j, :])
         else:
-            pos.append(pos[parent] + quat_rotate(quat[parent], offsets[j].expand_as(root_pos)))
+            pos.append(pos[parent] + quat_rotate(quat[parent], offsets[..., j, :].expand_as(root_pos)))
             quat.append(quat_mul(quat[parent], rot[..., j, :]))
     return torch.stack(pos, -2), torch.stack(quat, -2)
 

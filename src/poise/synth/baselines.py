@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.motion.windows import tree_positions
 from poise.nets.transition import Filled, Known, Layout
+from poise.spatial import forward_kinematics
 
 #: Under this distance of the dot product from 1 the published slerp is a plain weighted sum.
 _LINEAR = 0.01
@@ -41,7 +41,7 @@ class Baseline:
             t = torch.linspace(0, 1, length + 2, dtype=torch.float32)[1:-1].to(a.dtype)
             root = a + t[:, None] * (known.target_root.unsqueeze(1) - a)
             rot = protocol_slerp(qa, known.target_rot.unsqueeze(1), t[:, None])
-        pos = tree_positions(self.layout.parents, known.offsets[:, None], root, rot)
+        pos, _ = forward_kinematics(self.layout.parents, known.offsets[:, None], root, rot)
         contact = torch.zeros(*root.shape[:2], len(self.layout.feet), dtype=root.dtype)
         return Filled(root, rot, contact, pos)
 

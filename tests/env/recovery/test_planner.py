@@ -19,7 +19,7 @@ from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.recovery import standing, walking_clips
 from poise.spatial import quat_angle, quat_between
-from poise.spatial.turns import facing, heading_angle, turned, yaw_quat
+from poise.spatial.directions import facing, heading_angle, turned, yaw_quat
 from toy_human import swing
 from toy_library import rises, tiny
 

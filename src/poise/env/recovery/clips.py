@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.env.reference import Reference
 from poise.kin import close_cycle
 from poise.spatial import heading_quat, into_heading, quat_angle, quat_between
-from poise.spatial.turns import heading_angle, turned
+from poise.spatial.directions import heading_angle, turned
 
 #: Shares of the standing height: a body that is lower lies, one that is at least so high stands again.
 LIES, STANDS = 0.5, 0.9

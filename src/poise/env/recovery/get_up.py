@@ -9,7 +9,7 @@ from poise.body import BodyTable
 from poise.env.recovery.clips import RecoveryClips
 from poise.kin import Kinematics, lowest_height
 from poise.spatial import quat_distance, quat_mul, quat_rotate, slerp
-from poise.spatial.turns import turned, yaw_quat
+from poise.spatial.directions import turned, yaw_quat
 
 #: s that a blend takes, and m of the distance between poses that are blended in a second more.
 BLEND_S, BLEND_SPEED = 0.4, 1.5

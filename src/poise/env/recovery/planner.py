@@ -26,7 +26,7 @@ from torch import Tensor
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.spatial import quat_mul
-from poise.spatial.turns import facing, heading_angle, yaw_quat
+from poise.spatial.directions import facing, heading_angle, yaw_quat
 
 #: rad/s, m and rad: how fast is turned, and how near has come back.
 TURN, HERE, FACING = 2.0, 0.08, 0.1

@@ -31,8 +31,8 @@ from poise.motion.points import FitConfig, fit_clip
 
 #: How the points of a format are read, by the name that its clips bear.
 _POINTS: dict[str, Callable[[Path, Options], RawPoints]] = {
-    "trc": lambda path, options: trc_points(path),
-    "c3d": lambda path, options: c3d_points(path),
+    "trc": trc_points,
+    "c3d": c3d_points,
     "csv": csv_points,
     "keypoints-npz": lambda path, options: array_points(Archive(path), path, options),
 }

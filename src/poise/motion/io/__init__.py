@@ -1,6 +1,6 @@
 """Motion files: one reader and one writer per format; all conversion to metres, Z up."""
 
-from poise.motion.io.bvh import write_bvh
+from poise.motion.io.bvh.write import write_bvh
 from poise.motion.io.formats import (
     READERS,
     WRITERS,
@@ -9,7 +9,7 @@ from poise.motion.io.formats import (
     read_clip,
     write_clip,
 )
-from poise.motion.io.gltf import write_gltf
+from poise.motion.io.gltf.write import write_gltf
 
 __all__ = [
     "READERS",

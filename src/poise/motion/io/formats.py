@@ -8,16 +8,13 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.io.acclaim import read_amc
-from poise.motion.io.angles import (
-    looks_like_mot,
-    looks_like_robot,
-    read_deepmimic,
-    read_mot,
-    refuse_robot,
-)
-from poise.motion.io.bvh import read_bvh, write_bvh
-from poise.motion.io.gltf import read_gltf, write_gltf
+from poise.motion.io.acclaim.amc import read_amc
+from poise.motion.io.angles.deepmimic import read_deepmimic
+from poise.motion.io.angles.opensim import looks_like_mot, read_mot
+from poise.motion.io.bvh.read import read_bvh
+from poise.motion.io.bvh.write import write_bvh
+from poise.motion.io.gltf.read import read_gltf
+from poise.motion.io.gltf.write import write_gltf
 from poise.motion.io.named_arrays import (
     looks_like_npz,
     looks_like_pickle,
@@ -25,21 +22,24 @@ from poise.motion.io.named_arrays import (
     read_pickled,
     write_npz,
 )
-from poise.motion.io.own import looks_like_csv, read_csv, write_csv
-from poise.motion.io.points import (
-    looks_like_c3d,
+from poise.motion.io.own.csv import looks_like_csv, read_csv, write_csv
+from poise.motion.io.points.c3d import c3d_points, looks_like_c3d
+from poise.motion.io.points.csv import csv_points, looks_like_points_csv
+from poise.motion.io.points.raw import as_clip
+from poise.motion.io.points.trc import looks_like_trc, trc_points
+from poise.motion.io.raw import ReadOptions, check_options
+from poise.motion.io.refused import (
+    looks_like_asf,
     looks_like_openpose,
-    looks_like_points_csv,
-    looks_like_trc,
-    read_c3d,
-    read_points_csv,
-    read_trc,
+    looks_like_robot,
+    refuse_asf,
     refuse_folder,
     refuse_openpose,
+    refuse_robot,
 )
-from poise.motion.io.raw import ReadOptions, check_options
 from poise.motion.io.text import read_head, shown
-from poise.motion.io.usd import pxr_package, read_usd, write_usd
+from poise.motion.io.usd.read import pxr_package, read_usd
+from poise.motion.io.usd.write import write_usd
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,6 @@ class Reader:
 
 def _looks_like_bvh(head: bytes) -> bool:
     return head[:9].upper() == b"HIERARCHY"
-
-
-def _looks_like_asf(head: bytes) -> bool:
-    lines = [line.strip().lower() for line in head.splitlines()]
-    return any(x.split()[:1] in ([b":bonedata"], [b":units"], [b":version"]) for x in lines if x)
 
 
 def _looks_like_amc(head: bytes) -> bool:
@@ -86,27 +81,21 @@ def _looks_like_usd(head: bytes) -> bool:
     return head.startswith((b"PXR-USDC", b"#usda"))
 
 
-def _refuse_asf(path: Path, options: ReadOptions) -> Clip:
-    raise PoiseError(
-        "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
-    )
-
-
 READERS = (
     Reader("BVH", (".bvh",), _looks_like_bvh, read_bvh),
-    Reader("ASF", (".asf",), _looks_like_asf, _refuse_asf),
+    Reader("ASF", (".asf",), looks_like_asf, refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
     Reader("pickled SMPL, poselib or MDM", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
-    Reader("TRC keypoints", (".trc",), looks_like_trc, read_trc),
-    Reader("C3D markers", (".c3d",), looks_like_c3d, read_c3d),
+    Reader("TRC keypoints", (".trc",), looks_like_trc, as_clip(trc_points)),
+    Reader("C3D markers", (".c3d",), looks_like_c3d, as_clip(c3d_points)),
     Reader("OpenPose", (), looks_like_openpose, refuse_openpose, asks=True),
     Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
     Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
-    Reader("CSV keypoints", (".csv",), looks_like_points_csv, read_points_csv),
+    Reader("CSV keypoints", (".csv",), looks_like_points_csv, as_clip(csv_points)),
     Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
 )
 #: Readers that only say what to give instead.

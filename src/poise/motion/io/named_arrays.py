@@ -9,21 +9,17 @@ from typing import Any
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.io.angles import is_opensim, read_loco
-from poise.motion.io.numpy import (
-    is_amass_clip,
-    is_poselib,
-    is_smpl,
-    read_poselib,
-    read_smpl,
-    write_amass,
-)
+from poise.motion.io.angles.opensim import is_opensim, read_loco
 from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header
 from poise.motion.io.numpy.pickles import load_restricted, loads_restricted
-from poise.motion.io.own import read_poise_npz, write_poise_npz
-from poise.motion.io.own.npz import MARK
-from poise.motion.io.points import is_mdm, is_points, read_mdm, read_points_arrays
+from poise.motion.io.numpy.poselib import is_poselib, read_poselib
+from poise.motion.io.numpy.smpl import is_smpl, read_smpl
+from poise.motion.io.numpy.smpl_write import is_amass_clip, write_amass
+from poise.motion.io.own.npz import MARK, read_poise_npz, write_poise_npz
+from poise.motion.io.points.arrays import array_points, is_mdm, is_points, mdm_points
+from poise.motion.io.points.raw import as_clip
 from poise.motion.io.raw import ReadOptions
+from poise.motion.io.refused import is_qpos, refuse_qpos
 from poise.motion.io.text import listed, shown
 
 
@@ -36,26 +32,14 @@ class Kind:
     read: Callable[[Mapping[str, Any], Path, ReadOptions], Clip]
 
 
-def _is_qpos(data: Mapping[str, Any]) -> bool:
-    return any(k in data for k in ("qpos", "dof_pos", "joint_pos", "dof"))
-
-
-def _refuse_qpos(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
-    raise PoiseError(
-        "it holds the joint angles of a robot (qpos), which mean nothing without the robot's model",
-        path,
-        "Give the human motion it was made from",
-    )
-
-
 KINDS: tuple[Kind, ...] = (
     Kind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
     Kind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
     Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
-    Kind("keypoints (positions, names, fps)", is_points, read_points_arrays),
-    Kind("results of the motion diffusion model (motion, lengths)", is_mdm, read_mdm),
+    Kind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
+    Kind("results of the motion diffusion model (motion, lengths)", is_mdm, as_clip(mdm_points)),
     Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
-    Kind("a robot's joint angles", _is_qpos, _refuse_qpos),
+    Kind("a robot's joint angles", is_qpos, refuse_qpos),
 )
 """Named arrays that are known, whether they come from `.npz`, `.npy` or `.pkl`; first match reads."""
 

@@ -8,17 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from poise.errors import PoiseError
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import guess_unit, guess_up
 from poise.motion.io.raw import ReadOptions, vectors_from_z_up
 from poise.motion.io.text import shown
-from poise.motion.skeleton import Skeleton
-from poise.spatial import forward_kinematics, quat_mul, quat_rotate, quat_rotate_inv
+from poise.motion.skeleton import Skeleton, posed
+from poise.spatial import forward_kinematics, matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
 
-# As for BVH: a joint is rigid if its place stays within this share of the skeleton's size.
-_RIGID_SHARE = 6e-4
-_TRAVEL_SHARE = 20 * _RIGID_SHARE
+RIGID_SHARE = 6e-4
+"""A joint is rigid if its place stays within this share of the skeleton's size: about 1 mm on a person,
+whatever the unit."""
+_TRAVEL_SHARE = 20 * RIGID_SHARE
 _HUMAN_M = (0.3, 4.0)
+_SHEAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,27 @@ def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return quat_rotate(torch.tensor(q).expand(*v.shape[:-1], 4), torch.tensor(v)).numpy()
 
 
+def turn_and_scale(
+    axes: np.ndarray, what: str, where: str, hint: str | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations `(..., 4)` wxyz and scales `(..., 3)` of matrices `(..., 3, 3)`.
+
+    what: how a sentence calls them.
+
+    Raises:
+        PoiseError: a matrix that flattens, mirrors or shears space.
+    """
+    scale = np.linalg.norm(axes, axis=-2)
+    if scale.min() < 1e-9:
+        raise PoiseError(f"its {what} flattens space", where)
+    turn = axes / scale[..., None, :]
+    if np.linalg.det(turn).min() < 0:
+        raise PoiseError(f"its {what} mirrors space, which a body cannot do", where)
+    if np.abs(np.swapaxes(turn, -1, -2) @ turn - np.eye(3)).max() > _SHEAR:
+        raise PoiseError(f"its {what} shears space", where, hint)
+    return matrix_to_quat(torch.tensor(turn)).numpy(), scale
+
+
 def rigid_bones(
     names: Sequence[str],
     parents: Sequence[int],
@@ -113,18 +137,13 @@ def rigid_bones(
     travel = _travel_joint(parents, offsets, paths, root_pos, size)
     still = None
     if travel is not None:
-        moves = np.abs(root_pos - root_pos[0]).max() > _RIGID_SHARE * size
+        moves = np.abs(root_pos - root_pos[0]).max() > RIGID_SHARE * size
         still = None if moves else root_pos[0].tolist()
-        root, hips = names[0], names[travel]
-        notes.append(
-            f"Both the root '{root}' and '{hips}' travel; the path of both became the root's"
-            if moves
-            else f"The root '{root}' stands still: the travel of '{hips}' became the root's path"
-        )
+        notes.append(travel_note(names[0], names[travel], bool(moves)))
         offsets[travel] = 0.0
-        root_pos = _lifted(parents, offsets, root_pos, rot, travel, paths.pop(travel))
+        root_pos = lifted(parents, offsets, root_pos, rot, travel, paths.pop(travel))
     strays = ((j, float(np.linalg.norm(p - offsets[j], axis=-1).max())) for j, p in paths.items())
-    loose = tuple((names[j], stray) for j, stray in strays if stray > _RIGID_SHARE * size)
+    loose = tuple((names[j], stray) for j, stray in strays if stray > RIGID_SHARE * size)
     return Bones(offsets, root_pos, rot, travel, still, loose)
 
 
@@ -143,7 +162,7 @@ def _travel_joint(
     weight = [1] * len(parents)
     for j in range(len(parents) - 1, 0, -1):
         weight[parents[j]] += weight[j]
-    still = np.abs(root_pos - root_pos[0]).max() <= _RIGID_SHARE * size
+    still = np.abs(root_pos - root_pos[0]).max() <= RIGID_SHARE * size
     joint, only = 0, True
     while True:
         heavy = [j for j, p in enumerate(parents) if p == joint and 2 * weight[j] > weight[0]]
@@ -151,12 +170,19 @@ def _travel_joint(
         if not heavy or not (only or still):
             return None
         joint = heavy[0]
-        slack = (_RIGID_SHARE if only else _TRAVEL_SHARE) * size
+        slack = (RIGID_SHARE if only else _TRAVEL_SHARE) * size
         if np.linalg.norm(paths[joint] - offsets[joint], axis=-1).max() > slack:
             return joint
 
 
-def _lifted(
+def travel_note(root: str, joint: str, both: bool) -> str:
+    """The sentence about the joint that carries the travel instead of the root, or together with it."""
+    if both:
+        return f"Both the root '{root}' and '{joint}' travel; the path of both became the root's"
+    return f"The root '{root}' stands still: the travel of '{joint}' became the root's path"
+
+
+def lifted(
     parents: Sequence[int],
     offsets: np.ndarray,
     root_pos: np.ndarray,
@@ -165,10 +191,8 @@ def _lifted(
     path: np.ndarray,
 ) -> np.ndarray:
     """The root's path with a joint's own travel added: p_root + R_parent p_joint(t)."""
-    _, quat = forward_kinematics(
-        parents, torch.tensor(offsets), torch.tensor(root_pos), torch.tensor(rot)
-    )
-    moved = quat_rotate(quat[:, parents[joint]], torch.tensor(path).expand(len(rot), 3))
+    above = torch.tensor(posed(parents, offsets, root_pos, rot)[1][:, parents[joint]])
+    moved = quat_rotate(above, torch.tensor(path).expand(len(rot), 3))
     return root_pos + moved.numpy()
 
 
@@ -223,12 +247,7 @@ def checked_unit(
     if len(bones.rot) < 2 or not np.abs(bones.offsets).max() > 0:
         return stated
     at = sampled(len(bones.rot))
-    pos = forward_kinematics(
-        parents,
-        torch.tensor(bones.offsets),
-        torch.tensor(bones.root_pos[at]),
-        torch.tensor(bones.rot[at]),
-    )[0].numpy()
+    pos, _ = posed(parents, bones.offsets, bones.root_pos[at], bones.rot[at])
     up = guess_up(names, pos, pos[0])
     if options.up_axis is None and up.value != up_axis and "uncertain" not in up.note:
         notes.append(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_frames, check_poses, check_rate
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import (
     Guess,
@@ -19,10 +19,9 @@ from poise.motion.io.guess import (
     stated_unit,
     teleports,
 )
-from poise.motion.io.text import MAX_JOINTS, listed
-from poise.motion.limits import check_poses, check_rate
-from poise.motion.skeleton import Channel, Skeleton, Source
-from poise.spatial import forward_kinematics, normalize, unwrap_quats
+from poise.motion.io.text import MAX_JOINTS
+from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
+from poise.spatial import normalize, unwrap_quats
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,9 @@ class ReadOptions:
     allow_pickle: bool = False
     smooth_hz: float | None = None
     take: str | None = None
+
+
+UNSTATED = ReadOptions()
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
         raw.names,
         raw.parents,
         vectors_to_z_up(raw.offsets, axis) * scale,
-        tuple((j, _metres(tip, axis, scale)) for j, tip in raw.ends),
+        tuple((j, triple(vectors_to_z_up(np.array(tip), axis) * scale)) for j, tip in raw.ends),
         Source(
             format=raw.format,
             path=str(raw.path),
@@ -170,19 +172,10 @@ def _rate(raw: RawMotion) -> str:
     return next((n for n in raw.notes if "frame rate" in n), BY_FORMAT)
 
 
-def _metres(tip: tuple[float, float, float], axis: str, scale: float) -> tuple[float, float, float]:
-    x, y, z = (vectors_to_z_up(np.array(tip), axis) * scale).tolist()
-    return x, y, z
-
-
 def _check(raw: RawMotion) -> None:
     if len(raw.names) > MAX_JOINTS:
         raise PoiseError(f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed", raw.path)
-    if len(raw.root_pos) < 2:
-        count = len(raw.root_pos)
-        raise PoiseError(
-            f"the clip has {count} frame{'' if count == 1 else 's'}; motion needs at least 2", raw.path
-        )
+    check_frames(len(raw.root_pos), raw.path)
     if not np.abs(raw.offsets).max() > 0:
         raise PoiseError("no bone of the skeleton has any length (all offsets are zero)", raw.path)
 
@@ -200,10 +193,7 @@ def _drop_rest_frames(raw: RawMotion, notes: list[str]) -> RawMotion:
 def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple[Guess, Guess]:
     """The vertical and the metres per unit, stated or guessed, each with its evidence."""
     at = sampled(len(rot))
-    offsets = torch.tensor(raw.offsets)
-    pos = forward_kinematics(
-        raw.parents, offsets, torch.tensor(raw.root_pos[at]), torch.tensor(rot[at])
-    )[0].numpy()
+    pos, _ = posed(raw.parents, raw.offsets, raw.root_pos[at], rot[at])
     height, how = body_height(raw.names, raw.parents, raw.offsets, pos)
     if not height > 0:
         raise PoiseError("the skeleton has no height (all joints lie in one place)", raw.path)
@@ -213,24 +203,7 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
         unit = Guess(raw.unit_m)
     else:
         unit = guess_unit(height, how, raw.unit_hint, raw.path)
-    if options.up_axis is not None:
-        up = Guess(options.up_axis.upper())
-    elif raw.up_axis is not None:
-        up = Guess(raw.up_axis)
-    else:
-        up = guess_up(raw.names, pos, _rest(raw))
-    return up, unit
-
-
-def _rest(raw: RawMotion) -> np.ndarray:
-    """`(J, 3)` joint places with all rotations at identity, file units."""
-    out = np.zeros_like(raw.offsets)
-    for j, parent in enumerate(raw.parents):
-        if parent >= 0:
-            out[j] = out[parent] + raw.offsets[j]
-    return out
-
-
-def zero_length_note(names: list[str]) -> str:
-    """The sentence about joints that lie on their parents."""
-    return f"Bones of no length lead to {listed(names)}"
+    stated = options.up_axis or raw.up_axis
+    if stated is not None:
+        return Guess(stated.upper()), unit
+    return guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets)), unit

@@ -1,15 +1,14 @@
-"""Bounded reading of text files, numbers with the place of every mistake, files written whole."""
+"""Bounded reading of text files and JSON, words for errors, files written whole."""
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import stat
-from array import array
 from collections.abc import Iterable
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from poise.errors import PoiseError
 
@@ -29,6 +28,12 @@ MAX_NAME = 200
 """Joints and keypoints with longer names are refused."""
 MAX_VALUE = 1e8
 """Numbers larger than this, in any unit, are taken for damage."""
+MAX_JSON_BYTES = 128 << 20
+"""Longer JSON is refused before it is read."""
+MAX_CONTAINERS = 2_000_000
+"""JSON with more objects and lists is refused: a short one takes up to 250 bytes in memory."""
+MAX_ITEMS = 20_000_000
+"""The same for items in them, at some 40 bytes each (44 numbers at 60 Hz: two hours)."""
 CUT_OFF = "The file seems cut off"
 """The hint of errors about files that end too early."""
 
@@ -64,12 +69,12 @@ def check_file(path: Path, limit: int = MAX_FILE_BYTES) -> int:
     return info.st_size
 
 
-def read_head(path: Path, size: int = 4096) -> bytes:
+def read_head(path: Path) -> bytes:
     """The first bytes of a file, after `check_file`."""
     check_file(path)
     try:
         with path.open("rb") as file:
-            return file.read(size)
+            return file.read(4096)
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
 
@@ -144,53 +149,41 @@ def decode(line: bytes, path: Path, number: int) -> str:
         ) from None
 
 
+def json_object(data: bytes, path: Path) -> dict[str, Any]:
+    """The JSON object in a file's bytes; brackets and commas are counted before memory is taken."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    for size, most, what in (
+        (len(data), MAX_JSON_BYTES, "bytes"),
+        (data.count(b"{") + data.count(b"["), MAX_CONTAINERS, "objects and lists"),
+        (data.count(b","), MAX_ITEMS, "items"),
+    ):
+        if size > most:
+            raise PoiseError(
+                f"the JSON has {size} {what}, more than the {most} allowed",
+                path,
+                "Cut it into shorter clips",
+            )
+    try:
+        content = json.loads(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise PoiseError("this is not UTF-8 text", at_line(path, line), "Save it as UTF-8") from None
+    except json.JSONDecodeError as error:
+        raise PoiseError(
+            f"this is not valid JSON ({error.msg})", at_line(path, error.lineno), CUT_OFF
+        ) from None
+    except (RecursionError, ValueError):
+        raise PoiseError("this is not valid JSON", path) from None
+    if not isinstance(content, dict):
+        raise PoiseError("the JSON is no object", path)
+    return content
+
+
 def shown(token: object) -> str:
     """A token for an error message: printable and short."""
     text = token.decode("utf-8", "replace") if isinstance(token, bytes) else str(token)
     text = "".join(c if c.isprintable() else "?" for c in text)
     return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
-
-
-def number(token: str | bytes, where: str) -> float:
-    """One finite number; anything else is refused with its place."""
-    try:
-        if ("_" if isinstance(token, str) else b"_") in token:  # type: ignore[operator]
-            raise ValueError
-        value = float(token)
-    except ValueError:
-        raise PoiseError(f"{shown(token)} is not a number", where) from None
-    if not abs(value) <= MAX_VALUE:
-        raise PoiseError(f"{shown(token)} is not a usable number", where)
-    return value
-
-
-def append_numbers(values: array[float], tokens: list[bytes], where: str) -> None:
-    """Adds the numbers of one row in one go; on a mistake, names the token at fault.
-
-    NaN and inf pass, so that the caller can name the joint and frame.
-    """
-    size = len(values)
-    try:
-        # Python reads "1_000" as a number; motion files do not.
-        if b"_" in b"".join(tokens):
-            raise ValueError
-        values.extend(map(float, tokens))
-    except ValueError:
-        del values[size:]
-        for token in tokens:
-            try:
-                float(token.replace(b"_", b"x"))
-            except ValueError:
-                raise PoiseError(f"{shown(token)} is not a number", where) from None
-
-
-def first_bad(table: np.ndarray) -> tuple[int, int] | None:
-    """(row, column) of the first value that is not finite or is absurdly large, else None."""
-    bad = ~(np.abs(table) <= MAX_VALUE)
-    if not bad.any():
-        return None
-    row, column = np.argwhere(bad)[0]
-    return int(row), int(column)
 
 
 def listed(items: Iterable[object], limit: int = 8) -> str:

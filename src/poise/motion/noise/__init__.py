@@ -11,9 +11,17 @@ from poise.motion.noise.apply import (
     robustness_levels,
     scaled,
 )
-from poise.motion.noise.kinds import Noise, Points, Pose, side_pairs
-from poise.motion.noise.missing import Dropouts, FrameLoss, Latency, SwapSides
-from poise.motion.noise.offsets import Drift, Jitter, Outliers, WrongDepth
+from poise.motion.noise.base import Noise, Seen, side_pairs
+from poise.motion.noise.kinds import (
+    Drift,
+    Dropouts,
+    FrameLoss,
+    Jitter,
+    Latency,
+    Outliers,
+    SwapSides,
+    WrongDepth,
+)
 
 __all__ = [
     "TRIANGULATED",
@@ -26,8 +34,7 @@ __all__ = [
     "Level",
     "Noise",
     "Outliers",
-    "Points",
-    "Pose",
+    "Seen",
     "SwapSides",
     "WrongDepth",
     "hold_missing",

@@ -11,9 +11,18 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.keypoints import Keypoints
-from poise.motion.noise.kinds import Noise, Points, Pose, side_pairs
-from poise.motion.noise.missing import Dropouts, FrameLoss, Latency, SwapSides, last_seen
-from poise.motion.noise.offsets import Drift, Jitter, Outliers, WrongDepth
+from poise.motion.noise.base import Noise, Seen, side_pairs
+from poise.motion.noise.kinds import (
+    Drift,
+    Dropouts,
+    FrameLoss,
+    Jitter,
+    Latency,
+    Outliers,
+    SwapSides,
+    WrongDepth,
+    last_seen,
+)
 
 #: Several cameras, triangulated (Pose2Sim, as measured): one axis is twice as bad, nothing is smoothed.
 TRIANGULATED: tuple[Noise, ...] = (
@@ -46,10 +55,10 @@ def perturb_clip(clip: Clip, noise: Noise | Sequence[Noise], seed: int = 0) -> C
 
     The numbers depend on `seed`, on each noise's own seed and place, and on the clip's name.
     """
-    track = Pose(clip.root_pos, clip.rot, clip.fps, side_pairs(clip.skeleton.names))
+    seen = Seen(clip.root_pos[:, None], clip.rot, clip.fps, side_pairs(clip.skeleton.names))
     for one, rng in _each(noise, seed, clip.name):
-        track = one.pose(track, rng)
-    return clip.replaced(root_pos=track.root_pos, rot=track.rot)
+        seen = one.on(seen, rng)
+    return clip.replaced(root_pos=seen.pos[:, 0], rot=seen.rot)
 
 
 def perturb_points(points: Keypoints, noise: Noise | Sequence[Noise], seed: int = 0) -> Keypoints:
@@ -69,10 +78,10 @@ def perturb_positions(
     """Positions `(T, K, 3)` m of points called `names`, with noise; what is lost is NaN."""
     if positions.ndim != 3 or positions.shape[1:] != (len(names), 3):
         raise PoiseError(f"positions must be (T, {len(names)}, 3), got {positions.shape}")
-    track = Points(np.asarray(positions, dtype=float), fps, side_pairs(tuple(names)))
+    seen = Seen(np.asarray(positions, dtype=float), None, fps, side_pairs(tuple(names)))
     for one, rng in _each(noise, seed, name):
-        track = one.points(track, rng)
-    return track.pos
+        seen = one.on(seen, rng)
+    return seen.pos
 
 
 def hold_missing(positions: np.ndarray) -> np.ndarray:

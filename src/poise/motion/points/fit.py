@@ -16,7 +16,7 @@ from poise.motion.points.labels import SIDES
 from poise.motion.points.landmarks import complete, places_of
 from poise.motion.points.measure import TITLE, Rest, measure, trunk_tracks
 from poise.motion.points.solve import Solver, hold_lengths
-from poise.motion.skeleton import Skeleton
+from poise.motion.skeleton import Skeleton, triple
 
 _LIMBS = {"UpLeg": "hip", "Leg": "knee", "Foot": "ankle", "ToeBase": "toe"}
 _LIMBS |= {"Shoulder": "collar", "Arm": "shoulder", "ForeArm": "elbow", "Hand": "wrist"}
@@ -71,7 +71,7 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
         names,
         tuple(-1 if up is None else names.index(up) for up in rest.parents.values()),
         np.stack([rest.offsets[n] for n in names]),
-        tuple((names.index(n), (float(x), float(y), float(z))) for n, (x, y, z) in rest.tips.items()),
+        tuple((names.index(n), triple(tip)) for n, tip in rest.tips.items()),
         points.source,
     )
     clip = Clip(skeleton, root_pos.numpy(), rot.numpy(), points.fps, points.name)

@@ -70,30 +70,14 @@ def _bare(text: str) -> str:
 
 
 # The labels of surface markers (Plug-in Gait, CMU, OpenCap's "_study" set), known by `markers.py`.
-MARKER_CORES = (
-    *("asi", "psi", "fwt", "bwt", "kne", "knm", "mkn", "knem", "mkne", "ank", "anm", "mank", "ankm"),
-    *(
-        "mma",
-        "med",
-        "hee",
-        "mt1",
-        "mt5",
-        "sho",
-        "elb",
-        "elm",
-        "melb",
-        "elbm",
-        "wra",
-        "wrb",
-        "fin",
-        "fhd",
-    ),
-    *("bhd", "asis", "psis", "tip", "thi", "tib", "upa", "frm", "shn", "asisstudy", "psisstudy"),
-    *("kneestudy", "mkneestudy", "anklestudy", "manklestudy", "toestudy", "5metastudy", "calcstudy"),
-    *("shoulderstudy", "hjcstudy", "lelbowstudy", "melbowstudy", "lwriststudy", "mwriststudy"),
+_MARKERS = (
+    "asi psi fwt bwt kne knm mkn knem mkne ank anm mank ankm mma med hee mt1 mt5 sho elb elm melb "
+    "elbm wra wrb fin fhd bhd asis psis tip thi tib upa frm shn asisstudy psisstudy kneestudy "
+    "mkneestudy anklestudy manklestudy toestudy 5metastudy calcstudy shoulderstudy hjcstudy "
+    "lelbowstudy melbowstudy lwriststudy mwriststudy"
 )
 _MIDDLE_MARKERS = {"c7", "clav", "strn", "t10", "sacr", "sacrum"}
-_CORES = frozenset(core for cores in _SIDED.values() for core in cores) | frozenset(MARKER_CORES)
+_CORES = frozenset(c for cores in _SIDED.values() for c in cores) | frozenset(_MARKERS.split())
 
 
 def known_labels() -> tuple[str, ...]:

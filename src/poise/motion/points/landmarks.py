@@ -25,12 +25,11 @@ _JITTER_M = 0.0035
 class Landmarks:
     """Complete tracks of the places of one body; m, Z up.
 
-    tracks: place -> `(T, 3)`, no NaN. seen: place -> `(T,)`, where it was measured and not filled.
+    tracks: place -> `(T, 3)`, no NaN.
     first: the frame of the recording that is frame 0 here. notes: one sentence per repair.
     """
 
     tracks: dict[str, np.ndarray]
-    seen: dict[str, np.ndarray]
     first: int
     notes: tuple[str, ...]
 
@@ -117,8 +116,8 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
             f"{_lost(missing, start, stop)} missing for longer than {max_gap_s:g} s or up to an end"
         )
     tracks = {place: track[start:stop] for place, track in tracks.items()}
-    seen = {place: ~np.isnan(track[:, 0]) for place, track in tracks.items()}
-    gaps = [(int((~s).sum()), place) for place, s in seen.items() if not s.all()]
+    gaps = [(int(np.isnan(track[:, 0]).sum()), place) for place, track in tracks.items()]
+    gaps = [gap for gap in gaps if gap[0]]
     if gaps:
         worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
@@ -134,7 +133,7 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         notes.append(
             f"The keypoints were smoothed by a zero-phase Gaussian low-pass at {smooth_hz:g} Hz"
         )
-    return Landmarks(tracks, seen, start, tuple(notes))
+    return Landmarks(tracks, start, tuple(notes))
 
 
 def _lost(missing: np.ndarray, start: int, stop: int) -> str:

@@ -12,17 +12,9 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
 from poise.motion.io.acclaim.asf import ROTATIONS, TRAVEL, AsfFile, fixed_axes_quat, parse_asf
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
-from poise.motion.io.text import (
-    CUT_OFF,
-    append_numbers,
-    at_line,
-    decode,
-    first_bad,
-    listed,
-    read_bytes,
-    shown,
-)
-from poise.motion.skeleton import Channel
+from poise.motion.io.tables import append_numbers, first_bad
+from poise.motion.io.text import CUT_OFF, at_line, decode, listed, read_bytes, shown
+from poise.motion.skeleton import Channel, triple
 from poise.spatial import quat_conj, quat_mul
 
 DEFAULT_FPS = 120.0
@@ -114,7 +106,7 @@ def _raw(
         for n in names
     )
     leaves = [j for j in range(len(names)) if j not in parents and names[j] != "root"]
-    ends = tuple((j, (float(t[0]), float(t[1]), float(t[2]))) for j in leaves for t in [tip[names[j]]])
+    ends = tuple((j, triple(tip[names[j]])) for j in leaves)
     flat = [n for n in names if n != "root" and not tip[n].any()]
     if flat:
         notes.append(f"Bones of no length: {listed(flat)}")

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError, did_you_mean
+from poise.motion.io.tables import number
 from poise.motion.io.text import (
     CUT_OFF,
     MAX_JOINTS,
     MAX_SKELETON_BYTES,
     at_line,
     decode,
-    number,
     read_bytes,
     shown,
 )

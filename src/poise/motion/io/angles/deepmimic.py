@@ -11,9 +11,8 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.edits import blended
-from poise.motion.io.json import MAX_JSON_BYTES, json_object
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
-from poise.motion.io.text import MAX_VALUE, read_bytes
+from poise.motion.io.text import MAX_JSON_BYTES, MAX_VALUE, json_object, read_bytes
 from poise.motion.skeleton import Channel
 from poise.spatial import axis_angle_to_quat
 
@@ -59,7 +58,9 @@ def read_deepmimic(path: Path, options: ReadOptions) -> Clip:
     Quaternions off unit length are normalised and told; where frame durations differ by more
     than 1 %, the clip is resampled at the median one.
     """
-    data = _load(path)
+    data = json_object(read_bytes(path, MAX_JSON_BYTES), path)
+    if not isinstance(data.get("Frames"), list):
+        raise PoiseError("the JSON has no list named 'Frames'", path, "DeepMimic files need one")
     table = _table(data["Frames"], path)
     loop = data.get("Loop", "none")
     if loop not in ("wrap", "none"):
@@ -96,13 +97,6 @@ def read_deepmimic(path: Path, options: ReadOptions) -> Clip:
         clip = _even(clip, times, path)
     source = clip.skeleton.source
     return clip.replaced(skeleton=clip.skeleton.with_source(notes=(*notes, *source.notes)))
-
-
-def _load(path: Path) -> dict[str, Any]:
-    data = json_object(read_bytes(path, MAX_JSON_BYTES), path)
-    if not isinstance(data.get("Frames"), list):
-        raise PoiseError("the JSON has no list named 'Frames'", path, "DeepMimic files need one")
-    return data
 
 
 def _table(frames: list[Any], path: Path) -> np.ndarray:

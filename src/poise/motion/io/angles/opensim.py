@@ -6,7 +6,6 @@ bones: a stated default body of 1.70 m takes their place, X to the front, Y up, 
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,11 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_frames
 from poise.motion.io.numpy.arrays import numeric, refuse_bad, require
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
-from poise.motion.io.text import CUT_OFF, append_numbers, at_line, decode, listed, read_bytes, shown
+from poise.motion.io.tables import number_table
+from poise.motion.io.text import CUT_OFF, decode, listed, read_bytes, shown
 from poise.motion.skeleton import Channel
 from poise.spatial import axis_angle_to_quat, quat_mul
 
@@ -96,21 +96,10 @@ def read_mot(path: Path, options: ReadOptions) -> Clip:
         raise PoiseError("the file ends in its header", path, CUT_OFF)
     degrees = any(x.strip().lower().replace(b" ", b"") == b"indegrees=yes" for x in lines[:end])
     names = decode(lines[end + 1], path, end + 2).split()
-    values: array[float] = array("d")
-    for i in range(end + 2, len(lines)):
-        tokens = lines[i].split()
-        if not tokens:
-            continue
-        if len(tokens) != len(names):
-            what = f"the row has {len(tokens)} values; there are {len(names)} columns"
-            raise PoiseError(what, at_line(path, i + 1))
-        append_numbers(values, tokens, at_line(path, i + 1))
-    table = np.frombuffer(values, dtype=np.float64).reshape(-1, len(names))
+    table = number_table(lines, end + 2, len(names), path)
     columns = dict(zip(names, table.T, strict=True))
     require(columns, ("time", *_PELVIS), path, "this OpenSim motion")
-    if len(table) < 2:
-        plural = "" if len(table) == 1 else "s"
-        raise PoiseError(f"the clip has {len(table)} frame{plural}; motion needs at least 2", path)
+    check_frames(len(table), path)
     steps = np.diff(columns["time"])
     step = float(steps.mean())
     if not (step > 0 and np.abs(steps / step - 1).max() < 0.05):

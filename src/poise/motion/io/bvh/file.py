@@ -9,17 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.tables import append_numbers, first_bad, number
 from poise.motion.io.text import (
     CUT_OFF,
     MAX_HEADER_WORDS,
     MAX_JOINTS,
     MAX_NAME,
     MAX_VALUE,
-    append_numbers,
     at_line,
     decode,
-    first_bad,
-    number,
     read_bytes,
     shown,
 )
@@ -115,127 +113,120 @@ def parse_bvh(path: Path) -> BvhFile:
     """Reads a BVH file's hierarchy and motion; every refusal names the line."""
     lines = read_bytes(path).splitlines()
     tokens = _Tokens(lines, path)
-    joints = _hierarchy(tokens)
+    joints = _Hierarchy(tokens).read()
     if tokens.motion_line is None:
         raise PoiseError("the file ends before MOTION", path, CUT_OFF)
     return _motion(lines, tokens.motion_line + 1, joints, path)
 
 
-def _hierarchy(tokens: _Tokens) -> list[BvhJoint]:
-    tokens.expect("HIERARCHY")
-    joints: list[BvhJoint] = []
-    known: dict[str, int] = {}
-    # The open braces: a joint's index, or -1 for an End Site.
-    stack: list[int] = []
-    while not tokens.done():
-        place = tokens.place()
-        word = tokens.next("a joint").upper()
-        if word in ("ROOT", "JOINT"):
-            _open_joint(tokens, word, place, joints, known, stack)
-        elif word == "END":
-            tokens.next("'Site'")
-            tokens.expect("{")
-            if not stack or stack[-1] < 0:
-                raise PoiseError("an End Site stands outside a joint", place)
-            stack.append(-1)
-        elif word == "}":
-            if not stack:
-                raise PoiseError("a closing brace has no opening one", place)
-            stack.pop()
-        elif word == "OFFSET":
-            vector = tokens.vector()
-            _set_offset(joints, stack, vector, place)
-        elif word == "CHANNELS":
-            _set_channels(tokens, joints, stack, place)
+class _Hierarchy:
+    """Reads the joints. stack: the open braces, a joint's index each, or -1 for an End Site."""
+
+    def __init__(self, tokens: _Tokens):
+        self.tokens, self.place = tokens, ""
+        self.joints: list[BvhJoint] = []
+        self.known: dict[str, int] = {}
+        self.stack: list[int] = []
+
+    def read(self) -> list[BvhJoint]:
+        tokens = self.tokens
+        tokens.expect("HIERARCHY")
+        while not tokens.done():
+            self.place = tokens.place()
+            word = tokens.next("a joint").upper()
+            if word in ("ROOT", "JOINT"):
+                self._open_joint(word)
+            elif word == "END":
+                tokens.next("'Site'")
+                tokens.expect("{")
+                self._need_joint("an End Site stands outside a joint")
+                self.stack.append(-1)
+            elif word == "}":
+                if not self.stack:
+                    raise PoiseError("a closing brace has no opening one", self.place)
+                self.stack.pop()
+            elif word == "OFFSET":
+                self._offset(tokens.vector())
+            elif word == "CHANNELS":
+                self._need_joint("CHANNELS stand outside any joint")
+                self._channels(self.joints[self.stack[-1]])
+            else:
+                raise PoiseError(
+                    f"{shown(word)} is not a BVH keyword",
+                    self.place,
+                    "Known: ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION",
+                )
+        self._check_closed()
+        return self.joints
+
+    def _need_joint(self, otherwise: str) -> None:
+        if not self.stack or self.stack[-1] < 0:
+            raise PoiseError(otherwise, self.place)
+
+    def _open_joint(self, word: str) -> None:
+        line = self.tokens.words[self.tokens.at - 1][1]
+        name = self.tokens.name()
+        if word == "ROOT" and self.joints:
+            raise PoiseError(f"a second ROOT, '{name}'", self.place, "Give each body its own file")
+        if word == "JOINT":
+            self._need_joint(f"joint '{name}' stands outside any other joint")
+        if name in self.known:
+            raise PoiseError(
+                f"joint name '{name}' appears twice (first in line {self.known[name]})",
+                self.place,
+                "Rename one of them",
+            )
+        if len(self.joints) >= MAX_JOINTS:
+            raise PoiseError(f"more than {MAX_JOINTS} joints", self.place)
+        self.tokens.expect("{")
+        self.known[name] = line
+        self.joints.append(BvhJoint(name, self.stack[-1] if self.stack else -1, line))
+        self.stack.append(len(self.joints) - 1)
+
+    def _offset(self, vector: tuple[float, float, float]) -> None:
+        if not self.stack:
+            raise PoiseError("an OFFSET stands outside any joint", self.place)
+        joint = self.joints[self.stack[-1] if self.stack[-1] >= 0 else self.stack[-2]]
+        if self.stack[-1] < 0:
+            joint.tips.append(vector)
+        elif joint.offset is not None:
+            raise PoiseError(f"joint '{joint.name}' has two OFFSETs", self.place)
         else:
-            raise PoiseError(
-                f"{shown(word)} is not a BVH keyword",
-                place,
-                "Known: ROOT, JOINT, End Site, OFFSET, CHANNELS, MOTION",
-            )
-    _check_closed(tokens, joints, stack)
-    return joints
+            joint.offset = vector
 
+    def _channels(self, joint: BvhJoint) -> None:
+        count = self.tokens.next("the number of channels")
+        if not (count.isdigit() and count.isascii()) or int(count) > 6:
+            what = f"joint '{joint.name}' must have 0 to 6 channels, got {shown(count)}"
+            raise PoiseError(what, self.place)
+        if joint.channels is not None:
+            raise PoiseError(f"joint '{joint.name}' has two CHANNELS lines", self.place)
+        channels = []
+        for _ in range(int(count)):
+            word = self.tokens.next("a channel name")
+            if word.lower() not in _CANONICAL:
+                raise PoiseError(
+                    f"{shown(word)} is not a channel of joint '{joint.name}'",
+                    self.place,
+                    f"Known: {', '.join(_CANONICAL.values())}",
+                )
+            channels.append(_CANONICAL[word.lower()])
+        if len(set(channels)) != len(channels):
+            raise PoiseError(f"joint '{joint.name}' names a channel twice", self.place)
+        joint.channels = tuple(channels)
 
-def _open_joint(
-    tokens: _Tokens,
-    word: str,
-    place: str,
-    joints: list[BvhJoint],
-    known: dict[str, int],
-    stack: list[int],
-) -> None:
-    line = tokens.words[tokens.at - 1][1]
-    name = tokens.name()
-    if word == "ROOT" and joints:
-        raise PoiseError(f"a second ROOT, '{name}'", place, "Give each body its own file")
-    if word == "JOINT" and (not stack or stack[-1] < 0):
-        raise PoiseError(f"joint '{name}' stands outside any other joint", place)
-    if name in known:
-        raise PoiseError(
-            f"joint name '{name}' appears twice (first in line {known[name]})",
-            place,
-            "Rename one of them",
-        )
-    if len(joints) >= MAX_JOINTS:
-        raise PoiseError(f"more than {MAX_JOINTS} joints", place)
-    tokens.expect("{")
-    known[name] = line
-    joints.append(BvhJoint(name, stack[-1] if stack else -1, line))
-    stack.append(len(joints) - 1)
-
-
-def _set_offset(
-    joints: list[BvhJoint], stack: list[int], vector: tuple[float, float, float], place: str
-) -> None:
-    if not stack:
-        raise PoiseError("an OFFSET stands outside any joint", place)
-    if stack[-1] < 0:
-        joints[stack[-2]].tips.append(vector)
-    elif joints[stack[-1]].offset is not None:
-        raise PoiseError(f"joint '{joints[stack[-1]].name}' has two OFFSETs", place)
-    else:
-        joints[stack[-1]].offset = vector
-
-
-def _set_channels(tokens: _Tokens, joints: list[BvhJoint], stack: list[int], place: str) -> None:
-    if not stack or stack[-1] < 0:
-        raise PoiseError("CHANNELS stand outside any joint", place)
-    joint = joints[stack[-1]]
-    count = tokens.next("the number of channels")
-    if not (count.isdigit() and count.isascii()) or int(count) > 6:
-        raise PoiseError(f"joint '{joint.name}' must have 0 to 6 channels, got {shown(count)}", place)
-    if joint.channels is not None:
-        raise PoiseError(f"joint '{joint.name}' has two CHANNELS lines", place)
-    channels = []
-    for _ in range(int(count)):
-        word = tokens.next("a channel name")
-        if word.lower() not in _CANONICAL:
-            raise PoiseError(
-                f"{shown(word)} is not a channel of joint '{joint.name}'",
-                place,
-                f"Known: {', '.join(_CANONICAL.values())}",
-            )
-        channels.append(_CANONICAL[word.lower()])
-    if len(set(channels)) != len(channels):
-        raise PoiseError(f"joint '{joint.name}' names a channel twice", place)
-    joint.channels = tuple(channels)
-
-
-def _check_closed(tokens: _Tokens, joints: list[BvhJoint], stack: list[int]) -> None:
-    if not joints:
-        raise PoiseError("the hierarchy has no ROOT", tokens.place(), CUT_OFF)
-    if stack:
-        open_joint = next(joints[j].name for j in reversed(stack) if j >= 0)
-        raise PoiseError(
-            f"the brace of joint '{open_joint}' is never closed",
-            tokens.place(),
-            CUT_OFF,
-        )
-    for joint in joints:
-        for what, value in (("OFFSET", joint.offset), ("CHANNELS", joint.channels)):
-            if value is None:
-                raise PoiseError(f"joint '{joint.name}' has no {what}", at_line(tokens.path, joint.line))
+    def _check_closed(self) -> None:
+        place = self.tokens.place()
+        if not self.joints:
+            raise PoiseError("the hierarchy has no ROOT", place, CUT_OFF)
+        if self.stack:
+            name = next(self.joints[j].name for j in reversed(self.stack) if j >= 0)
+            raise PoiseError(f"the brace of joint '{name}' is never closed", place, CUT_OFF)
+        for joint in self.joints:
+            for what, value in (("OFFSET", joint.offset), ("CHANNELS", joint.channels)):
+                if value is None:
+                    where = at_line(self.tokens.path, joint.line)
+                    raise PoiseError(f"joint '{joint.name}' has no {what}", where)
 
 
 def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) -> BvhFile:

@@ -10,6 +10,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.bvh.file import POSITIONS
+from poise.motion.io.nodes import place_of_travel
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
 from poise.motion.skeleton import Skeleton
@@ -19,7 +20,6 @@ from poise.spatial import (
     quat_angle,
     quat_conj,
     quat_mul,
-    quat_rotate_inv,
     quat_to_euler,
 )
 
@@ -126,13 +126,7 @@ def _places(
     name = skeleton.source.travel_joint
     if name is None or name not in skeleton.names or "root_position" not in kept:
         return out
-    travel = skeleton.names.index(name)
-    still = np.tile(kept["root_position"], (len(root_pos), 1))
-    base, quat = forward_kinematics(parents, bones, torch.tensor(still), turns)
-    up = parents[travel]
-    # p_travel = R_parent^-1 (x_travel - x_parent), with the parent where a still root puts it.
-    place = quat_rotate_inv(quat[:, up], pos[:, travel] - base[:, up])
-    return {**out, 0: still, travel: place.numpy()}
+    return out | place_of_travel(skeleton, offsets, root_pos, turns, kept["root_position"])
 
 
 def _hierarchy(

@@ -11,8 +11,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from poise.errors import PoiseError
-from poise.motion.io.json import json_object
-from poise.motion.io.text import CUT_OFF, MAX_FILE_BYTES, read_binary, shown
+from poise.motion.io.text import CUT_OFF, MAX_FILE_BYTES, json_object, read_binary, shown
 
 MAGIC = b"glTF"
 JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942

@@ -7,18 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
 from poise.motion.io.gltf.accessor import index_of
 from poise.motion.io.gltf.file import GltfFile
+from poise.motion.io.nodes import turn_and_scale
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
-from poise.spatial import matrix_to_quat
 
 MAX_DEPTH = 1000
 """Deeper node trees are refused."""
-
-_SHEAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -137,15 +134,8 @@ def _vector(node: dict[str, Any], key: str, size: int, where: str) -> np.ndarray
 def _decomposed(m: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Translation, rotation and scale of a column-major 4x4 matrix."""
     matrix = m.reshape(4, 4).T
-    scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    if scale.min() < 1e-9:
-        raise PoiseError("its matrix flattens space", where)
-    turn = matrix[:3, :3] / scale
-    if np.linalg.det(turn) < 0:
-        raise PoiseError("its matrix mirrors space, which a body cannot do", where)
-    if np.abs(turn.T @ turn - np.eye(3)).max() > _SHEAR:
-        raise PoiseError("its matrix shears space", where, "Apply the transform before exporting")
-    return matrix[:3, 3], matrix_to_quat(torch.tensor(turn)).numpy(), scale
+    turn, scale = turn_and_scale(matrix[:3, :3], "matrix", where, "Apply the transform before exporting")
+    return matrix[:3, 3], turn, scale
 
 
 def choose_joints(

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_poses
 from poise.motion.info import sampled
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
@@ -27,9 +27,8 @@ from poise.motion.io.raw import (
     vectors_from_z_up,
 )
 from poise.motion.io.text import listed
-from poise.motion.limits import check_poses
-from poise.motion.skeleton import Channel
-from poise.spatial import forward_kinematics, quat_mul, rotvec_to_quat
+from poise.motion.skeleton import Channel, posed
+from poise.spatial import quat_mul, rotvec_to_quat
 
 _POSES = ("poses", "smpl_poses", "pose_aa", "fullpose")
 _ROOT = ("root_orient", "global_orient")
@@ -215,12 +214,10 @@ def _up(
     if not len(root_pos):
         return "Z", []
     at = sampled(len(root_pos))
-    pos, _ = forward_kinematics(
-        layout.parents, torch.tensor(layout.offsets), torch.tensor(root_pos[at]), quat[at]
-    )
+    pos, _ = posed(layout.parents, layout.offsets, root_pos[at], quat[at].numpy())
     ankles = [layout.names.index(f"{side}_ankle") for side in ("left", "right")]
     way = pos[:, layout.names.index("head")] - pos[:, ankles].mean(1)
-    lean = (way / way.norm(dim=-1, keepdim=True)).mean(0).numpy()
+    lean = (way / np.linalg.norm(way, axis=-1, keepdims=True)).mean(0)
     if abs(lean[1]) > 0.7 and abs(lean[2]) < 0.4:
         head_down = "" if lean[1] > 0 else " with the head down (are these a camera's axes?)"
         return "Y", [f"The file states no vertical: Y taken, since the body stands along it{head_down}"]

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from poise.motion.skeleton import Skeleton
+
 _SIDES = (("left", 1.0), ("right", -1.0))
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 
@@ -149,6 +151,7 @@ def layout_of_width(width: int) -> Layout | None:
     return next((layout for layout in LAYOUTS if layout.width == width), None)
 
 
-def layout_of_names(names: tuple[str, ...], parents: tuple[int, ...]) -> Layout | None:
-    """The layout with exactly these joints, None if there is none."""
-    return next((x for x in LAYOUTS if x.names == names and x.parents == parents), None)
+def layout_of_joints(skeleton: Skeleton) -> Layout | None:
+    """The layout with exactly the joints of a skeleton, None if there is none."""
+    joints = skeleton.names, skeleton.parents
+    return next((x for x in LAYOUTS if (x.names, x.parents) == joints), None)

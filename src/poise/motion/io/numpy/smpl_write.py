@@ -11,10 +11,10 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import npz_bytes
 from poise.motion.io.numpy.smpl import Z_TO_Y_UP
-from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_names
+from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, layout_of_joints
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up, vectors_to_z_up
 from poise.motion.io.text import write_whole
-from poise.motion.skeleton import Skeleton, Source
+from poise.motion.skeleton import Skeleton, Source, triple
 from poise.spatial import quat_conj, quat_mul, quat_to_rotvec
 
 
@@ -27,14 +27,14 @@ def smpl_skeleton(layout: str = "SMPL") -> Skeleton:
     if found is None:
         known = ", ".join(x.name for x in LAYOUTS)
         raise PoiseError(f"there is no layout '{layout}'. Known: {known}")
-    tips = tuple((j, _point(vectors_to_z_up(np.array(tip), "Y"))) for j, tip in found.tips)
+    tips = tuple((j, triple(vectors_to_z_up(np.array(tip), "Y"))) for j, tip in found.tips)
     offsets = vectors_to_z_up(found.offsets, "Y")
     return Skeleton(found.names, found.parents, offsets, tips, Source(format="smpl"))
 
 
 def is_amass_clip(clip: Clip) -> bool:
     """Whether a clip came from the SMPL family and can go back to it."""
-    return clip.skeleton.source.format == "smpl" and _layout(clip) is not None
+    return clip.skeleton.source.format == "smpl" and layout_of_joints(clip.skeleton) is not None
 
 
 def write_amass(clip: Clip, path: str | Path) -> None:
@@ -47,7 +47,7 @@ def write_amass(clip: Clip, path: str | Path) -> None:
     Raises:
         PoiseError: the clip is on another skeleton, or the folder cannot be written to.
     """
-    layout = _layout(clip)
+    layout = layout_of_joints(clip.skeleton)
     if layout is None:
         raise PoiseError(
             f"the clip's {len(clip.skeleton)} joints are not those of SMPL, which AMASS files need",
@@ -76,14 +76,5 @@ def write_amass(clip: Clip, path: str | Path) -> None:
     write_whole(Path(path), npz_bytes(arrays))
 
 
-def _layout(clip: Clip) -> Layout | None:
-    return layout_of_names(clip.skeleton.names, clip.skeleton.parents)
-
-
 def _numbers(text: str | None, default: np.ndarray) -> np.ndarray:
     return default if text is None else np.array([float(x) for x in text.split()])
-
-
-def _point(v: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = v.tolist()
-    return x, y, z

@@ -4,41 +4,36 @@ from __future__ import annotations
 
 import csv
 import json
-from array import array
 from pathlib import Path
 
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_rate
 from poise.motion.io.numpy.arrays import refuse_bad, require
 from poise.motion.io.own.record import (
     loads,
-    make_clip,
     make_skeleton,
     refuse_overrides,
     source_from_json,
     source_to_json,
 )
 from poise.motion.io.raw import ReadOptions
+from poise.motion.io.tables import BLANK, number, number_table
 from poise.motion.io.text import (
     CUT_OFF,
-    append_numbers,
     at_line,
     decode,
-    number,
     read_bytes,
     shown,
     write_whole,
 )
-from poise.motion.limits import check_rate
 from poise.motion.skeleton import Skeleton
 
 VERSION = 1
 MARK = "# poise motion csv"
 """The first line of the format, before its version."""
 _TIME_SLACK = 0.01
-_BLANK = b" \t,;"
 
 
 def write_csv(clip: Clip, path: str | Path) -> None:
@@ -107,7 +102,9 @@ def read_csv(path: Path, options: ReadOptions) -> Clip:
     refuse_bad(rot, "the rotation", path, skeleton.names)
     name = loads(f'{{"name":{header["name"]}}}', path, "name")["name"]
     cyclic = header["cyclic"] == "true"
-    return make_clip(skeleton, root_pos, rot, options.fps or rate, str(name), cyclic, path)
+    # What a clip refuses is told with the file, once the clip bears the file's name.
+    clip = Clip(skeleton, root_pos, rot, options.fps or rate, path.stem, cyclic)
+    return clip.replaced(name=str(name))
 
 
 def _place(path: Path, key: str) -> str:
@@ -174,7 +171,7 @@ def _order(lines: list[bytes], first: int, skeleton: Skeleton, path: Path) -> li
 def _table(lines: list[bytes], first: int, order: list[int], path: Path) -> np.ndarray:
     """`(T, 4 + 4 J)` the numbers in the order of `columns`."""
     width, *at = order
-    rows = [line for line in lines[first + 1 :] if line.strip(_BLANK)]
+    rows = [line for line in lines[first + 1 :] if line.strip(BLANK)]
     if not rows:
         raise PoiseError("the file has no frames", path, CUT_OFF)
     try:
@@ -183,21 +180,8 @@ def _table(lines: list[bytes], first: int, order: list[int], path: Path) -> np.n
         table = np.zeros((0, 0))
     if table.shape != (len(rows), width):
         # Line by line is slower, but finds the place of the mistake.
-        table = _line_by_line(lines, first, width, path)
+        table = number_table(lines, first + 1, width, path, b",")
     return table[:, at]
-
-
-def _line_by_line(lines: list[bytes], first: int, width: int, path: Path) -> np.ndarray:
-    values: array[float] = array("d")
-    for i in range(first + 1, len(lines)):
-        if not lines[i].strip(_BLANK):
-            continue
-        tokens = lines[i].split(b",")
-        if len(tokens) != width:
-            what = f"the row has {len(tokens)} values; there are {width} columns"
-            raise PoiseError(what, at_line(path, i + 1))
-        append_numbers(values, tokens, at_line(path, i + 1))
-    return np.frombuffer(values, dtype=np.float64).reshape(-1, width)
 
 
 def _check_times(times: np.ndarray, fps: float, path: Path) -> None:

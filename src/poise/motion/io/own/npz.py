@@ -12,7 +12,6 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import npz_bytes, numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.own.record import (
-    make_clip,
     make_skeleton,
     refuse_overrides,
     source_from_json,
@@ -95,4 +94,5 @@ def read_poise_npz(data: Mapping[str, Any], path: Path, options: ReadOptions) ->
     cyclic = bool(np.all(np.asarray(data["cyclic"])))
     name = text_of(data["name"], path.stem)
     fps = options.fps or one_number(data, "fps", path)
-    return make_clip(skeleton, root_pos, rot, fps, name, cyclic, path)
+    # What a clip refuses is told with the file, once the clip bears the file's name.
+    return Clip(skeleton, root_pos, rot, fps, path.stem, cyclic).replaced(name=name)

@@ -11,10 +11,9 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.clip import Clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.io.text import CUT_OFF, MAX_JOINTS, MAX_VALUE, shown
-from poise.motion.skeleton import Skeleton, Source
+from poise.motion.skeleton import Skeleton, Source, triple
 
 MAX_RECORD = 16 << 20
 """Longer records are refused, characters."""
@@ -97,32 +96,13 @@ def make_skeleton(
             raise PoiseError(f"array '{what}' holds a number that is not usable", path)
     if not ((end_joints >= 0) & (end_joints < count)).all():
         raise PoiseError("array 'end_joints' names a joint that does not exist", path)
-    tips = tuple((int(j), _point(e)) for j, e in zip(end_joints, ends.tolist(), strict=True))
+    tips = tuple((int(j), triple(e)) for j, e in zip(end_joints, ends.tolist(), strict=True))
     if source.travel_joint is not None and source.travel_joint not in names:
         raise PoiseError(
             f"there is no joint '{source.travel_joint}'. {did_you_mean(source.travel_joint, names)}",
             path,
         )
-    try:
-        return Skeleton(tuple(names), tuple(int(p) for p in parents), offsets, tips, source)
-    except PoiseError as error:
-        raise PoiseError(error.what, path, error.hint) from None
-
-
-def make_clip(
-    skeleton: Skeleton,
-    root_pos: np.ndarray,
-    rot: np.ndarray,
-    fps: float,
-    name: str,
-    cyclic: bool,
-    path: Path,
-) -> Clip:
-    """The clip, with the file named in whatever a clip's own checks refuse."""
-    try:
-        return Clip(skeleton, root_pos, rot, fps, name, cyclic)
-    except PoiseError as error:
-        raise PoiseError(error.what, path, error.hint) from None
+    return Skeleton(tuple(names), tuple(int(p) for p in parents), offsets, tips, source)
 
 
 def refuse_overrides(options: ReadOptions, path: Path) -> None:
@@ -130,8 +110,3 @@ def refuse_overrides(options: ReadOptions, path: Path) -> None:
     for flag, value in (("--unit", options.unit_m), ("--up", options.up_axis)):
         if value is not None:
             raise PoiseError(f"{flag} is not for Poise's own files, which are in metres, Z up", path)
-
-
-def _point(v: list[float]) -> tuple[float, float, float]:
-    x, y, z = v
-    return x, y, z

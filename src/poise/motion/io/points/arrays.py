@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import check_rate
 from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
-from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
-from poise.motion.io.raw import ReadOptions
+from poise.motion.io.points.raw import RawPoints
+from poise.motion.io.raw import UNSTATED, ReadOptions
+from poise.motion.io.refused import FLAT_HINT
 from poise.motion.io.text import MAX_JOINTS, shown
-from poise.motion.limits import check_rate
 
 HUMANML3D = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
@@ -30,12 +30,7 @@ def is_points(data: Mapping[str, Any]) -> bool:
     return "positions" in data and "names" in data and not {"rot", "rotations", "quats"} & set(data)
 
 
-def read_points_arrays(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
-    """Keypoint arrays as the clip of a skeleton that is fitted to them."""
-    return points_clip(array_points(data, path, options), options)
-
-
-def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions | None = None) -> RawPoints:
+def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     """`positions (T, K, 3)` (NaN where missing), `names (K)`, `fps`; optional `confidence (T, K)`,
     `unit_m` and `up_axis`.
 
@@ -52,7 +47,7 @@ def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions | Non
         raise PoiseError(
             f"it has {len(names)} names and {positions.shape[1]} keypoints; each needs a name", path
         )
-    fps = None if options is None else options.fps
+    fps = options.fps
     if fps is None:
         if "fps" not in data:
             raise PoiseError("the arrays state no frame rate", path, "Add fps, or give --fps F")
@@ -73,22 +68,18 @@ def is_mdm(data: Mapping[str, Any]) -> bool:
     return "motion" in data and "lengths" in data
 
 
-def read_mdm(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
-    """One motion in the results of a motion diffusion model: the first, or number `options.take`."""
+def mdm_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
+    """One of the motions `motion (N, 22, 3, T)`: HumanML3D's joints, metres, Y up, 20 frames per second.
+
+    The first one, or number `options.take`. `lengths (N)` tells how many of the T frames are its own.
+    """
     take = options.take or "0"
     if not take.isdecimal():
         raise PoiseError(f"--take must be the number of a motion, got {shown(take)}", path)
-    return points_clip(mdm_points(data, path, int(take)), options)
-
-
-def mdm_points(data: Mapping[str, Any], path: Path, index: int = 0) -> RawPoints:
-    """One of the motions `motion (N, 22, 3, T)`: HumanML3D's joints, metres, Y up, 20 frames per second.
-
-    `lengths (N)` tells how many of the T frames are the motion's own.
-    """
+    index = int(take)
     motion = numeric(data, "motion", (None, len(HUMANML3D), 3, None), path)
     lengths = numeric(data, "lengths", (len(motion),), path)
-    if not 0 <= index < len(motion):
+    if index >= len(motion):
         raise PoiseError(f"it holds {len(motion)} motions, there is none with index {index}", path)
     length = lengths[index]
     if not 1 <= length <= motion.shape[-1]:

@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
-from poise.motion.io.points.raw import RawPoints, points_clip
-from poise.motion.io.points.trc import UNITS_M
-from poise.motion.io.raw import ReadOptions
+from poise.motion.io.points.raw import UNITS_M, RawPoints
+from poise.motion.io.raw import UNSTATED, ReadOptions
 from poise.motion.io.text import CUT_OFF, check_file, listed, shown
 
 _KEY = 0x50
@@ -52,12 +50,7 @@ def looks_like_c3d(head: bytes) -> bool:
     return 0 < points < 2048
 
 
-def read_c3d(path: Path, options: ReadOptions) -> Clip:
-    """A C3D file's labelled markers as the clip of a skeleton that is fitted to them."""
-    return points_clip(c3d_points(path), options)
-
-
-def c3d_points(path: Path) -> RawPoints:
+def c3d_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     """The markers of a C3D file: unit, rate and vertical as it states them; NaN where the residual is
     negative. Model outputs (angles, forces) are left out.
 

@@ -20,12 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
-from poise.motion.io.points.cells import row_numbers
-from poise.motion.io.points.raw import FLAT_HINT, RawPoints, points_clip
-from poise.motion.io.points.trc import UNITS_M
-from poise.motion.io.raw import ReadOptions
-from poise.motion.io.text import CUT_OFF, at_line, decode, listed, number, read_bytes, shown
+from poise.motion.io.points.raw import UNITS_M, RawPoints
+from poise.motion.io.raw import UNSTATED, ReadOptions
+from poise.motion.io.refused import FLAT_HINT
+from poise.motion.io.tables import number, row_numbers
+from poise.motion.io.text import CUT_OFF, at_line, decode, listed, read_bytes, shown
 
 _COLUMN = re.compile(r"^(.+?)[_. :]?(?:pos[_.]?)?\(?([xyz])\)?$", re.IGNORECASE)
 _SCORE = re.compile(r"^(.+?)[_. :](?:c|confidence|conf|score|likelihood|visibility)$", re.IGNORECASE)
@@ -55,12 +54,7 @@ def looks_like_points_csv(head: bytes) -> bool:
     return sum((name, "y") in axes for name, axis in axes if axis == "x") >= 4
 
 
-def read_points_csv(path: Path, options: ReadOptions) -> Clip:
-    """A table of keypoints as the clip of a skeleton that is fitted to them."""
-    return points_clip(csv_points(path, options), options)
-
-
-def csv_points(path: Path, options: ReadOptions | None = None) -> RawPoints:
+def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     """The points of a table in its own unit and axes.
 
     Raises:
@@ -157,10 +151,10 @@ def _rows(lines: list[str], first: int, layout: _Layout, path: Path) -> np.ndarr
 
 
 def _rate(
-    table: np.ndarray, layout: _Layout, stated: dict[str, str], options: ReadOptions | None, path: Path
+    table: np.ndarray, layout: _Layout, stated: dict[str, str], options: ReadOptions, path: Path
 ) -> float:
     """Frames per second: stated by the caller, by the comment, or measured on the times."""
-    if options is not None and options.fps is not None:
+    if options.fps is not None:
         return options.fps
     if "fps" in stated:
         return number(stated["fps"], path.name)

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
+from poise.motion.clip import Clip, check_poses, check_rate
 from poise.motion.info import body_height, landmarks, sampled
 from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
 from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
+from poise.motion.io.refused import FLAT_HINT
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 from poise.motion.keypoints import Keypoints
-from poise.motion.limits import check_poses, check_rate
 from poise.motion.points import FitConfig, fit_clip
 from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
 from poise.motion.skeleton import Source
 
-FLAT_HINT = "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file"
-"""What to do with 2D keypoints."""
+UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""Metres in a unit, as tables of points call it."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     """
     _check(raw)
     check_rate(float(options.fps or raw.fps), raw.path)
-    probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, _of(raw))
+    source = Source(format=raw.format, path=str(raw.path))
+    probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, source)
     bones = _body(probe)
     notes = list(raw.notes)
     up, unit = _up(bones, options, raw), _unit(bones, options, raw)
@@ -86,13 +89,18 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     )  # fmt: skip
 
 
-def points_clip(raw: RawPoints, options: ReadOptions) -> Clip:
-    """The clip of a skeleton that follows the file's keypoints, see `fit_clip`."""
-    return fit_clip(assemble_points(raw, options), FitConfig(smooth_hz=options.smooth_hz))
+def as_clip(points: Callable[..., RawPoints]) -> Callable[..., Clip]:
+    """The reader of clips that a reader of points makes: a skeleton follows them, see `fit_clip`.
 
+    points: takes a path and `ReadOptions`, or named arrays before them.
+    """
 
-def _of(raw: RawPoints) -> Source:
-    return Source(format=raw.format, path=str(raw.path))
+    def read(*given: Any) -> Clip:
+        options: ReadOptions = given[-1]
+        raw = assemble_points(points(*given), options)
+        return fit_clip(raw, FitConfig(smooth_hz=options.smooth_hz))
+
+    return read
 
 
 def _check(raw: RawPoints) -> None:
@@ -161,20 +169,18 @@ def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, 
     height, how = body_height(names, parents, _offsets(parents, pos), pos)
     if not height > 0:
         raise PoiseError("all keypoints lie in one place", raw.path)
-    if options.unit_m is not None:
-        return stated_unit(height, options.unit_m, raw.path)
-    if raw.unit_m is not None:
-        # A stated unit that makes a giant or a doll is a mistake of the file; the sentence tells.
-        return stated_unit(height, raw.unit_m, raw.path)
+    # A stated unit that makes a giant or a doll is a mistake, the file's too; the sentence tells.
+    stated = raw.unit_m if options.unit_m is None else options.unit_m
+    if stated is not None:
+        return stated_unit(height, stated, raw.path)
     return guess_unit(height, how, None, raw.path)
 
 
 def _up(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
     names, _, pos = bones
-    if options.up_axis is not None:
-        return Guess(options.up_axis.upper())
-    if raw.up_axis is not None:
-        return Guess(raw.up_axis)
+    stated = options.up_axis or raw.up_axis
+    if stated is not None:
+        return Guess(stated.upper())
     return guess_up(names, pos, np.median(pos - pos[:, :1], axis=0))
 
 

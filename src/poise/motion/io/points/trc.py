@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
-from poise.motion.io.points.cells import row_numbers
-from poise.motion.io.points.raw import RawPoints, points_clip
-from poise.motion.io.raw import ReadOptions
-from poise.motion.io.text import CUT_OFF, at_line, decode, number, read_bytes, shown
+from poise.motion.io.points.raw import UNITS_M, RawPoints
+from poise.motion.io.raw import UNSTATED, ReadOptions
+from poise.motion.io.tables import number, row_numbers
+from poise.motion.io.text import CUT_OFF, at_line, decode, read_bytes, shown
 
-UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 _LABEL_LINE = 3
 
 
@@ -35,16 +33,10 @@ def looks_like_trc(head: bytes) -> bool:
     return head[:12].lower() == b"pathfiletype" or b"\ndatarate\t" in head[:2000].lower()
 
 
-def read_trc(path: Path, options: ReadOptions) -> Clip:
-    """A TRC file as the clip of a skeleton that is fitted to its points.
+def trc_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
+    """The points of a TRC file in its own unit and axes.
 
     Rate and unit come from the header; the vertical is guessed. Blank cells are missing points.
-    """
-    return points_clip(trc_points(path), options)
-
-
-def trc_points(path: Path) -> RawPoints:
-    """The points of a TRC file in its own unit and axes.
 
     Raises:
         PoiseError: a header, row or cell that cannot be read, with its line and column.

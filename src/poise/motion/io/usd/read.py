@@ -8,19 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from poise.errors import PoiseError
-from poise.motion.clip import Clip
-from poise.motion.io.nodes import base_of, checked_unit, rigid_bones, unique_names
+from poise.motion.clip import Clip, check_poses
+from poise.motion.io.nodes import base_of, checked_unit, rigid_bones, turn_and_scale, unique_names
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_JOINTS, MAX_VALUE, check_file, listed, shown
-from poise.motion.limits import check_poses
-from poise.spatial import matrix_to_quat
 
 _EVEN_TIME = 0.01
 _DAMAGED = "It seems cut off or is no USD file"
-_SHEAR = 1e-3
 
 
 def pxr_package() -> Any:
@@ -53,9 +49,7 @@ def read_usd(path: Path, options: ReadOptions) -> Clip:
         rig, query = _animated_skeleton(pxr, stage, path, notes)
         raw = _raw_motion(pxr, stage, rig, query, path, options, notes)
     except (pxr.Tf.ErrorException, UnicodeDecodeError):
-        raise PoiseError(
-            "USD cannot read the file", path, "It seems cut off or is no USD file"
-        ) from None
+        raise PoiseError("USD cannot read the file", path, _DAMAGED) from None
     return assemble(raw, options)
 
 
@@ -109,6 +103,8 @@ def _raw_motion(
     names = unique_names(given, notes)
     codes, fps = _codes(stage, query, len(order), options, path, notes)
     local = np.stack([np.array(query.ComputeJointLocalTransforms(c)) for c in codes])
+    if local.shape[1] != len(order):
+        raise PoiseError("its animation and rest transforms do not give every joint a place", path)
     above = np.array(pxr.UsdGeom.Xformable(rig).ComputeLocalToWorldTransform(codes[0]))
     top = [x[0] for x in _parts(above[None], f"{path}, the skeleton's own transform", codes)]
     parts = [_parts(local[:, j], f"{path}, joint '{n}'", codes) for j, n in enumerate(names)]
@@ -177,16 +173,8 @@ def _parts(m: np.ndarray, where: str, codes: np.ndarray) -> tuple[np.ndarray, np
         raise PoiseError(
             f"its transform is no usable number at time code {codes[bad.argmax()]:g}", where
         )
-    axes = m[:, :3, :3].transpose(0, 2, 1)
-    scale = np.linalg.norm(axes, axis=1)
-    if scale.min() < 1e-9:
-        raise PoiseError("its transform flattens space", where)
-    turn = axes / scale[:, None]
-    if np.linalg.det(turn).min() < 0:
-        raise PoiseError("its transform mirrors space, which a body cannot do", where)
-    if np.abs(turn.transpose(0, 2, 1) @ turn - np.eye(3)).max() > _SHEAR:
-        raise PoiseError("its transform shears space", where)
-    return m[:, 3, :3], matrix_to_quat(torch.tensor(turn)).numpy(), scale
+    turn, scale = turn_and_scale(m[:, :3, :3].transpose(0, 2, 1), "transform", where)
+    return m[:, 3, :3], turn, scale
 
 
 def _ends(text: object, joints: int) -> tuple[tuple[int, tuple[float, float, float]], ...]:

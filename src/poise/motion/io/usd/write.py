@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import secrets
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -39,19 +39,16 @@ def write_usd(clip: Clip, path: str | Path) -> None:
     if suffix == ".usda":
         write_whole(path, stage.GetRootLayer().ExportToString())
         return
-    # Binary layers are written by the library, to a file beside that then takes the place.
-    beside = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.usdc")
-    if not path.parent.is_dir() or path.is_dir():
-        raise PoiseError("the file cannot be written", path, "Name a file in a folder that exists")
-    try:
-        if not stage.GetRootLayer().Export(str(beside)):
-            raise OSError("USD refused")
-        beside.replace(path)
-    except (OSError, pxr.Tf.ErrorException):
-        beside.unlink(missing_ok=True)
-        raise PoiseError(
-            "the file cannot be written", path, "Choose a folder you may write to"
-        ) from None
+    # Binary layers are written by the library alone, and only to a file.
+    with tempfile.TemporaryDirectory() as folder:
+        layer = Path(folder) / f"motion{suffix}"
+        try:
+            written = stage.GetRootLayer().Export(str(layer))
+        except pxr.Tf.ErrorException:
+            written = False
+        if not written:
+            raise PoiseError("USD could not make the file", path)
+        write_whole(path, layer.read_bytes())
 
 
 def _fill(pxr: Any, stage: Any, clip: Clip) -> None:

@@ -1,0 +1,106 @@
+"""Files that are known and no motion of a human: what they hold, and what to give instead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from poise.errors import PoiseError
+from poise.motion.io.raw import ReadOptions
+
+FLAT_HINT = "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file"
+"""What to do with 2D keypoints."""
+_HUMAN_HINT = "Give the human motion it was made from"
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_ROOT = 7
+_LEAST_JOINTS = 6
+
+
+def looks_like_asf(head: bytes) -> bool:
+    """Whether a file's first bytes are those of an ASF skeleton."""
+    lines = [line.strip().lower() for line in head.splitlines()]
+    return any(x.split()[:1] in ([b":bonedata"], [b":units"], [b":version"]) for x in lines if x)
+
+
+def refuse_asf(path: Path, options: ReadOptions) -> NoReturn:
+    """A skeleton alone does not move."""
+    raise PoiseError(
+        "an ASF file holds a skeleton without motion", path, "Give the AMC file, with --skeleton FILE"
+    )
+
+
+def looks_like_robot(head: bytes) -> bool:
+    """Whether a file is HDF5, or rows of root position, root quaternion and joint angles alone."""
+    return head.startswith(_HDF5_MAGIC) or _robot_columns(head) is not None
+
+
+def refuse_robot(path: Path, options: ReadOptions) -> NoReturn:
+    """Joint angles mean nothing without the model that they turn."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    columns = _robot_columns(head)
+    if columns is not None:
+        raise PoiseError(
+            f"its rows of {columns} numbers are a robot's root pose and {columns - _ROOT} joint angles "
+            "(qpos), which mean nothing without the robot's model",
+            path,
+            _HUMAN_HINT,
+        )
+    if head.startswith(_HDF5_MAGIC):
+        raise PoiseError(
+            "HDF5 files of motion (dm_control, MuJoCo) hold the joint angles of one fixed model, which "
+            "mean nothing without it",
+            path,
+            _HUMAN_HINT,
+        )
+    raise PoiseError("it is no motion that is known", path)
+
+
+def _robot_columns(head: bytes) -> int | None:
+    """The number of columns if the first line is numbers only, the 4th to 7th a unit quaternion."""
+    line = head.split(b"\n", 1)[0]
+    if line.count(b",") < _ROOT + _LEAST_JOINTS - 1:
+        return None
+    try:
+        row = [float(x) for x in line.split(b",")]
+    except ValueError:
+        return None
+    norm = sum(x * x for x in row[3:7])
+    return len(row) if 0.98 < norm < 1.02 else None
+
+
+def is_qpos(data: Mapping[str, Any]) -> bool:
+    """Whether named arrays are a robot's coordinates."""
+    return any(k in data for k in ("qpos", "dof_pos", "joint_pos", "dof"))
+
+
+def refuse_qpos(data: Mapping[str, Any], path: Path, options: ReadOptions) -> NoReturn:
+    """The same for arrays as for rows of text."""
+    raise PoiseError(
+        "it holds the joint angles of a robot (qpos), which mean nothing without the robot's model",
+        path,
+        _HUMAN_HINT,
+    )
+
+
+def looks_like_openpose(head: bytes) -> bool:
+    """Whether a file's first bytes are one frame of OpenPose's JSON."""
+    return head[:1] == b"{" and (b"pose_keypoints_2d" in head or b'"people"' in head[:200])
+
+
+def refuse_openpose(path: Path, options: ReadOptions) -> NoReturn:
+    """OpenPose's JSON holds the image coordinates of one frame of one camera."""
+    raise PoiseError("it holds the 2D keypoints of one camera's image (OpenPose)", path, FLAT_HINT)
+
+
+def refuse_folder(path: Path) -> NoReturn:
+    """A folder is no motion; one of OpenPose's JSON files is told from others."""
+    first = next(iter(sorted(path.glob("*.json"))), None)
+    if first is not None and first.is_file():
+        with first.open("rb") as file:
+            if looks_like_openpose(file.read(4096).lstrip()):
+                raise PoiseError(
+                    "this folder holds the 2D keypoints of one camera (OpenPose)", path, FLAT_HINT
+                )
+    raise PoiseError("this is a folder, not a motion file", path, "Name one file in it")
