@@ -8,7 +8,7 @@ import torch
 from scipy.stats import norm as normal
 
 from poise.errors import PoiseError
-from poise.nets import Composer, ProgressiveNet, gaussian_log_prob, half_forward, product_of_gaussians
+from poise.nets import Composer, ProgressiveNet, gaussian_log_prob, product_of_gaussians
 
 
 def rng(seed: int = 0) -> torch.Generator:
@@ -46,7 +46,7 @@ def test_columns_are_those_of_the_equation(lateral):
     torch.testing.assert_close(net(x), want[-1])
     torch.testing.assert_close(net.all(x), torch.stack(want, 1))
     assert net.all(x).shape == (9, 3, 3)
-    half = half_forward(net, x)
+    half = net(x.bfloat16())
     assert half.dtype == torch.float32
     torch.testing.assert_close(half, want[-1], rtol=0.03, atol=0.02)
     kept = net.copy()

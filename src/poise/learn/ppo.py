@@ -35,7 +35,6 @@ from poise.nets import (
     GaussianPolicy,
     RunningNorm,
     bfloat16_is_fast,
-    half_forward,
 )
 
 _SUMS: tuple[str, ...] = ("policy loss", "kl", "clip fraction", "policy gradient")
@@ -252,7 +251,7 @@ class PPO:
         total = batch.target.new_zeros(())
         for index in indices:
             obs = batch.obs.index_select(0, index)
-            value = half_forward(self.critic, obs) if self._half else self.critic(obs)
+            value = self.critic(obs)
             loss = (value - batch.target.index_select(0, index)).square().mean()
             self.value_optimizer.zero_grad(set_to_none=True)
             loss.backward()

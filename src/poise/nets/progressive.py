@@ -9,10 +9,9 @@ from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.nets.mlp import MLP, bare_linear
+from poise.nets.mlp import MLP, bare_linear, product
 
 Start = Literal["copy", "random"]
 
@@ -110,12 +109,10 @@ class ProgressiveNet(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """The last column's output, `(..., num_in)` to `(..., num_out)`.
 
-        Inputs in bfloat16 pass the hidden layers in bfloat16, as in `half_forward`; outputs are float32.
+        Inputs in bfloat16 pass the hidden layers in bfloat16, as in an `MLP`; outputs are float32.
         """
         if not self.lateral or len(self) == 1:
-            if x.dtype == torch.float32:
-                return self.column(-1).forward(x)
-            return self._run(len(self) - 1, x, [])[-1]
+            return self.column(-1).forward(x)
         return self._outputs(x)[-1]
 
     def all(self, x: Tensor) -> Tensor:
@@ -135,10 +132,10 @@ class ProgressiveNet(nn.Module):
         entered = [x]
         for i, layer in enumerate(linear):
             last = i == len(linear) - 1
-            h = _product(layer, entered[-1], last)
+            h = product(layer, entered[-1], last)
             if i and self.lateral:
                 for lateral, other in zip(self._laterals(k), before, strict=True):
-                    h = h + _product(lateral[i - 1], other[i], last)
+                    h = h + product(lateral[i - 1], other[i], last)
             entered.append(h if last else activation[i](h))
         return entered
 
@@ -162,12 +159,3 @@ class ProgressiveNet(nn.Module):
         self.laterals.append(earlier)
         self.log_std = torch.cat((self.log_std, self.log_std.new_zeros(1, self.num_out)))
         self.to(device)
-
-
-def _product(layer: nn.Module, x: Tensor, last: bool) -> Tensor:
-    """A linear layer in the arithmetic of `x`, or in float32 if it is the last one."""
-    assert isinstance(layer, nn.Linear)
-    if last or x.dtype == torch.float32:
-        return layer.forward(x.float())
-    bias = None if layer.bias is None else layer.bias.to(x.dtype)
-    return functional.linear(x, layer.weight.to(x.dtype), bias)
