@@ -203,7 +203,7 @@ def step(env: ImitationEnv, action: Tensor) -> dict[str, Any]:
 def state(env: ImitationEnv) -> dict[str, Any]:
     out: dict[str, Any] = {"help": env.help.now, "weights": env.weights}
     if (sampling := env.plugin(AdaptiveSampling)) is not None:
-        out["hardness"] = sampling.rates.state()
+        out["hardness"] = sampling.state()["hardness"]
     if (clock := env.plugin(RecoveryClock)) is not None:
         out["kind"] = clock.kind
     return out

@@ -18,8 +18,9 @@ PRIOR = 5.0
 ALWAYS_FAILS = 0.1
 
 
-class FailureRates:
-    """How often episodes failed in each of G motion bins lately.
+class AdaptiveSampling(Plugin):
+    """How often episodes failed in each of G motion bins lately: those in which they fail are begun in
+    more often.
 
     Attributes:
         odds: `(G,)` float64 on the CPU, with which bins are to be practised: f (1 + `ALWAYS_FAILS` - f)
@@ -31,6 +32,9 @@ class FailureRates:
         self._counts = torch.zeros(2, bins, dtype=torch.float64, device=device)
         self.steps = 0
         self._rate()
+
+    def count(self, ended: Ended) -> None:
+        self.add(ended.bins)
 
     def add(self, seen: Outcomes) -> None:
         """One control step of all worlds."""
@@ -46,32 +50,16 @@ class FailureRates:
         share = failed / (ended + PRIOR)
         self.odds = share * (1.0 + ALWAYS_FAILS - share)
 
-    def state(self) -> Tensor:
-        """What `load_state` takes: float64 `(1 + 3 G)`."""
-        return torch.cat((torch.tensor([self.steps]).double(), self.odds, self._counts.cpu().flatten()))
-
-    def load_state(self, state: Tensor) -> None:
-        """Goes on from `state()`; from that of other bins as if nothing were known."""
-        bins = self._counts.shape[1]
-        if len(state) != 1 + 3 * bins:
-            return
-        self.steps, own = int(state[0]), state[1:].cpu().reshape(3, bins)
-        self.odds = own[0].clone()
-        self._counts.copy_(own[1:])
-
-
-class AdaptiveSampling(Plugin):
-    """Keeps an environment's failure rates, by which its starts are drawn."""
-
-    def __init__(self, rates: FailureRates):
-        self.rates = rates
-
-    def count(self, ended: Ended) -> None:
-        self.rates.add(ended.bins)
-
     def state(self) -> dict[str, Tensor]:
-        return {"hardness": self.rates.state()}
+        """Under "hardness", float64 `(1 + 3 G)`."""
+        steps = torch.tensor([self.steps]).double()
+        return {"hardness": torch.cat((steps, self.odds, self._counts.cpu().flatten()))}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        if "hardness" in state:
-            self.rates.load_state(state["hardness"])
+        """Goes on from `state()`; from that of other bins as if nothing were known."""
+        bins, saved = self._counts.shape[1], state.get("hardness")
+        if saved is None or len(saved) != 1 + 3 * bins:
+            return
+        self.steps, own = int(saved[0]), saved[1:].cpu().reshape(3, bins)
+        self.odds = own[0].clone()
+        self._counts.copy_(own[1:])

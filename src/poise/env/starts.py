@@ -68,7 +68,7 @@ class Starts:
     def draw(self, count: int, odds: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(clip, frame) of `count` starts, `(count,)` each.
 
-        odds: `(G,)` float64 of the motion bins, such as `FailureRates.odds`. The share `hard` of the
+        odds: `(G,)` float64 of the motion bins, such as `AdaptiveSampling.odds`. The share `hard` of the
             starts lies in the `RUN_UP` before the middle of a bin that is drawn by them among those of
             its clip, or of all clips of odds above 0; where all are 0 an episode begins as without.
         """

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.config import PPOConfig
-from poise.learn.gae import gae
 from poise.learn.guard import TrainingError
-from poise.learn.losses import Drawn, explained_variance, policy_loss
+from poise.learn.losses import Drawn, explained_variance, gae, policy_loss
 from poise.learn.parallel import ALONE, Comm, average_gradients, moments, noise_name, shared_statistics
 from poise.learn.policy import PolicyBundle
 from poise.learn.rollout import Rollout
@@ -29,7 +28,7 @@ from poise.learn.state import (
     take,
     under,
 )
-from poise.learn.threaded_update import Acting, ThreadedUpdate, mean_gradient, parts_of
+from poise.learn.threaded_update import ThreadedUpdate, mean_gradient, parts_of
 from poise.nets import (
     MLP,
     GaussianPolicy,
@@ -234,17 +233,15 @@ class PPO:
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
         return {name: sum(m[name] for m in means) / len(means) for name in means[0]}, kl
 
-    def acting(self, threads: int = 1) -> Acting:
-        """The collecting policy: in the arithmetic of the update, so that both are equal at first."""
-        parallel = threads > 1 and self.comm.size == 1
-        return Acting(self.actor.policy, self._half, self._beside, parallel)
+    def distribution(self, obs: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The policy's own of normalised `obs (N, O)`, by the products of the update, so that the policy
+        that collects and the one that learns are equal at first."""
+        return self.actor.policy.distribution(obs.bfloat16() if self._half else obs, context)
 
     def mean(self, obs: Tensor) -> Tensor:
         """Mean actions of normalised `obs (N, O)` by the products of the update, with gradients."""
-        policy = self.actor.policy
-        context = policy.context(obs)
-        mean, _ = policy.distribution(obs.bfloat16() if self._half else obs, context)
-        return policy.drive(mean, context)
+        context = self.actor.policy.context(obs)
+        return self.actor.policy.drive(self.distribution(obs, context)[0], context)
 
     def _fit_value(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
         """One epoch of the critic; the sum of its losses."""

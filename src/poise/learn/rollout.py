@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
 from poise.learn.guard import check_finite
 from poise.learn.protocols import Style, VecEnv
-from poise.learn.threaded_update import Acting
 from poise.nets import GaussianPolicy, RunningNorm, gaussian_log_prob
 
 
@@ -94,13 +93,13 @@ def collect(
     episodes: Episodes,
     noise: torch.Generator,
     style: Style | None = None,
-    acting: Acting | None = None,
+    distribution: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]] | None = None,
 ) -> Tensor:
     """Fills the rollout's `obs` to `truncated` with on-policy steps from the raw `obs (N, O)`.
 
     Raw observations are gathered in `norm`, which is not frozen here. Returns the raw observation
     to go on from. A number that is not finite raises a `TrainingError`. `style` watches; the rewards are
-    the environment's. `acting` computes what is drawn from, by default as `policy` does.
+    the environment's. `distribution` gives what is drawn from, by default the policy's own.
     """
     episodes.begin()
     logs: list[Mapping[str, float]] = []
@@ -108,7 +107,7 @@ def collect(
     cut_obs: list[Tensor] = []
     log_stds: list[Tensor] = []
     horizon, num_envs = rollout.reward.shape
-    distribution = acting or policy.distribution
+    distribution = distribution or policy.distribution
     std, started = policy.log_std.exp(), float(norm.count) > 0
     if style is not None:
         style.begin(horizon)

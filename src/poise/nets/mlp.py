@@ -43,8 +43,8 @@ def bfloat16_is_fast() -> bool:
 def product(layer: nn.Module, x: Tensor, last: bool = False) -> Tensor:
     """A linear layer in the arithmetic of `x`, or in float32 if it is the `last` one.
 
-    In bfloat16 values and gradients differ from float32's by about 0.4 % of their size, far less than one
-    minibatch differs from the next. Weights stay float32, and so do gradients as the optimiser sees them.
+    In bfloat16 values and gradients differ from float32's by about 0.4 % of their size, far less than
+    one minibatch differs from the next. Weights stay float32, and so do their gradients.
     """
     assert isinstance(layer, nn.Linear)
     if last or x.dtype == torch.float32:

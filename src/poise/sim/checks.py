@@ -1,4 +1,4 @@
-"""What every backend checks before it touches its worlds."""
+"""What all backends share: what they show, and what they check before they touch their worlds."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.sim.backend import SimState
+from poise.sim.contacts import contact_columns
+from poise.sim.drive import Drive
 
 
 def compile_model(spec_or_model: mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
@@ -49,3 +52,68 @@ def row_index(rows: Tensor, num_envs: int) -> Tensor:
     if len(values) and bool(wrong):
         raise PoiseError(f"rows must be distinct and in 0 to {num_envs - 1}, got {rows.tolist()[:12]}")
     return rows
+
+
+class Worlds:
+    """The members that are the same in all backends; see `Backend`."""
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, device: torch.device) -> None:
+        if num_envs < 1:
+            raise PoiseError(f"num_envs must be above 0, got {num_envs}")
+        self._model, self._num_envs, self._device = model, num_envs, device
+
+    def _show(self) -> None:
+        """Makes state and drive, once the worlds are there."""
+        self._state = SimState(self._views)
+        self._drive = Drive(**self._views(["ctrl", "qfrc_applied", "xfrc_applied"]))
+        self._contact_bodies, self._contact_columns = (
+            torch.from_numpy(x).to(self._device) for x in contact_columns(self._model)
+        )
+        if len(self._contact_bodies):
+            self._state.bind(["sensordata"])
+
+    def _views(self, names: list[str]) -> dict[str, Tensor]:
+        raise NotImplementedError
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self._model
+
+    @property
+    def num_envs(self) -> int:
+        return self._num_envs
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    @property
+    def state(self) -> SimState:
+        return self._state
+
+    @property
+    def drive(self) -> Drive:
+        return self._drive
+
+    def contacts(self) -> Tensor:
+        if not len(self._contact_bodies):
+            raise PoiseError(
+                "the model has no contact force sensors",
+                hint="Call poise.sim.add_contact_sensors(spec) before making the backend.",
+            )
+        sensed = self._state["sensordata"]
+        out = sensed.new_zeros(self._num_envs, self._model.nbody, 3)
+        # The sensed force is what the first body exerts on the others, so the sign turns.
+        out[:, self._contact_bodies] = -sensed[:, self._contact_columns]
+        return out
+
+    @staticmethod
+    def _holds_derived(snapshot: Tensor, n: int, full: int, short: int) -> bool:
+        """Whether a snapshot of n worlds has derived fields, `(n, full)`, or none, `(n, short)`."""
+        if snapshot.shape not in ((n, full), (n, short)):
+            raise PoiseError(
+                f"the snapshot has shape {tuple(snapshot.shape)}, but this backend needs "
+                f"({n}, {full}), or ({n}, {short}) without derived fields",
+                hint="Restore into the same model, with the same state fields bound.",
+            )
+        return snapshot.shape[1] == full
