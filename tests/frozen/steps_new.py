@@ -17,8 +17,8 @@ import poise
 from poise.cli.main import main as command
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
-from poise.env.adaptive_sampling import AdaptiveSampling
 from poise.env.recovery.clock import RecoveryClock
+from poise.env.starts import AdaptiveSampling
 from poise.eval import read_score
 from poise.jobs.deliver import deliver
 from poise.jobs.open import open_run

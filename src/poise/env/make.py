@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from poise.env.adaptive_sampling import AdaptiveSampling
 from poise.env.body_assignment import BodyAssignment
 from poise.env.goals.clip import ClipGoal
 from poise.env.goals.goal import Goal
@@ -12,7 +11,7 @@ from poise.env.help import HelpBudget
 from poise.env.plugins import Plugin
 from poise.env.recovery.clock import RecoveryClock
 from poise.env.reference import Reference
-from poise.env.starts import Starts
+from poise.env.starts import AdaptiveSampling, Starts
 from poise.env.task import TaskConfig
 from poise.sim import Backend
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.learn.guard import TrainingError
+from poise.learn.rollout import TrainingError
 from poise.nets.transition import Filled, Known, TransitionNet, joint_positions
 
 N = TypeVar("N", bound=nn.Module)

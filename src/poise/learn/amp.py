@@ -23,9 +23,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.learn.guard import TrainingError, check_finite
 from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_statistics, sums
 from poise.learn.protocols import DemoSampler, FeatureSource
+from poise.learn.rollout import TrainingError, check_finite
 from poise.learn.state import (
     State,
     load_module,

@@ -29,7 +29,6 @@ from poise.version import __version__
 
 FORMAT = 1
 LATEST = "checkpoint.safetensors"
-BEST = "best.safetensors"
 LAST_GOOD = "last_good.safetensors"
 _TEMPORARY = ".partial"
 

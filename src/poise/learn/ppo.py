@@ -12,11 +12,10 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.config import PPOConfig
-from poise.learn.guard import TrainingError
 from poise.learn.losses import Drawn, explained_variance, gae, policy_loss
 from poise.learn.parallel import ALONE, Comm, average_gradients, moments, noise_name, shared_statistics
 from poise.learn.policy import PolicyBundle
-from poise.learn.rollout import Rollout
+from poise.learn.rollout import Rollout, TrainingError
 from poise.learn.state import (
     State,
     load_module,

@@ -16,7 +16,6 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.learn.checkpoint import TrainerMeta, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.config import PPOConfig
-from poise.learn.guard import TrainingError, check_finite
 from poise.learn.parallel import (
     ALONE,
     Comm,
@@ -29,7 +28,7 @@ from poise.learn.parallel import (
 from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import Style, VecEnv
-from poise.learn.rollout import Episodes, Rollout, collect
+from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.learn.state import State, load_module, prefixed, take, under
 from poise.settings import check_data
 

@@ -69,31 +69,27 @@ class ProgressiveNet(nn.Module):
         """Column k's own layers."""
         return cast(MLP, self.columns[k])
 
-    def add(self, start: Start, generator: torch.Generator, source: int = -1) -> None:
+    def add(self, start: Start, generator: torch.Generator) -> None:
         """Freezes all columns and appends one that learns.
 
         Args:
-            start: "copy" makes it the same function as column `source`; "random" draws new weights, the
+            start: "copy" makes it the same function as the last column; "random" draws new weights, the
                 lateral ones too.
             generator: source of random weights.
-            source: index of the column that is copied.
         """
         if start not in ("copy", "random"):
             raise PoiseError(f"a column cannot start as '{start}'", hint="Use copy or random")
-        if not -len(self) <= source < len(self):
-            raise PoiseError(f"there is no column {source} among {len(self)}")
-        source %= len(self)
+        last = len(self) - 1
         self.requires_grad_(False)
         self._append(generator)
         if start == "random":
             return
-        self.column(-1).load_state_dict(self.column(source).state_dict())
-        for j, lateral in enumerate(self._laterals(len(self) - 1)):
-            if j < source:
-                lateral.load_state_dict(self._laterals(source)[j].state_dict())
-            else:
-                for p in lateral.parameters():
-                    nn.init.zeros_(p)
+        self.column(-1).load_state_dict(self.column(last).state_dict())
+        for lateral, other in zip(self._laterals(last + 1), self._laterals(last), strict=False):
+            lateral.load_state_dict(other.state_dict())
+        if self.lateral:
+            for p in self._laterals(last + 1)[last].parameters():
+                nn.init.zeros_(p)
 
     def copy(self) -> ProgressiveNet:
         """An independent copy."""

@@ -9,7 +9,7 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
-from poise.sim.checks import Worlds, check_state, compile_model, row_index
+from poise.sim.worlds import Worlds, check_state, compile_model, row_index
 
 State = tuple[Tensor, Tensor]
 _NONE = int(mujoco.mjtStage.mjSTAGE_NONE)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
 from poise.sim.backend import STANDARD_FIELDS
-from poise.sim.checks import Worlds, check_state, compile_model, row_index
 from poise.sim.warp_model import WarpModel
 from poise.sim.warp_setup import (
     Capacity,
@@ -24,6 +23,7 @@ from poise.sim.warp_setup import (
     load_warp,
     resolve_device,
 )
+from poise.sim.worlds import Worlds, check_state, compile_model, row_index
 
 _STATE = (
     "time", "qpos", "qvel", "act", "history", "plastic", "qacc_warmstart", "ctrl", "qfrc_applied",
