@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import mujoco
@@ -96,7 +97,7 @@ def row_index(rows: Tensor, num_envs: int) -> Tensor:
     return rows
 
 
-class Worlds:
+class Worlds(ABC):
     """The members that are the same in all backends; see `Backend`."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, device: torch.device) -> None:
@@ -114,8 +115,9 @@ class Worlds:
         if len(self._contact_bodies):
             self._state.bind(["sensordata"])
 
+    @abstractmethod
     def _views(self, names: list[str]) -> dict[str, Tensor]:
-        raise NotImplementedError
+        """Live views of the state's fields by name, see `SimState.bind`."""
 
     @property
     def model(self) -> mujoco.MjModel:
