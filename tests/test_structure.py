@@ -29,7 +29,7 @@ EXPLAINED = {
         "jobs/imitate.py:imitate", "jobs/track/clips.py:track_clip", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
-        "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/checks.py:add_contact_sensors",
+        "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "view/data.py:decode_track",
     ),
     "called by the libraries that they belong to": (

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from poise.errors import PoiseError
 from poise.learn.rollout import TrainingError
 from poise.nets.transition import Filled, Known, TransitionNet, joint_positions
+from poise.settings import validate
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -49,9 +50,7 @@ class Adaptation:
             raise PoiseError(
                 f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}"
             )
-        for name, known in (("contacts", ("detached", "paper")), ("optimizer", ("sgd", "adam"))):
-            if getattr(self, name) not in known:
-                raise PoiseError(f"{name} must be one of {', '.join(known)}", "Adaptation")
+        validate(self)
 
 
 def contact_loss(feet: Tensor, contact: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.state import State, take
+from poise.settings import validate
 
 Rule = Literal["uniform", "soft", "hard", "floor"]
 Union = Literal["recent", "last"]
@@ -48,11 +49,7 @@ class MiningConfig:
     code), or in the last one (its paper)."""
 
     def __post_init__(self) -> None:
-        if self.rule not in ("uniform", "soft", "hard", "floor"):
-            hint = "Use uniform, soft, hard or floor"
-            raise PoiseError(f"there is no rule of mining '{self.rule}'", "MiningConfig", hint)
-        if self.union not in ("recent", "last"):
-            raise PoiseError(f"there is no union '{self.union}'", "MiningConfig", "Use recent or last")
+        validate(self)
         for name in ("floor", "fade"):
             if not 0 <= getattr(self, name) <= 1:
                 raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "MiningConfig")

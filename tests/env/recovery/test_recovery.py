@@ -65,7 +65,7 @@ def test_settings_that_cannot_be_are_refused(built):
     ):  # fmt: skip
         with pytest.raises(PoiseError):
             Recovery(**wrong)
-    with pytest.raises(PoiseError, match="torques or an action"):
+    with pytest.raises(PoiseError, match="by cannot be 'gravity'"):
         Drop(by="gravity")  # type: ignore[arg-type]
     with pytest.raises(PoiseError, match="far from the reference alone"):
         replace(built.task, recovery=None)
