@@ -20,7 +20,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -39,12 +39,12 @@ from poise.eval.inbetween import (
     test_set,
 )
 from poise.jobs.inbetween.training import Inbetween, Task, begin, train
-from poise.learn.adapt import Adaptation, adapt, best_setting, choose_iterations
+from poise.learn.adapt import Adaptation, adapt
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.metrics import physics
-from poise.nets.between import BetweenConfig, parameter_count
-from poise.nets.transition import Known
+from poise.nets.between import BetweenConfig
+from poise.nets.transition import Filled, Known
 from poise.synth.baselines import Baseline
 
 PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}
@@ -141,6 +141,48 @@ def chosen(
     return best_setting(among, lambda s: choose_iterations(model.net, known, length, rated, s))
 
 
+def choose_iterations(
+    net: torch.nn.Module,
+    known: Known,
+    length: int,
+    score: Callable[[Filled], float],
+    config: Adaptation | None = None,
+    most: int = 7,
+) -> tuple[int, tuple[float, ...]]:
+    """The number of iterations, 0 to `most`, after which transitions score lowest on validation
+    sequences.
+
+    The paper reports the best iteration on the test set itself, which is tuning on test data; this is
+    for sequences held out for choices. Returns the number and the scores of 0, 1, ... iterations.
+    """
+    config = config or Adaptation()
+
+    @torch.no_grad()
+    def scored(own: torch.nn.Module) -> float:
+        filled = [
+            own.fill(Known(*(x[low : low + config.batch] for x in known)), length)  # type: ignore[operator]
+            for low in range(0, len(known.target_root), config.batch)
+        ]
+        return score(Filled(*(torch.cat(x) for x in zip(*filled, strict=True))))
+
+    scores = [scored(net)]
+    steps = Adaptation(**{**config.__dict__, "iterations": most})
+    adapt(net, known, length, steps, lambda i, own, loss: scores.append(scored(own)))
+    best = min(range(len(scores)), key=scores.__getitem__)
+    return best, tuple(scores)
+
+
+def best_setting(
+    choices: Sequence[Adaptation], tried: Callable[[Adaptation], tuple[int, tuple[float, ...]]]
+) -> Adaptation:
+    """The setting, with its iterations, that scored lowest; `tried` runs `choose_iterations` for one."""
+    if not choices:
+        raise PoiseError("there is no setting to choose from")
+    results = [(config, *tried(config)) for config in choices]
+    config, iterations, _ = min(results, key=lambda r: r[2][r[1]])
+    return Adaptation(**{**config.__dict__, "iterations": iterations})
+
+
 def _ratio(value: float, before: float) -> float:
     return value / before if abs(before) > 1e-9 else 1.0
 
@@ -179,7 +221,7 @@ def cost(model: InbetweenModel, test: TestSet, length: int = 30, count: int = 20
     iteration = (time.perf_counter() - begun) / count
     torch.set_num_threads(threads)
     return {
-        "parameters": parameter_count(model.net),
+        "parameters": sum(p.numel() for p in model.net.parameters()),
         "seconds_a_sequence": alone,
         "seconds_an_iteration": iteration,
     }

@@ -20,8 +20,6 @@ EXPLAINED = {
     "figures of the benchmarks": (
         
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
-        "learn/adapt.py:adapt_each", "learn/adapt.py:choose_iterations", "learn/adapt.py:best_setting",
-        "nets/between.py:parameter_count",
     ),
     "analytic inverse kinematics, which keyframes will need": (
         "kin/ik/analytic.py:clip_ik", "kin/ik/angles.py:count_jumps", "kin/ik/body.py:body_points",
@@ -31,10 +29,8 @@ EXPLAINED = {
         "jobs/imitate.py:imitate", "eval/card.py:read_score", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
-        "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/contacts.py:add_contact_sensors",
-        "sim/guard.py:replay_dump", "view/data.py:decode_track", "sim/drive.py:Drive.add_ctrl",
-        "sim/drive.py:Drive.add_root_wrench", "nets/gaussian.py:GaussianPolicy.entropy",
-        "plan/inverse_dynamics.py:InverseDynamics.on_bodies",
+        "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
+        "sim/guard.py:replay_dump", "view/data.py:decode_track",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
-from poise.env.adaptive_sampling import EVERY, KEPT, PRIOR, AdaptiveSampling, FailureRates
 from poise.env.bins import MotionBins, Outcomes
-from poise.env.starts import Starts
+from poise.env.starts import EVERY, KEPT, PRIOR, AdaptiveSampling, Starts
 from poise.errors import PoiseError
 from poise.recipes.imitation import Imitation
 from toy_human import swing
@@ -128,14 +127,14 @@ def outcome(bin: int, failed: bool) -> Outcomes:
 
 
 def test_moments_are_hard_where_episodes_fail():
-    hard = FailureRates(3)
+    hard = AdaptiveSampling(3)
     assert hard.odds.tolist() == [0.0] * 3
     for k in range(EVERY):
         hard.add(outcome(k % 2, failed=k % 4 == 0))
     # Of 32 episodes of the first, half failed.
     share = 16 / (32 + PRIOR)
     assert hard.odds.tolist() == pytest.approx([share * (1.1 - share), 0.0, 0.0])
-    other = FailureRates(3)
+    other = AdaptiveSampling(3)
     other.load_state(hard.state())
     for each in (hard, other):
         for _ in range(EVERY):
@@ -147,7 +146,7 @@ def test_moments_are_hard_where_episodes_fail():
         assert each.odds[2] == pytest.approx(always * (1.1 - always))
         assert 0.1 < each.odds[2] < each.odds[0]
     # Of other moments nothing is known.
-    fresh = FailureRates(4)
+    fresh = AdaptiveSampling(4)
     fresh.load_state(hard.state())
     assert fresh.odds.tolist() == [0.0] * 4
 
@@ -250,7 +249,7 @@ def test_a_run_goes_on_where_it_was(task: Imitation):
     for _ in range(EVERY + 20):
         one.step(torch.randn(6, one.num_actions, generator=rng))
     rates = one.plugin(AdaptiveSampling)
-    assert rates is not None and float(rates.rates.odds.max()) > 0.1
+    assert rates is not None and float(rates.odds.max()) > 0.1
     two.load_state(one.state())
     for _ in range(EVERY):
         action = torch.randn(6, one.num_actions, generator=rng)

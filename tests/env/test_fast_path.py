@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, RewardTerm
+from poise.env.actuation import record
 from poise.env.frame import Frame, LazyPose
-from poise.env.record import record
 from poise.env.terms.evaluate import MANY
 from poise.sim import CpuBackend, body_linear_velocity_w
 from poise.spatial import (

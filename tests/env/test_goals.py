@@ -91,7 +91,7 @@ def test_a_stream_that_jumps_or_sends_no_pose_is_told(task: Imitation) -> None:
     far[0] += 4.0
     torn[9] = float("nan")
     goal.push(torn)
-    assert goal.buffer.count.tolist() == [5]
+    assert goal.count.tolist() == [5]
     goal.push(far)
     goal.push(far.clone())
     assert len(goal.notes) == 2

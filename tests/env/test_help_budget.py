@@ -43,22 +43,27 @@ def test_without_help_the_drive_is_that_of_help_scaled_to_nothing(make_env):
     assert short.wrench.body == long.wrench.body
 
 
+def count(budget: HelpBudget, ended: int, failed: int) -> None:
+    """One control step in which episodes of a single group ended, some by failure."""
+    budget.add(torch.zeros(ended).long(), torch.ones(ended), torch.arange(ended) < failed)
+
+
 def test_it_counts_with_fading_memory():
     budget = HelpBudget(SuccessHelp(lower_at=0.8, raise_at=0.5, factor=0.5, every=2))
-    budget.count(10, 0)
+    count(budget, 10, 0)
     assert float(budget.scale) == 1.0
-    budget.count(0, 0)
+    count(budget, 0, 0)
     assert float(budget.scale) == 0.5 and budget.success == 1.0
-    budget.count(2, 2)
+    count(budget, 2, 2)
     # 8 remembered successes and 2 failures.
     assert budget.success == pytest.approx(0.8)
-    budget.count(0, 0)
+    count(budget, 0, 0)
     assert float(budget.scale) == 0.25
 
 
 def test_nothing_ended_is_no_success():
     budget = HelpBudget(SuccessHelp(every=1))
-    budget.count(0, 0)
+    count(budget, 0, 0)
     assert float(budget.scale) == 1.0
 
 

@@ -28,7 +28,8 @@ def task(make_task: Callable[..., Imitation]) -> Imitation:
 def ended(budget: HelpBudget, *outcomes: tuple[int, bool]) -> None:
     """One step in which episodes of clips ended, and whether by failure."""
     clips = torch.tensor([c for c, _ in outcomes], dtype=torch.long)
-    budget.count_worlds(clips, torch.tensor([f for _, f in outcomes], dtype=torch.bool))
+    failed = torch.tensor([f for _, f in outcomes]).double()
+    budget.add(clips, torch.ones_like(failed), failed)
 
 
 def test_one_group_counts_as_plain_python_does():
@@ -38,14 +39,14 @@ def test_one_group_counts_as_plain_python_does():
     for step in range(1, 400):
         n = int(torch.randint(0, 6, (), generator=rng))
         failed = torch.rand(n, generator=rng) < (0.9 if step % 100 > 60 else 0.2)
-        budget.count_worlds(torch.randint(0, 7, (n,), generator=rng), failed)
+        budget.add(torch.randint(0, 7, (n,), generator=rng), torch.ones(n), failed)
         counts = [counts[0] + n, counts[1] + int(failed.sum())]
         if step % 3 == 0:
             success = 1.0 - counts[1] / counts[0] if counts[0] else float("nan")
             scale = float(torch.tensor(rule.scale(scale, step, success), dtype=torch.float32))
             counts = [KEPT * x for x in counts]
         assert budget.now == float(budget.scale) == scale
-        assert budget.state().tolist() == [scale, step, *counts]
+        assert budget.state()["help"].tolist() == [scale, step, *counts]
     assert scale < 1.0 and budget.scale.dim() == 0
 
 
@@ -192,20 +193,18 @@ def test_states_of_other_kinds():
     ended(budget, (0, True), (1, False))
     # One of all worlds: its scale for all, and episodes of no clip in particular.
     other = HelpBudget(RULE, groups=3)
-    other.load_state(torch.tensor([0.75, 8.0, 6.0, 2.0], dtype=torch.float64))
+    other.load_state({"help": torch.tensor([0.75, 8.0, 6.0, 2.0], dtype=torch.float64)})
     assert other.scale.tolist() == [0.75] * 3 and other.steps == 8
-    assert other.state().tolist() == [0.75, 8, 0, 0, *[0.75] * 3, *[0] * 6]
+    assert other.state()["help"].tolist() == [0.75, 8, 0, 0, *[0.75] * 3, *[0] * 6]
     single = HelpBudget(RULE)
     single.load_state(budget.state())
-    assert single.state().tolist() == [0.5, 1, 2, 1]
+    assert single.state()["help"].tolist() == [0.5, 1, 2, 1]
     with pytest.raises(PoiseError, match="help for 2 groups, and there are 3"):
         other.load_state(budget.state())
     with pytest.raises(PoiseError, match="2 groups need as many scales"):
         budget.set(torch.ones(3))
     with pytest.raises(PoiseError, match="at least 1 group"):
         HelpBudget(groups=0)
-    with pytest.raises(PoiseError, match="name no group"):
-        budget.count(1, 0)
 
 
 def test_another_way_to_share_is_refused(task: Imitation):

@@ -17,8 +17,8 @@ import poise
 from poise.cli.main import main as command
 from poise.control import SuccessHelp
 from poise.env import ImitationEnv
-from poise.env.adaptive_sampling import AdaptiveSampling
 from poise.env.recovery.clock import RecoveryClock
+from poise.env.starts import AdaptiveSampling
 from poise.eval import read_score
 from poise.jobs.deliver import deliver
 from poise.jobs.open import open_run
@@ -204,7 +204,7 @@ def step(env: ImitationEnv, action: Tensor) -> dict[str, Any]:
 def state(env: ImitationEnv) -> dict[str, Any]:
     out: dict[str, Any] = {"help": env.help.now, "weights": env.weights}
     if (sampling := env.plugin(AdaptiveSampling)) is not None:
-        out["hardness"] = sampling.rates.state()
+        out["hardness"] = sampling.state()["hardness"]
     if (clock := env.plugin(RecoveryClock)) is not None:
         out["kind"] = clock.kind
     return out

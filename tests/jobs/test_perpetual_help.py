@@ -200,8 +200,8 @@ def test_a_checkpoint_with_one_scale_for_all_goes_on_by_clip(
     old = {k: v for k, v in to_data(config).items() if k not in ("help_by", "adaptive_sampling")}
     assert config_of(old) == replace(config, help_by="all", adaptive_sampling=0.0)
     stages = StageTrainer(begin(tmp_path, library(), config), tmp_path, until, 1, tensorboard=False)
-    plain: Callable[[], Tensor] = stages.env.help.state
-    monkeypatch.setattr(stages.env.help, "state", lambda: plain()[:4])
+    plain: Callable[[], dict[str, Tensor]] = stages.env.help.state
+    monkeypatch.setattr(stages.env.help, "state", lambda: {"help": plain()["help"][:4]})
     stages.iterate()
     stages.save()
     left = stages.help

@@ -11,9 +11,6 @@ from poise.errors import PoiseError
 from poise.learn.adapt import (
     Adaptation,
     adapt,
-    adapt_each,
-    best_setting,
-    choose_iterations,
     contact_loss,
     smoothness_loss,
 )
@@ -112,28 +109,6 @@ def test_an_iteration_is_one_step_however_large_the_set_and_its_parts() -> None:
     thrice = type(k)(*(x.repeat(3, *[1] * (x.dim() - 1)) for x in k))
     more = adapt(net, thrice, 12, config).fill(k, 12).pos
     assert torch.allclose(whole, more, atol=1e-5)
-
-
-def test_per_sequence_is_each_one_adapted_alone() -> None:
-    net, k = network(), known(bank(), dtype=torch.float32)
-    config = Adaptation(iterations=2, lr=1e-4)
-    each = adapt_each(net, k, 12, config)
-    second = type(k)(*(x[1:] for x in k))
-    alone = adapt(net, second, 12, config).fill(second, 12)
-    assert torch.allclose(each.pos[1:], alone.pos, atol=1e-6)
-    whole = adapt(net, k, 12, config).fill(k, 12)
-    assert not torch.allclose(each.pos, whole.pos, atol=1e-7)
-
-
-def test_iterations_are_chosen_by_their_score() -> None:
-    net, k = network(), known(bank(), dtype=torch.float32)
-    scores = iter([3.0, 2.0, 1.0, 2.5, 4.0])
-    best, tried = choose_iterations(net, k, 12, lambda filled: next(scores), Adaptation(), most=4)
-    assert best == 2 and tried == (3.0, 2.0, 1.0, 2.5, 4.0)
-    settings = [Adaptation(lr=1e-5), Adaptation(lr=1e-4)]
-    results = {1e-5: (1, (0.9, 0.7)), 1e-4: (0, (0.5, 0.8))}
-    chosen = best_setting(settings, lambda s: results[s.lr])
-    assert chosen.lr == 1e-4 and chosen.iterations == 0
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:

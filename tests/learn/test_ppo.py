@@ -21,7 +21,7 @@ from poise.learn import (
 )
 from poise.learn.losses import clipped_surrogate
 from poise.learn.rollout import Episodes, collect
-from poise.nets import gaussian_kl
+from poise.nets import gaussian_kl, gaussian_log_prob
 
 TOY = PPOConfig(
     std=0.3,
@@ -49,10 +49,10 @@ def filled(ppo: PPO, horizon: int = 8, num_envs: int = 16, seed: int = 0) -> Rol
     rollout = Rollout(horizon, num_envs, ppo.actor.num_obs, ppo.actor.num_actions, torch.device("cpu"))
     rollout.obs.copy_(torch.randn(rollout.obs.shape, generator=g))
     with torch.no_grad():
-        action, mean = ppo.actor.policy.sample(rollout.obs[:-1], g)
-        rollout.action.copy_(action)
-        rollout.mean.copy_(mean)
-        rollout.log_prob.copy_(ppo.actor.policy.log_prob(rollout.obs[:-1], action))
+        policy = ppo.actor.policy
+        rollout.action.copy_(policy.act(rollout.obs[:-1], g))
+        rollout.mean.copy_(policy(rollout.obs[:-1]))
+        rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, policy.log_std))
     rollout.reward.copy_(10 + torch.randn(rollout.reward.shape, generator=g))
     return rollout
 
@@ -222,7 +222,7 @@ def test_a_rollout_records_what_was_seen_done_and_reached():
     torch.testing.assert_close(rollout.obs[1, :, :2], rollout.obs[0, :, :2] + 0.2 * rollout.action[0])
     assert torch.equal(rollout.obs[-1], obs)
     with torch.no_grad():
-        want = actor.policy.log_prob(rollout.obs[:-1], rollout.action)
+        want = gaussian_log_prob(rollout.action, *actor.policy.distribution(rollout.obs[:-1]))
     torch.testing.assert_close(rollout.log_prob, want)
     assert episodes.finished == 6 and episodes.finished_length == 6 * LIMIT and episodes.failures == 0
     assert episodes.length.tolist() == [3] * 6

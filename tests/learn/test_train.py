@@ -14,7 +14,7 @@ import torch
 from toy_point_env import PointEnv
 
 from poise.errors import PoiseError
-from poise.learn import BEST, LATEST, PPOConfig, Trainer, Until, load_checkpoint, load_policy, run
+from poise.learn import LATEST, PPOConfig, Trainer, Until, load_checkpoint, load_policy, run
 
 TOY = PPOConfig(
     std=0.3,
@@ -104,34 +104,23 @@ def test_a_run_resumes_and_leaves_the_same_table(tmp_path):
     assert run(make(), Until(iterations=6), tmp_path / "parts").last is None
 
 
-def test_limits_callbacks_and_the_best_policy(tmp_path):
+def test_limits_and_callbacks(tmp_path):
     seen: list[int] = []
-    scores = {1: 0.5, 2: 0.9, 3: 0.1}
     trainer = make()
     result = run(
         trainer,
         Until(samples=3 * 12 * 32, minutes=10),
         tmp_path,
         on_iteration=lambda s: seen.append(s.iteration),
-        score=lambda s: scores[s.iteration],
         tensorboard=False,
     )
     assert seen == [1, 2, 3] and result.checkpoint == tmp_path / LATEST
     assert not (tmp_path / "tensorboard").exists()
-    best = load_policy(tmp_path / BEST, character="point", num_obs=4, num_actions=2)
-    assert best.meta["metadata"]["iteration"] == 2 and best.meta["metadata"]["best_score"] == 0.9
-    for _ in range(2):  # The best score outlives more than one resumed run.
-        again = make()
-        run(again, Until(iterations=3), tmp_path, score=lambda s: 0.7, tensorboard=False)
-        assert again.metadata["best_score"] == 0.9
-        again.save(tmp_path / LATEST)
     assert run(make(), Until(minutes=0)).last is None
     stopped = run(make(), Until(iterations=9), on_iteration=lambda s: s.iteration < 2)
     assert stopped.last is not None and stopped.last.iteration == 2
     with pytest.raises(PoiseError, match="needs a limit"):
         Until()
-    with pytest.raises(PoiseError, match="already holds a run"):
-        run(make(), Until(iterations=1), tmp_path, resume=False)
 
 
 def test_ctrl_c_finishes_the_iteration_and_saves(tmp_path):

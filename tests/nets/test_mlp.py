@@ -45,3 +45,23 @@ def test_errors_name_what_exists():
         make(activation="rellu")
     with pytest.raises(PoiseError, match="at least 1 unit"):
         MLP(0, (4,), 1, generator=torch.Generator())
+
+
+@pytest.mark.parametrize("activation", ["relu", "silu"])
+@pytest.mark.parametrize("hidden", [(), (64,), (64, 32)])
+def test_in_bfloat16_values_and_gradients_differ_by_rounding_alone(activation, hidden):
+    rng = torch.Generator().manual_seed(0)
+    net = MLP(20, hidden, 5, activation, generator=rng)
+    x, goal = torch.randn(256, 20, generator=rng), torch.randn(256, 5, generator=rng)
+    outs, grads = [], []
+    for out in (net(x), net(x.bfloat16())):
+        assert out.dtype == torch.float32
+        net.zero_grad()
+        (out - goal).square().mean().backward()
+        outs.append(out.detach())
+        grads.append([p.grad.clone() for p in net.parameters() if p.grad is not None])
+    assert float((outs[0] - outs[1]).norm() / outs[0].norm()) < 0.01
+    assert len(grads[0]) == len(grads[1]) == 2 * (len(hidden) + 1)
+    for a, b in zip(*grads, strict=True):
+        assert b.dtype == torch.float32
+        assert float((a - b).norm() / a.norm()) < 0.06

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from poise.nets.between import parameter_count
 from poise.nets.rtn import PLU, RTN, Critic, RTNConfig, arrival_embedding, noise_scale
 from poise.nets.transition import Layout
 from poise.spatial import quat_rotate
@@ -44,7 +43,7 @@ def test_sizes_are_those_that_follow_from_the_paper() -> None:
     g = torch.Generator().manual_seed(0)
     for width, millions in ((512, 3.6), (768, 5.8), (1024, 8.6)):
         net = RTN(chains, RTNConfig(hidden=width), generator=g)
-        assert parameter_count(net) / 1e6 == pytest.approx(millions, abs=0.06)
+        assert sum(p.numel() for p in net.parameters()) / 1e6 == pytest.approx(millions, abs=0.06)
     # 95 numbers of state, 91 of offset, 88 of target
     widths = [part[0].in_features for part in (net.state, net.offset, net.target)]
     assert widths == [95, 91, 88]

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.sim import CpuBackend, NanGuard, SimConfig, WarpBackend
+from poise.sim import CpuBackend, NanGuard, SimConfig, UnstableError, WarpBackend
 from poise.sim.warp_setup import (
     Capacity,
     capacity,
@@ -113,8 +113,9 @@ def test_a_bad_world_is_named_and_harms_no_other(make_spec, random_state):
     for backend in (spec, other):
         backend.write(None, *state)
     spec.drive.ctrl[1] = torch.nan
-    guard = NanGuard(spec, on_failure="return")
-    failures = guard.step(2)
+    with pytest.raises(UnstableError) as caught:
+        NanGuard(spec).step(2)
+    failures = caught.value.failures
     other.step(2)
     assert [f.env for f in failures] == [1] and "ctrl of actuator 'hip_left'" in str(failures[0])
     assert spec.unstable().tolist() == [False, True, False, False]

@@ -17,9 +17,8 @@ from poise.env.make import goal_of, plugins_of
 from poise.env.plugins import Ended, Plugin, combined
 from poise.env.reference import Reference
 from poise.env.snapshot import Snapshot, put, take
-from poise.env.step_log import StepLog
 from poise.env.style import ClipFeatures, ClipWindows
-from poise.env.task import EnvStep, TaskConfig
+from poise.env.task import EnvStep, StepLog, TaskConfig
 from poise.env.terms.evaluate import Sources, Terms, seen_by
 from poise.errors import PoiseError
 from poise.sim import Backend, NanGuard

@@ -23,7 +23,7 @@ KEPT = 0.8
 EPISODES = 5.0
 
 
-class HelpBudget:
+class HelpBudget(Plugin):
     """Scales the residual force's limits by what a schedule decides from the episodes' outcomes.
 
     With several groups, which are clips or motion bins, each has a scale of its own, decided from the
@@ -34,6 +34,7 @@ class HelpBudget:
     scale: float32, multiplied with the limits, where the worlds are: 0-dimensional for one group, else
         `(G,)`. now: a Python number, which need not wait for a GPU: the largest scale of any group in
         use, so that 0 means that no group is helped. Without a schedule they stay as they are set.
+    by: whether all worlds have one share of help left, or each "clip" or motion "bin" its own.
     """
 
     def __init__(
@@ -41,10 +42,12 @@ class HelpBudget:
         schedule: HelpSchedule | None = None,
         device: torch.device | str = "cpu",
         groups: int = 1,
+        by: Group = "all",
     ):
         if groups < 1:
             raise PoiseError(f"help needs at least 1 group, got {groups}", "HelpBudget")
         self.schedule, self.groups, self.steps, self.now = schedule, groups, 0, 1.0
+        self.by: Group = by
         self.scale = torch.ones(() if groups == 1 else (groups,), device=device)
         # The same on the CPU, where decisions are made.
         self._scales, self._used = np.ones(groups, np.float32), np.ones(groups, bool)
@@ -102,35 +105,26 @@ class HelpBudget:
         ended, failed = self._counts.sum(1).tolist()
         return 1.0 - failed / ended if ended else float("nan")
 
-    def count(self, ended: int, failed: int) -> None:
-        """One control step of all worlds of a single group, in which episodes ended, some by failure.
-
-        Raises:
-            PoiseError: there are several groups, and their episodes are not told apart here.
-        """
-        if self.groups > 1:
-            raise PoiseError("the ended episodes name no group", hint="Use HelpBudget.count_worlds")
+    def count(self, ended: Ended) -> None:
         if self.schedule is None:
             return
-        self._counts.numpy()[:, 0] += ended, failed
-        self._tick(self.schedule)
-
-    def count_worlds(self, group: Tensor, failed: Tensor) -> None:
-        """One control step, in which the episodes of worlds of `group (n,)` ended, `failed (n,)` bool.
-
-        Nothing here waits for a GPU if there are several groups, but for a decision now and then.
-        """
-        self.add(group, torch.ones_like(failed).double(), failed.double())
+        if self.by == "bin":
+            self.add(*ended.bins)
+        else:
+            failed = ended.failed[ended.ids].double()
+            self.add(ended.goal.group(self.by)[ended.ids], torch.ones_like(failed), failed)
 
     def add(self, group: Tensor, ended: Tensor, failed: Tensor) -> None:
         """One control step in which `ended (n,)` outcomes of `group (n,)`, 1 or 0 each, became known,
-        `failed (n,)` of them failures."""
+        `failed (n,)` of them failures.
+
+        Nothing here waits for a GPU if there are several groups, but for a decision now and then.
+        """
         if self.schedule is None:
             return
         if self.groups == 1:
-            self.count(int(ended.sum()), int(failed.sum()))
-            return
-        if len(group):
+            self._counts.numpy()[:, 0] += int(ended.sum()), int(failed.sum())
+        elif len(group):
             # Ones are added, so that their order, which a GPU does not keep, makes no difference.
             self._counts.index_add_(1, group, torch.stack((ended, failed)))
         self._tick(self.schedule)
@@ -147,24 +141,25 @@ class HelpBudget:
         self.set(np.array([schedule.scale(scale, self.steps, share) for scale, share in given]))
         self._counts *= torch.as_tensor(np.where(known, KEPT, 1.0)).to(self._counts.device)
 
-    def state(self) -> Tensor:
-        """What `load_state` takes: float64 `(4)`: `now`, steps, ended and failed episodes of all; and
-        with G groups their scales, ended and failed, `(4 + 3 G)`."""
+    def state(self) -> dict[str, Tensor]:
+        """Under "help", float64 `(4)`: `now`, steps, ended and failed episodes of all; and with G groups
+        their scales, ended and failed, `(4 + 3 G)`."""
         counts = self._counts.cpu()
         head = torch.tensor((self.now, self.steps, *counts.sum(1).tolist()), dtype=torch.float64)
         if self.groups == 1:
-            return head
-        return torch.cat((head, torch.tensor(self._scales).double(), counts.flatten()))
+            return {"help": head}
+        return {"help": torch.cat((head, torch.tensor(self._scales).double(), counts.flatten()))}
 
-    def load_state(self, state: Tensor) -> None:
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from `state()`; from that of one group with its scale for all, which then know no
         episodes yet, and from that of groups as one group with the most that any has left.
 
         Raises:
             PoiseError: the state is that of another number of groups.
         """
-        now, steps, *totals = state[:4].tolist()
-        own, self.steps = state[4:].cpu().double(), int(steps)
+        saved = state["help"]
+        now, steps, *totals = saved[:4].tolist()
+        own, self.steps = saved[4:].cpu().double(), int(steps)
         if self.groups == 1:
             self.set(now)
             self._counts.copy_(torch.tensor(totals, dtype=torch.float64)[:, None])
@@ -178,30 +173,6 @@ class HelpBudget:
             own = own.reshape(3, self.groups)
             self.set(own[0])
             self._counts.copy_(own[1:])
-
-
-class HelpCounter(Plugin):
-    """Counts what becomes of an environment's episodes for its budget of help.
-
-    by: whether all worlds have one share of help left, or each "clip" or "bin" its own.
-    """
-
-    def __init__(self, budget: HelpBudget, by: Group):
-        self.budget = budget
-        self.by: Group = by
-
-    def count(self, ended: Ended) -> None:
-        if self.by != "bin":
-            group = ended.goal.group(self.by)[ended.ids]
-            self.budget.count_worlds(group, ended.failed[ended.ids])
-        elif self.budget.schedule is not None:
-            self.budget.add(*ended.bins)
-
-    def state(self) -> dict[str, Tensor]:
-        return {"help": self.budget.state()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        self.budget.load_state(state["help"])
 
 
 def scale_in(state: Mapping[str, Tensor]) -> float:

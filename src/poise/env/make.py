@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from poise.env.adaptive_sampling import AdaptiveSampling, FailureRates
 from poise.env.body_assignment import BodyAssignment
 from poise.env.goals.clip import ClipGoal
 from poise.env.goals.goal import Goal
-from poise.env.help import HelpBudget, HelpCounter
+from poise.env.help import HelpBudget
 from poise.env.plugins import Plugin
 from poise.env.recovery.clock import RecoveryClock
 from poise.env.reference import Reference
-from poise.env.starts import Starts
+from poise.env.starts import AdaptiveSampling, Starts
 from poise.env.task import TaskConfig
 from poise.sim import Backend
 
@@ -31,13 +30,13 @@ def plugins_of(
 ) -> tuple[HelpBudget, tuple[Plugin, ...]]:
     """The budget of help, and the plug-ins of a task in the order in which they are asked."""
     schedule = task.help if task.auto_reset and task.residual else None
-    budget = HelpBudget(schedule, backend.device, goal.groups(task.help_by))
+    budget = HelpBudget(schedule, backend.device, goal.groups(task.help_by), task.help_by)
     out: list[Plugin] = []
     if task.adaptive and task.auto_reset:
-        rates = FailureRates(goal.groups("bin"), backend.device)
-        goal.clips.odds = lambda: rates.odds
-        out.append(AdaptiveSampling(rates))
-    out.append(HelpCounter(budget, task.help_by))
+        sampling = AdaptiveSampling(goal.groups("bin"), backend.device)
+        goal.clips.odds = lambda: sampling.odds
+        out.append(sampling)
+    out.append(budget)
     if goal.begins:
         budget.use(goal.clips.drawn(task.help_by))
     clock = None

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
-from poise.control import HelpSchedule, PDTargets, Residual
+from poise.control import HelpSchedule, PDTargets, Residual, Wrench
 from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
 from poise.env.plugins import Plugin
 from poise.env.recovery.config import Recovery
@@ -103,3 +104,47 @@ class TaskConfig:
                 f"the reward '{lost[0]}' counts far from the reference alone, and no world is ever far",
                 hint="Set TaskConfig.recovery, for instance to Recovery.phc()",
             )
+
+
+class StepLog(Mapping[str, float]):
+    """Means over the worlds: "reward/NAME" of every term, "imitation", the help in N and N m,
+    the limit of its force in N (`limit_n`, a number or `(N,)`), and whatever `more` there is.
+
+    All of them come by one pass and one wait for the numbers, at the first that is read.
+    """
+
+    def __init__(
+        self,
+        terms: Mapping[str, Tensor],
+        imitation: Tensor,
+        wrench: Wrench | None,
+        limit_n: float | Tensor,
+        more: Mapping[str, Tensor] | None = None,
+    ):
+        self._parts = terms, imitation, wrench, limit_n, more or {}
+        self._values: dict[str, float] | None = None
+
+    def _read(self) -> dict[str, float]:
+        if self._values is None:
+            terms, imitation, wrench, limit_n, more = self._parts
+            rows = {**{f"reward/{name}": value for name, value in terms.items()}, "imitation": imitation}
+            if wrench is not None:
+                rows["help/force_n"] = wrench.force.norm(dim=-1).sum(-1)
+                rows["help/torque_nm"] = wrench.torque.norm(dim=-1).sum(-1)
+            rows.update(more)
+            if wrench is not None and isinstance(limit_n, Tensor):
+                rows["help/limit_n"] = limit_n
+            means = torch.stack(list(rows.values())).mean(-1).tolist()
+            self._values = dict(zip(rows, means, strict=True))
+            if wrench is not None and not isinstance(limit_n, Tensor):
+                self._values["help/limit_n"] = limit_n
+        return self._values
+
+    def __getitem__(self, name: str) -> float:
+        return self._read()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._read())
+
+    def __len__(self) -> int:
+        return len(self._read())

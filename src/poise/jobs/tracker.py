@@ -26,8 +26,8 @@ from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile
 from poise.jobs.runs import policy_for
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import PolicyMeta
 from poise.learn.policy import policy_in
-from poise.learn.schema import PolicyMeta
 from poise.learn.state import prefixed, under
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips

@@ -26,8 +26,8 @@ from poise.learn import (
     clone,
     load_checkpoint,
 )
+from poise.learn.checkpoint import PolicyMeta
 from poise.learn.parallel import ALONE, Comm, any_of, together
-from poise.learn.schema import PolicyMeta
 from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
 from poise.recipes.imitation import Imitation
 from poise.sim import UnstableError

@@ -1,25 +1,21 @@
 """Reinforcement learning on any `VecEnv`; it knows neither the simulator nor the character."""
 
 from poise.learn.amp import Amp, AmpConfig
-from poise.learn.checkpoint import BEST, LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.clone import CloneConfig, CloneStats, clone
 from poise.learn.config import PPOConfig
-from poise.learn.converge import Convergence, ConvergenceConfig, Decision
-from poise.learn.gae import gae
-from poise.learn.guard import TrainingError
 from poise.learn.log import Log
-from poise.learn.mining import HardNegatives, MiningConfig
-from poise.learn.policy import PolicyBundle, WarmStart, load_policy
+from poise.learn.losses import gae
+from poise.learn.mining import Convergence, ConvergenceConfig, Decision, HardNegatives, MiningConfig
+from poise.learn.policy import PolicyBundle, Value, WarmStart, load_policy
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.progressive import columns_of, compose, first_column, next_column, primitive
 from poise.learn.protocols import DemoSampler, FeatureSource, Policy, Step, Style, Teacher, VecEnv
-from poise.learn.rollout import Rollout
+from poise.learn.rollout import Rollout, TrainingError
 from poise.learn.run import RunResult, Until, run
 from poise.learn.train import IterationStats, Trainer
-from poise.learn.value import Value
 
 __all__ = [
-    "BEST",
     "LAST_GOOD",
     "LATEST",
     "PPO",

@@ -14,7 +14,7 @@ nor the optimiser, nor which weights move; these are settings here.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
@@ -22,8 +22,9 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.learn.guard import TrainingError
+from poise.learn.rollout import TrainingError
 from poise.nets.transition import Filled, Known, TransitionNet, joint_positions
+from poise.settings import validate
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -49,9 +50,7 @@ class Adaptation:
             raise PoiseError(
                 f"iterations and beta must be at least 0, lr above 0, batch at least 1, got {self}"
             )
-        for name, known in (("contacts", ("detached", "paper")), ("optimizer", ("sgd", "adam"))):
-            if getattr(self, name) not in known:
-                raise PoiseError(f"{name} must be one of {', '.join(known)}", "Adaptation")
+        validate(self)
 
 
 def contact_loss(feet: Tensor, contact: Tensor) -> Tensor:
@@ -121,57 +120,3 @@ def adapt(
     for p in params:
         p.requires_grad_(False)
     return own
-
-
-def adapt_each(net: nn.Module, known: Known, length: int, config: Adaptation | None = None) -> Filled:
-    """Transitions of a network adapted anew to every single sequence, as one gap of a user needs it."""
-    config = config or Adaptation()
-    parts = []
-    for i in range(len(known.target_root)):
-        one = Known(*(x[i : i + 1] for x in known))
-        own = adapt(net, one, length, config)
-        with torch.no_grad():
-            parts.append(own.fill(one, length))  # type: ignore[operator]
-    return Filled(*(torch.cat(x) for x in zip(*parts, strict=True)))
-
-
-def choose_iterations(
-    net: nn.Module,
-    known: Known,
-    length: int,
-    score: Callable[[Filled], float],
-    config: Adaptation | None = None,
-    most: int = 7,
-) -> tuple[int, tuple[float, ...]]:
-    """The number of iterations, 0 to `most`, after which transitions score lowest on validation
-    sequences.
-
-    The paper reports the best iteration on the test set itself, which is tuning on test data; this is
-    for sequences held out for choices. Returns the number and the scores of 0, 1, ... iterations.
-    """
-    config = config or Adaptation()
-
-    @torch.no_grad()
-    def scored(own: nn.Module) -> float:
-        filled = [
-            own.fill(Known(*(x[low : low + config.batch] for x in known)), length)  # type: ignore[operator]
-            for low in range(0, len(known.target_root), config.batch)
-        ]
-        return score(Filled(*(torch.cat(x) for x in zip(*filled, strict=True))))
-
-    scores = [scored(net)]
-    steps = Adaptation(**{**config.__dict__, "iterations": most})
-    adapt(net, known, length, steps, lambda i, own, loss: scores.append(scored(own)))
-    best = min(range(len(scores)), key=scores.__getitem__)
-    return best, tuple(scores)
-
-
-def best_setting(
-    choices: Sequence[Adaptation], tried: Callable[[Adaptation], tuple[int, tuple[float, ...]]]
-) -> Adaptation:
-    """The setting, with its iterations, that scored lowest; `tried` runs `choose_iterations` for one."""
-    if not choices:
-        raise PoiseError("there is no setting to choose from")
-    results = [(config, *tried(config)) for config in choices]
-    config, iterations, _ = min(results, key=lambda r: r[2][r[1]])
-    return Adaptation(**{**config.__dict__, "iterations": iterations})

@@ -23,9 +23,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.learn.guard import TrainingError, check_finite
 from poise.learn.parallel import ALONE, Comm, any_of, average_gradients, shared_statistics, sums
 from poise.learn.protocols import DemoSampler, FeatureSource
+from poise.learn.rollout import TrainingError, check_finite
 from poise.learn.state import (
     State,
     load_module,
@@ -39,6 +39,7 @@ from poise.learn.state import (
 )
 from poise.learn.windows import History, WindowBuffer
 from poise.nets.discriminator import Discriminator, gradient_penalty
+from poise.settings import validate
 
 Loss = Literal["bce", "least_squares"]
 LEAST = 1e-4  # Of 1 - sigmoid(D): no window is worth more than -log(LEAST) scale.
@@ -89,15 +90,12 @@ class AmpConfig:
     """w_style."""
 
     def __post_init__(self) -> None:
+        validate(self)
         for name in ("frames", "lr", "steps", "minibatch", "kept"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "AmpConfig")
-        if self.loss not in ("bce", "least_squares"):
-            hint = "Use bce or least_squares"
-            raise PoiseError(f"there is no loss '{self.loss}'", "AmpConfig", hint)
         if not 0 <= self.keep <= 1:
             raise PoiseError(f"keep must lie in [0, 1], got {self.keep}", "AmpConfig")
-        object.__setattr__(self, "hidden", tuple(self.hidden))
 
     @classmethod
     def phc(cls, faithful: Literal["paper", "code"] = "paper") -> AmpConfig:

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from poise.learn.frames import Sampler, Windows
 from poise.nets.between import Between, Dropout, Gap
-from poise.nets.half import bfloat16_is_fast
+from poise.nets.mlp import bfloat16_is_fast
 from poise.nets.transition import into_place, place_of
 from poise.spatial import matrix_kinematics, quat_to_matrix
 

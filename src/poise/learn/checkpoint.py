@@ -2,6 +2,9 @@
 
 The file is safetensors; its metadata holds one JSON object, so weights and settings can never
 belong to different moments. It is written beside its place, flushed to the disk and renamed.
+
+Files come from strangers, too: `load_checkpoint(path, TrainerMeta)` refuses, in a sentence, metadata in
+which something is missing or of another type.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import torch
 from safetensors import SafetensorError
@@ -26,7 +29,6 @@ from poise.version import __version__
 
 FORMAT = 1
 LATEST = "checkpoint.safetensors"
-BEST = "best.safetensors"
 LAST_GOOD = "last_good.safetensors"
 _TEMPORARY = ".partial"
 
@@ -56,7 +58,7 @@ def load_checkpoint(
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors (on the CPU) and the metadata of a checkpoint.
 
-    schema: a `TypedDict` of what must stand in the metadata, see `learn.schema`.
+    schema: a `TypedDict` of what must stand in the metadata, such as `TrainerMeta`.
 
     Raises:
         PoiseError: the file is missing, damaged, foreign or of another format version, or its
@@ -154,3 +156,74 @@ def _checksum(tensors: Mapping[str, Tensor]) -> int:
         if flat.numel():
             crc = zlib.crc32(flat.view(torch.uint8).numpy().data, crc)
     return crc
+
+
+# --- what stands in the metadata ---------------------------------------------------------------
+
+
+class _Shape(TypedDict):
+    hidden: list[int]
+    activation: str
+    obs_clip: float
+
+
+class PolicyShape(_Shape, total=False):
+    """What rebuilds the networks of a policy, see `PolicyBundle.shape`."""
+
+    kind: str
+    columns: int
+    lateral: bool
+    composer_hidden: list[int]
+    combine: str
+    weights: str
+    joint: bool
+
+
+class _Policy(TypedDict):
+    num_obs: int
+    num_actions: int
+    policy: PolicyShape
+
+
+class PolicyMeta(_Policy, total=False):
+    """A checkpoint that holds a policy: alone, or with its trainer."""
+
+    kind: str
+    character: str
+    metadata: dict[str, Any]
+    samples: int
+    seconds: float
+    iteration: int
+
+
+class TrainerMeta(_Policy):
+    """A checkpoint of a whole trainer, from which a run goes on."""
+
+    metadata: dict[str, Any]
+    config: dict[str, Any]
+    iteration: int
+    samples: int
+    seconds: float
+
+
+class _Layout(TypedDict):
+    parents: list[int]
+    feet: list[int]
+    facing: list[float]
+
+
+class _Model(TypedDict):
+    net: Literal["transformer", "rtn"]
+    config: dict[str, Any]
+    layout: _Layout
+    names: list[str]
+    fps: float
+    longest: int
+    past: int
+    meta: dict[str, Any]
+
+
+class ModelMeta(_Model, total=False):
+    """The file of an in-betweening network."""
+
+    example: list[dict[str, Any]]

@@ -16,11 +16,10 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.config import PPOConfig
-from poise.learn.guard import TrainingError, check_finite
 from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO
 from poise.learn.protocols import Teacher, VecEnv
-from poise.learn.rollout import Episodes, Rollout, collect
+from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.learn.state import State, make_generator, prefixed
 
 

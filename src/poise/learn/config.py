@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 from poise.errors import PoiseError
@@ -82,18 +82,11 @@ class PPOConfig:
         for name in ("horizon", "epochs", "minibatch", "policy_lr", "value_lr", "clip"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "PPOConfig")
-        if self.products not in ("auto", "float32", "bfloat16"):
-            hint = "Use auto, float32 or bfloat16"
-            raise PoiseError(f"products cannot be in '{self.products}'", "PPOConfig", hint)
         for name in ("gamma", "lam"):
             if not 0 <= getattr(self, name) <= 1:
                 raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "PPOConfig")
         if not 0 < self.lr_range[0] <= self.lr_range[1]:
             raise PoiseError(f"lr_range must be (low, high) above 0, got {self.lr_range}", "PPOConfig")
-        for f in fields(self):
-            # A config read from JSON has lists where tuples are meant.
-            if isinstance(getattr(self, f.name), list):
-                object.__setattr__(self, f.name, tuple(getattr(self, f.name)))
 
     @classmethod
     def paper(cls, num_envs: int = 512, faithful: Literal["paper", "code"] = "paper") -> PPOConfig:

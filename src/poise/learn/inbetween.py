@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from poise.errors import PoiseError
 from poise.learn.checkpoint import LATEST, load_checkpoint, remove_partial, save_checkpoint
 from poise.learn.frames import FrameData, Sampler
-from poise.learn.guard import TrainingError
 from poise.learn.log import Log
+from poise.learn.rollout import TrainingError
 from poise.learn.run import interruptible
 from poise.learn.state import (
     State,

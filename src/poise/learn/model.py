@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.schema import ModelMeta
+from poise.learn.checkpoint import ModelMeta, load_checkpoint, save_checkpoint
 from poise.learn.state import State, load_module, prefixed, under
 from poise.nets.between import Between, BetweenConfig
 from poise.nets.rtn import RTN, RTNConfig

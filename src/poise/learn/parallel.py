@@ -12,7 +12,6 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Protocol
 
 import torch
 from safetensors.torch import load as parse_tensors
@@ -29,61 +28,31 @@ LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 _OWN = ("env/", "generator/noise", "trainer/obs", "trainer/episode_", "style/own/")
 
 
-class Comm(Protocol):
-    """What the learner asks of a group of processes. All of them make the same calls in the same
-    order; each call waits for the others."""
+class Comm:
+    """The processes that learn together: a single one, or those of the default group of
+    `torch.distributed`, which must have been initialised.
 
-    @property
-    def rank(self) -> int:
-        """This process, 0 <= rank < size; 0 alone writes files and prints."""
-        ...
+    All of them make the same calls in the same order; each call waits for the others.
 
-    @property
-    def size(self) -> int:
-        """Number of processes."""
-        ...
+    Attributes:
+        rank: of this process, 0 <= rank < size; 0 alone writes files and prints.
+        size: number of processes.
+        local_size: number of processes on this machine, which share its cores.
+    """
 
-    @property
-    def local_size(self) -> int:
-        """Number of processes on this machine, which share its cores."""
-        ...
+    def __init__(self, rank: int = 0, size: int = 1, local_size: int = 1):
+        self.rank, self.size, self.local_size = rank, size, local_size
 
     def sum_(self, x: Tensor) -> Tensor:
         """Replaces `x`, of one shape everywhere, by its sum over the processes; returns it."""
-        ...
+        if self.size > 1:
+            torch.distributed.all_reduce(x)
+        return x
 
     def gather(self, data: bytes) -> list[bytes]:
         """On rank 0 the data of every process by rank; elsewhere an empty list."""
-        ...
-
-
-class Alone:
-    """A single process."""
-
-    rank, size, local_size = 0, 1, 1
-
-    def sum_(self, x: Tensor) -> Tensor:
-        return x
-
-    def gather(self, data: bytes) -> list[bytes]:
-        return [data]
-
-
-ALONE = Alone()
-
-
-class Group:
-    """The default group of `torch.distributed`, which must have been initialised."""
-
-    def __init__(self, local_size: int = 1):
-        self.rank, self.size = torch.distributed.get_rank(), torch.distributed.get_world_size()
-        self.local_size = local_size
-
-    def sum_(self, x: Tensor) -> Tensor:
-        torch.distributed.all_reduce(x)
-        return x
-
-    def gather(self, data: bytes) -> list[bytes]:
+        if self.size == 1:
+            return [data]
         sizes = torch.zeros(self.size, dtype=torch.int64)
         sizes[self.rank] = len(data)
         self.sum_(sizes)
@@ -92,6 +61,10 @@ class Group:
         parts = [torch.empty_like(own) for _ in range(self.size)] if self.rank == 0 else None
         torch.distributed.gather(own, parts, dst=0)
         return [p[:n].numpy().tobytes() for p, n in zip(parts or (), sizes.tolist(), strict=False)]
+
+
+#: A single process.
+ALONE = Comm()
 
 
 @contextmanager
@@ -120,7 +93,8 @@ def joined() -> Iterator[Comm]:
         hint = "Start all processes with torchrun, and the same --nnodes and --rdzv-endpoint everywhere"
         raise PoiseError(f"the processes did not find each other ({reason})", where, hint) from None
     try:
-        yield Group(int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+        local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+        yield Comm(dist.get_rank(), dist.get_world_size(), local)
         # Gloo's threads may still hold tensors of the last call, which they can only give back while
         # Python runs. Waiting for each other lets them, and no process ends while another still sends.
         dist.barrier()

@@ -1,8 +1,9 @@
-"""A trained policy on its own: normaliser and network, without the trainer."""
+"""A trained policy on its own, without the trainer: normaliser, network, and what its critic tells."""
 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -13,8 +14,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
-from poise.learn.schema import PolicyMeta
+from poise.learn.checkpoint import PolicyMeta, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.state import State, load_module, prefixed
 from poise.nets import MLP, Composer, GaussianPolicy, ProgressiveNet, RunningNorm
 from poise.settings import check_data
@@ -166,6 +166,38 @@ class PolicyBundle:
         """Writes the policy alone as a checkpoint of the kind "policy"."""
         meta = {"kind": "policy", **self.identity(character), "metadata": dict(metadata or {})}
         save_checkpoint(path, self.state(), meta)
+
+
+class Value:
+    """V(o): the discounted rewards that a policy is still to earn, as its critic predicts them.
+
+    Args:
+        policy: its normaliser is applied to observations first.
+        state: entries of `PPO.state()` under "critic/" and "return_norm/".
+        activation: of the critic's hidden layers, as it was trained.
+
+    Raises:
+        PoiseError: entries are missing, or of other sizes.
+    """
+
+    def __init__(self, policy: PolicyBundle, state: Mapping[str, Tensor], activation: str = "relu"):
+        layers = sorted(k for k in state if k.startswith("critic/") and k.endswith("weight"))
+        widths = tuple(len(state[k]) for k in layers)
+        rng = torch.Generator().manual_seed(0)
+        self.norm, self.scale = policy.norm, RunningNorm(1, clip=math.inf)
+        self.critic = MLP(policy.num_obs, widths[:-1], 1, activation, generator=rng)
+        load_module(self.critic, state, "critic")
+        load_module(self.scale, state, "return_norm")
+
+    @torch.no_grad()
+    def __call__(self, obs: Tensor) -> Tensor:
+        """`(N,)` for raw observations `(N, O)`."""
+        return self.scale.inverse(self.critic(self.norm.forward(obs))).squeeze(-1)
+
+    def state(self) -> State:
+        """What it is made of."""
+        scale = prefixed("return_norm", self.scale.state_dict())
+        return prefixed("critic", self.critic.state_dict()) | scale
 
 
 @dataclass(frozen=True, eq=False)

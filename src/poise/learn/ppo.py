@@ -12,12 +12,10 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.learn.config import PPOConfig
-from poise.learn.gae import gae
-from poise.learn.guard import TrainingError
-from poise.learn.losses import Drawn, explained_variance, policy_loss
+from poise.learn.losses import Drawn, explained_variance, gae, policy_loss
 from poise.learn.parallel import ALONE, Comm, average_gradients, moments, noise_name, shared_statistics
 from poise.learn.policy import PolicyBundle
-from poise.learn.rollout import Rollout
+from poise.learn.rollout import Rollout, TrainingError
 from poise.learn.state import (
     State,
     load_module,
@@ -29,13 +27,12 @@ from poise.learn.state import (
     take,
     under,
 )
-from poise.learn.threaded_update import Acting, ThreadedUpdate, mean_gradient, parts_of
+from poise.learn.threaded_update import ThreadedUpdate, mean_gradient, parts_of
 from poise.nets import (
     MLP,
     GaussianPolicy,
     RunningNorm,
     bfloat16_is_fast,
-    half_forward,
 )
 
 _SUMS: tuple[str, ...] = ("policy loss", "kl", "clip fraction", "policy gradient")
@@ -235,24 +232,22 @@ class PPO:
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
         return {name: sum(m[name] for m in means) / len(means) for name in means[0]}, kl
 
-    def acting(self, threads: int = 1) -> Acting:
-        """The collecting policy: in the arithmetic of the update, so that both are equal at first."""
-        parallel = threads > 1 and self.comm.size == 1
-        return Acting(self.actor.policy, self._half, self._beside, parallel)
+    def distribution(self, obs: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The policy's own of normalised `obs (N, O)`, by the products of the update, so that the policy
+        that collects and the one that learns are equal at first."""
+        return self.actor.policy.distribution(obs.bfloat16() if self._half else obs, context)
 
     def mean(self, obs: Tensor) -> Tensor:
         """Mean actions of normalised `obs (N, O)` by the products of the update, with gradients."""
-        policy = self.actor.policy
-        context = policy.context(obs)
-        mean, _ = policy.distribution(obs.bfloat16() if self._half else obs, context)
-        return policy.drive(mean, context)
+        context = self.actor.policy.context(obs)
+        return self.actor.policy.drive(self.distribution(obs, context)[0], context)
 
     def _fit_value(self, batch: _Batch, indices: Sequence[Tensor]) -> Tensor:
         """One epoch of the critic; the sum of its losses."""
         total = batch.target.new_zeros(())
         for index in indices:
             obs = batch.obs.index_select(0, index)
-            value = half_forward(self.critic, obs) if self._half else self.critic(obs)
+            value = self.critic(obs)
             loss = (value - batch.target.index_select(0, index)).square().mean()
             self.value_optimizer.zero_grad(set_to_none=True)
             loss.backward()

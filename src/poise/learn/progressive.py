@@ -59,16 +59,16 @@ def columns_of(bundle: PolicyBundle, lateral: bool = False) -> PolicyBundle:
 
 
 def next_column(
-    bundle: PolicyBundle, start: Start = "copy", source: int = -1, *, generator: torch.Generator
+    bundle: PolicyBundle, start: Start = "copy", *, generator: torch.Generator
 ) -> PolicyBundle:
     """One primitive more, which alone learns; those before it and the normaliser are frozen.
 
-    start: "copy" of column `source`, as PHC's code does it (the paper's weight sharing), or "random",
+    start: "copy" of the last column, as PHC's code does it (the paper's weight sharing), or "random",
     with lateral connections as the paper describes it. Its action noise is that of the last column.
     """
     net, log_std = _columns(bundle).copy(), primitive_log_std(bundle)
     net.log_std.copy_(log_std)
-    net.add(start, generator, source)
+    net.add(start, generator)
     return _with_net(bundle, net, log_std[-1])
 
 

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from poise.learn.between import schedule
 from poise.learn.frames import Sampler, Windows
-from poise.nets.half import bfloat16_is_fast
+from poise.nets.mlp import bfloat16_is_fast
 from poise.nets.rtn import RTN, Critic, Steps
 from poise.nets.transition import Known, continued, into_place, joint_positions, place_of
 

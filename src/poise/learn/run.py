@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import BEST, LAST_GOOD, LATEST, remove_partial
-from poise.learn.guard import TrainingError
+from poise.learn.checkpoint import LAST_GOOD, LATEST, remove_partial
 from poise.learn.log import Log
 from poise.learn.parallel import any_of, together
+from poise.learn.rollout import TrainingError
 from poise.learn.train import IterationStats, Trainer
 
 
@@ -59,8 +59,6 @@ def run(
     folder: str | Path | None = None,
     every: int = 1,
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
-    score: Callable[[IterationStats], float] | None = None,
-    resume: bool = True,
     tensorboard: bool = True,
 ) -> RunResult:
     """Iterates until a limit; a killed run goes on from the last checkpoint bit for bit.
@@ -68,12 +66,9 @@ def run(
     Args:
         trainer: a fresh trainer; a checkpoint in `folder` is loaded into it.
         until: the limits.
-        folder: holds `checkpoint.safetensors`, `best.safetensors` and the logs; None writes nothing.
+        folder: holds `checkpoint.safetensors` and the logs; None writes nothing.
         every: iterations between checkpoints, so at most `every` iterations are lost by a kill.
         on_iteration: called after each iteration and its checkpoint; returning False ends the run.
-        score: rates an iteration; the policy with the highest score so far is kept as
-            `best.safetensors` (a policy alone, for `load_policy`).
-        resume: whether a checkpoint in `folder` may be continued; if not, finding one is an error.
         tensorboard: whether to write TensorBoard's files beside the CSV.
 
     Ctrl-C ends the run after the present iteration, with a checkpoint; a second one at once. After
@@ -85,7 +80,7 @@ def run(
     if every < 1:
         raise PoiseError(f"the interval of checkpoints must be at least 1, got {every}")
     with together(trainer.comm):
-        keeper = None if folder is None else _Keeper(trainer, Path(folder), resume, tensorboard)
+        keeper = None if folder is None else _Keeper(trainer, Path(folder), tensorboard)
     stats: IterationStats | None = None
     stop = until.reached(trainer)
     try:
@@ -95,7 +90,7 @@ def run(
                 stop = until.reached(trainer)
                 if keeper is not None:
                     last = any_of(trainer.comm, stop or interrupt.is_set())
-                    keeper.keep(stats, last or trainer.iteration % every == 0, score)
+                    keeper.keep(stats, last or trainer.iteration % every == 0)
                 try:
                     if on_iteration is not None and on_iteration(stats) is False:
                         stop = True
@@ -106,7 +101,7 @@ def run(
                 keeper.save()
     except TrainingError:
         if keeper is not None:
-            keeper.save_policy(LAST_GOOD)
+            keeper.save_last_good()
         raise
     finally:
         if keeper is not None and keeper.log is not None:
@@ -117,42 +112,29 @@ def run(
 class _Keeper:
     """Writes checkpoints and logs in the order that makes a kill at any moment harmless."""
 
-    def __init__(self, trainer: Trainer, folder: Path, resume: bool, tensorboard: bool):
-        self.trainer, self.folder, self.path = trainer, folder, folder / LATEST
-        self.best, writes = float("-inf"), trainer.comm.rank == 0
+    def __init__(self, trainer: Trainer, folder: Path, tensorboard: bool):
+        self.trainer, self.folder, self.path, self.saved = trainer, folder, folder / LATEST, -1
+        writes = trainer.comm.rank == 0
         if writes:
             folder.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
-            if not resume:
-                raise PoiseError(
-                    "the folder already holds a run", folder, "Resume it or choose another folder"
-                )
-            saved = trainer.load(self.path)["metadata"]
-            if "best_score" in saved:
-                self.best = trainer.metadata["best_score"] = saved["best_score"]
+            trainer.load(self.path)
+            self.saved = trainer.iteration
         if writes:
             remove_partial(folder)
-        self.saved = trainer.iteration if self.path.exists() else -1
         self.log = Log(folder, trainer.iteration, tensorboard) if writes else None
 
-    def keep(
-        self, stats: IterationStats, save: bool, score: Callable[[IterationStats], float] | None
-    ) -> None:
+    def keep(self, stats: IterationStats, save: bool) -> None:
         # Rows first: a row after the last checkpoint is dropped on resume, a missing one is lost.
         if self.log is not None:
             self.log.write(stats.row())
-        if score is not None and (value := score(stats)) > self.best:
-            self.best = value
-            self.trainer.metadata["best_score"] = value
-            self.save_policy(BEST)
         if save:
             self.save()
 
-    def save_policy(self, name: str) -> None:
-        if self.trainer.comm.rank:
-            return
-        extra = {**self.trainer.metadata, "iteration": self.trainer.iteration}
-        self.trainer.ppo.actor.save(self.folder / name, self.trainer.character, extra)
+    def save_last_good(self) -> None:
+        if self.trainer.comm.rank == 0:
+            extra = {**self.trainer.metadata, "iteration": self.trainer.iteration}
+            self.trainer.ppo.actor.save(self.folder / LAST_GOOD, self.trainer.character, extra)
 
     def save(self) -> None:
         if self.log is not None:

@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from poise.nets import GaussianPolicy
-
 T = TypeVar("T")
 
 #: Products of rows and weights from which a minibatch is worth two threads.
@@ -76,38 +74,3 @@ def mean_gradient(
                 mine.add_(theirs)
         terms = terms + their_terms
     return terms
-
-
-class Acting:
-    """What a policy draws its actions from while it collects, in the arithmetic of the update.
-
-    half: the hidden layers are multiplied in bfloat16. parallel: where there is much to do, the two
-    parts of the rows are computed at the same time, to the same numbers.
-    """
-
-    def __init__(self, policy: GaussianPolicy, half: bool, beside: ThreadedUpdate, parallel: bool):
-        self.policy, self.half, self.beside, self.parallel = policy, half, beside, parallel
-        self._weights = sum(p.numel() for p in policy.parameters() if p.requires_grad)
-
-    def __call__(self, obs: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
-        """`GaussianPolicy.distribution` of normalised `obs (N, O)` in float32."""
-        obs = obs.bfloat16() if self.half else obs
-        index = torch.arange(len(obs), device=obs.device)
-        parts = parts_of(index, self._weights, 1)
-        if len(parts) == 1:
-            return self.policy.distribution(obs, context)
-        rows = [len(part) for part in parts]
-        contexts = [None] * len(rows) if context is None else context.split(rows)
-        pieces = list(zip(obs.split(rows), contexts, strict=True))
-        others = [self.beside(self.parallel, self._part, *piece) for piece in pieces[1:]]
-        try:
-            first = self._part(*pieces[0])
-        finally:
-            found = [other() for other in others]
-        mean = torch.cat([first[0], *(m for m, _ in found)])
-        log_std = first[1]
-        return mean, torch.cat([log_std, *(s for _, s in found)]) if log_std.dim() > 1 else log_std
-
-    @torch.no_grad()
-    def _part(self, obs: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
-        return self.policy.distribution(obs, context)

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.learn.checkpoint import check_fits, load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import TrainerMeta, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.config import PPOConfig
-from poise.learn.guard import TrainingError, check_finite
 from poise.learn.parallel import (
     ALONE,
     Comm,
@@ -29,8 +28,7 @@ from poise.learn.parallel import (
 from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import Style, VecEnv
-from poise.learn.rollout import Episodes, Rollout, collect
-from poise.learn.schema import TrainerMeta
+from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.learn.state import State, load_module, prefixed, take, under
 from poise.settings import check_data
 
@@ -162,7 +160,7 @@ class Trainer:
         with shared_statistics(self.comm, ppo.actor.norm), together(self.comm, TrainingError):
             self._obs = collect(
                 self.env, ppo.actor.policy, ppo.actor.norm, rollout, obs, self.episodes, ppo.noise,
-                self.style, ppo.acting(self.update_threads),
+                self.style, ppo.distribution,
             )  # fmt: skip
             task = float(rollout.reward.mean())
             if self.style is not None:

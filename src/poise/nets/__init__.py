@@ -3,8 +3,7 @@ normalisation, the discriminator of a motion prior."""
 
 from poise.nets.discriminator import Discriminator, gradient_penalty
 from poise.nets.gaussian import GaussianPolicy, gaussian_entropy, gaussian_kl, gaussian_log_prob
-from poise.nets.half import bfloat16_is_fast, half_forward
-from poise.nets.mlp import ACTIVATIONS, MLP
+from poise.nets.mlp import ACTIVATIONS, MLP, bfloat16_is_fast
 from poise.nets.multiplicative import Composer, product_of_gaussians
 from poise.nets.norm import RunningNorm
 from poise.nets.progressive import ProgressiveNet
@@ -22,6 +21,5 @@ __all__ = [
     "gaussian_kl",
     "gaussian_log_prob",
     "gradient_penalty",
-    "half_forward",
     "product_of_gaussians",
 ]

@@ -335,8 +335,3 @@ def linear(a: int, b: int, generator: torch.Generator, scale: float = 1.0) -> nn
         layer.weight.uniform_(-bound, bound, generator=generator)
         layer.bias.zero_()
     return layer
-
-
-def parameter_count(net: nn.Module) -> int:
-    """The number of weights."""
-    return sum(p.numel() for p in net.parameters())

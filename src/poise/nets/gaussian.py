@@ -9,7 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.nets.half import MeanNet, half_forward
+from poise.nets.mlp import MLP
+from poise.nets.progressive import ProgressiveNet
+
+#: What may give the mean of a policy.
+MeanNet = MLP | ProgressiveNet
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
@@ -95,10 +99,9 @@ class GaussianPolicy(nn.Module):
     def distribution(self, obs: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean `(N, D)` and log sigma, `(D,)` or `(N, D)`, of what is drawn, with gradients.
 
-        Normalised `obs (N, O)` in bfloat16 are multiplied as `half_forward` does.
+        Normalised `obs (N, O)` in bfloat16 are multiplied in bfloat16, see `MLP`.
         """
-        half = obs.dtype == torch.bfloat16
-        return (half_forward(self.mean, obs) if half else self.mean.forward(obs)), self.log_std
+        return self.mean.forward(obs), self.log_std
 
     def drive(self, drawn: Tensor, context: Tensor | None = None) -> Tensor:
         """The action `(N, A)` that something drawn `(N, D)` stands for."""
@@ -108,21 +111,11 @@ class GaussianPolicy(nn.Module):
         """The mean `(..., D)` for normalised observations `(..., O)`."""
         return self.distribution(obs)[0]
 
-    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Something drawn and the mean, each `(..., D)`."""
-        mean, log_std = self.distribution(obs)
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-        return mean + noise * log_std.exp(), mean
-
     def act(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A drawn action `(..., A)`, or the mean action without a generator."""
-        drawn = self.forward(obs) if generator is None else self.sample(obs, generator)[0]
-        return self.drive(drawn, self.context(obs))
-
-    def log_prob(self, obs: Tensor, drawn: Tensor) -> Tensor:
-        """log pi(drawn | obs), `(...)`."""
-        return gaussian_log_prob(drawn, *self.distribution(obs))
-
-    def entropy(self) -> Tensor:
-        """Entropy of pi in nats, the same for all observations; a scalar."""
-        return gaussian_entropy(self.log_std)
+        context = self.context(obs)
+        drawn, log_std = self.distribution(obs, context)
+        if generator is not None:
+            noise = torch.randn(drawn.shape, generator=generator, device=drawn.device, dtype=drawn.dtype)
+            drawn = drawn + noise * log_std.exp()
+        return self.drive(drawn, context)

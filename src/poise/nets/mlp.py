@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from poise.errors import PoiseError, did_you_mean
 
@@ -32,6 +33,25 @@ def bare_linear(num_in: int, num_out: int, bias: bool = True) -> nn.Linear:
     """
     with torch.random.fork_rng(devices=[]):
         return nn.Linear(num_in, num_out, bias)
+
+
+def bfloat16_is_fast() -> bool:
+    """Whether this processor multiplies bfloat16 matrices itself (else they are slower than float32)."""
+    return bool(torch.cpu.get_capabilities().get("avx512_bf16", False))
+
+
+def product(layer: nn.Module, x: Tensor, last: bool = False) -> Tensor:
+    """A linear layer in the arithmetic of `x`; in float32 instead of bfloat16 if it is the `last` one.
+
+    In bfloat16 values and gradients differ from float32's by about 0.4 % of their size, far less than
+    one minibatch differs from the next. Weights stay float32, and so do their gradients.
+    """
+    assert isinstance(layer, nn.Linear)
+    if last or x.dtype != torch.bfloat16:
+        # The layer's own `forward`, since a module's call costs more than a layer of one character.
+        return layer.forward(x.float() if x.dtype == torch.bfloat16 else x)
+    bias = None if layer.bias is None else layer.bias.to(x.dtype)
+    return functional.linear(x, layer.weight.to(x.dtype), bias)
 
 
 class MLP(nn.Module):
@@ -87,8 +107,12 @@ class MLP(nn.Module):
         return layer
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., num_in)` to `(..., num_out)`."""
-        # Each layer's own `forward`, since a module's call costs more than a layer of one character.
-        for layer in self.layers:
-            x = layer.forward(x)
-        return x
+        """`(..., num_in)` to `(..., num_out)`.
+
+        Inputs in bfloat16 pass the hidden layers in bfloat16, forward and backward, at half the cost of
+        an update; outputs are float32.
+        """
+        *hidden, last = self.layers
+        for layer in hidden:
+            x = product(layer, x) if isinstance(layer, nn.Linear) else layer.forward(x)
+        return product(last, x, last=True)

@@ -157,15 +157,6 @@ class Composer(GaussianPolicy):
         # a = sum_k w_k mu_k
         return (drawn.unsqueeze(-1) * means).sum(-2)
 
-    def act(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A drawn action `(..., A)`, or the mean action without a generator."""
-        context = self._means(obs)
-        mean, log_std = self.distribution(obs, context)
-        if generator is not None:
-            noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-            mean = mean + noise * log_std.exp()
-        return self.drive(mean, context)
-
     def _means(self, obs: Tensor) -> Tensor:
         """All primitives' means `(N, K A)`, with gradients where they learn."""
         with torch.set_grad_enabled(self.joint and torch.is_grad_enabled()):

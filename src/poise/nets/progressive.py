@@ -9,10 +9,9 @@ from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.nets.mlp import MLP, bare_linear
+from poise.nets.mlp import MLP, bare_linear, product
 
 Start = Literal["copy", "random"]
 
@@ -70,31 +69,27 @@ class ProgressiveNet(nn.Module):
         """Column k's own layers."""
         return cast(MLP, self.columns[k])
 
-    def add(self, start: Start, generator: torch.Generator, source: int = -1) -> None:
+    def add(self, start: Start, generator: torch.Generator) -> None:
         """Freezes all columns and appends one that learns.
 
         Args:
-            start: "copy" makes it the same function as column `source`; "random" draws new weights, the
+            start: "copy" makes it the same function as the last column; "random" draws new weights, the
                 lateral ones too.
             generator: source of random weights.
-            source: index of the column that is copied.
         """
         if start not in ("copy", "random"):
             raise PoiseError(f"a column cannot start as '{start}'", hint="Use copy or random")
-        if not -len(self) <= source < len(self):
-            raise PoiseError(f"there is no column {source} among {len(self)}")
-        source %= len(self)
+        last = len(self) - 1
         self.requires_grad_(False)
         self._append(generator)
         if start == "random":
             return
-        self.column(-1).load_state_dict(self.column(source).state_dict())
-        for j, lateral in enumerate(self._laterals(len(self) - 1)):
-            if j < source:
-                lateral.load_state_dict(self._laterals(source)[j].state_dict())
-            else:
-                for p in lateral.parameters():
-                    nn.init.zeros_(p)
+        self.column(-1).load_state_dict(self.column(last).state_dict())
+        for lateral, other in zip(self._laterals(last + 1), self._laterals(last), strict=False):
+            lateral.load_state_dict(other.state_dict())
+        if self.lateral:
+            for p in self._laterals(last + 1)[last].parameters():
+                nn.init.zeros_(p)
 
     def copy(self) -> ProgressiveNet:
         """An independent copy."""
@@ -110,12 +105,10 @@ class ProgressiveNet(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """The last column's output, `(..., num_in)` to `(..., num_out)`.
 
-        Inputs in bfloat16 pass the hidden layers in bfloat16, as in `half_forward`; outputs are float32.
+        Inputs in bfloat16 pass the hidden layers in bfloat16, as in an `MLP`; outputs are float32.
         """
         if not self.lateral or len(self) == 1:
-            if x.dtype == torch.float32:
-                return self.column(-1).forward(x)
-            return self._run(len(self) - 1, x, [])[-1]
+            return self.column(-1).forward(x)
         return self._outputs(x)[-1]
 
     def all(self, x: Tensor) -> Tensor:
@@ -135,10 +128,10 @@ class ProgressiveNet(nn.Module):
         entered = [x]
         for i, layer in enumerate(linear):
             last = i == len(linear) - 1
-            h = _product(layer, entered[-1], last)
+            h = product(layer, entered[-1], last)
             if i and self.lateral:
                 for lateral, other in zip(self._laterals(k), before, strict=True):
-                    h = h + _product(lateral[i - 1], other[i], last)
+                    h = h + product(lateral[i - 1], other[i], last)
             entered.append(h if last else activation[i](h))
         return entered
 
@@ -162,12 +155,3 @@ class ProgressiveNet(nn.Module):
         self.laterals.append(earlier)
         self.log_std = torch.cat((self.log_std, self.log_std.new_zeros(1, self.num_out)))
         self.to(device)
-
-
-def _product(layer: nn.Module, x: Tensor, last: bool) -> Tensor:
-    """A linear layer in the arithmetic of `x`, or in float32 if it is the last one."""
-    assert isinstance(layer, nn.Linear)
-    if last or x.dtype == torch.float32:
-        return layer.forward(x.float())
-    bias = None if layer.bias is None else layer.bias.to(x.dtype)
-    return functional.linear(x, layer.weight.to(x.dtype), bias)

@@ -49,9 +49,6 @@ class RTNConfig:
     """Deviation of the target noise."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.encoder, list) or isinstance(self.decoder, list):
-            object.__setattr__(self, "encoder", tuple(self.encoder))
-            object.__setattr__(self, "decoder", tuple(self.decoder))
         if min(self.hidden, *self.encoder, *self.decoder, self.past, self.longest) < 1:
             raise PoiseError("every size must be at least 1", "RTNConfig")
 

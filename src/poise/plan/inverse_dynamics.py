@@ -61,11 +61,6 @@ class InverseDynamics:
     contact_point: np.ndarray
     contact_body: np.ndarray
 
-    def on_bodies(self, bodies: int) -> np.ndarray:
-        """Net floor force on each of `bodies` rows, `(T, B, 3)` N."""
-        member = self.contact_body[:, None] == np.arange(bodies)
-        return np.einsum("tpk,pb->tbk", self.contact_force, member)
-
 
 def step_midpoints(
     model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, rate_hz: float

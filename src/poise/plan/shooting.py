@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.plan.linear_model import driven
-from poise.plan.lqr import Regulator
+from poise.plan.lqr import Regulator, driven
 from poise.sim import CpuBackend, difference
 
 #: rad that a target may be away from the reference; rad/s beyond which a world has gone bad.
@@ -29,7 +28,7 @@ class Segments:
     Attributes:
         qpos: `(F, nq)`, positions of the trajectory.
         qvel: `(F, nv)`, its velocities.
-        action: `(F, nu + 6)`, its actions, see `linear_model.linearise`.
+        action: `(F, nu + 6)`, its actions, see `lqr.linearise`.
         rest: `(F, nu + 6)`, actions of no effort.
         ahead: `(F, nu)` rad, hinge angles of the reference's next rows.
         ref_qpos: `(F, nq)`, positions of the reference.

@@ -3,7 +3,7 @@
 An expert that needs no residual force. It is found by iLQR along all clips at once (Tassa et al. 2012),
 with three things that the motion of a human on stiff contacts asks for:
 
-- the linear model is taken over differences of about a tenth of a radian (`plan.linear_model`);
+- the linear model is taken over differences of about a tenth of a radian (`plan.lqr`);
 - at first a wrench on the root may help; its price rises wherever the character is near its reference:
   the curriculum of residual forces (Skeleton2Humanoid Eq. 9), for each shooting segment by itself;
 - the step is chosen for each segment of some seconds by itself, among rollouts that are made side by
@@ -22,8 +22,7 @@ from torch import Tensor
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.plan.expert import make_plan
-from poise.plan.linear_model import linearise
-from poise.plan.lqr import Regulator, regulate
+from poise.plan.lqr import Regulator, linearise, regulate
 from poise.plan.shooting import Segments, best_steps, segments
 from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
 from poise.sim import CpuBackend, SimConfig, difference

@@ -16,7 +16,7 @@ class TrajOptConfig:
 
     Attributes:
         iterations: number of iterations; 0 optimises nothing.
-        sizes: rad, of the differences in the first and in the last iteration, see `plan.linear_model`.
+        sizes: rad, of the differences in the first and in the last iteration, see `plan.lqr`.
         segment_s: seconds of a shooting segment; each segment chooses its own step.
         place_m: m, error of the root's place that costs 1.
         turn: rad, error of the root's attitude that costs 1.

@@ -9,7 +9,6 @@ from poise.sim.backend import (
     body_linear_velocity_w,
 )
 from poise.sim.config import CONES, INTEGRATORS, SOLVERS, SimConfig
-from poise.sim.contacts import add_contact_sensors, contact_columns
 from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
 from poise.sim.drive import Drive
@@ -17,6 +16,7 @@ from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dum
 from poise.sim.make import check_device, make_backend
 from poise.sim.tangent import difference, displaced
 from poise.sim.warp import WarpBackend
+from poise.sim.worlds import add_contact_sensors, contact_columns
 
 __all__ = [
     "CONES",

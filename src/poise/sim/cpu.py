@@ -9,10 +9,7 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
-from poise.sim.backend import SimState
-from poise.sim.checks import check_state, compile_model
-from poise.sim.contacts import contact_columns
-from poise.sim.drive import Drive
+from poise.sim.worlds import Worlds, check_state, compile_model, row_index
 
 State = tuple[Tensor, Tensor]
 _NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -25,7 +22,7 @@ _BAD = [
 ]
 
 
-class CpuBackend:
+class CpuBackend(Worlds):
     """`num_envs` worlds of one model on `threads` threads (0: all cores); see `Backend`.
 
     All numbers are float64 and the same, bit for bit, at any number of threads and as in a
@@ -36,42 +33,14 @@ class CpuBackend:
     def __init__(
         self, spec_or_model: mujoco.MjSpec | mujoco.MjModel, num_envs: int, threads: int = 0
     ) -> None:
-        if num_envs < 1 or threads < 0:
-            raise PoiseError(
-                f"num_envs must be above 0 and threads not below, got {num_envs}, {threads}"
-            )
-        self._model = compile_model(spec_or_model)
+        if threads < 0:
+            raise PoiseError(f"threads must not be below 0, got {threads}")
+        super().__init__(compile_model(spec_or_model), num_envs, torch.device("cpu"))
         self._batch: Batch | None = Batch(self._model, num_envs, min(threads, num_envs))
-        self._num_envs = num_envs
         self._rows = torch.from_numpy(self._live.state)
         self._outputs: dict[str, Tensor] = {}
-        self._state = SimState(self._views)
+        self._show()
         self._warmstart = self._view("qacc_warmstart")
-        self._drive = Drive(**self._views(["ctrl", "qfrc_applied", "xfrc_applied"]))
-        bodies, columns = contact_columns(self._model)
-        self._contact_bodies, self._contact_columns = torch.from_numpy(bodies), torch.from_numpy(columns)
-        if len(bodies):
-            self._state.bind(["sensordata"])
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        return self._model
-
-    @property
-    def num_envs(self) -> int:
-        return self._num_envs
-
-    @property
-    def device(self) -> torch.device:
-        return torch.device("cpu")
-
-    @property
-    def state(self) -> SimState:
-        return self._state
-
-    @property
-    def drive(self) -> Drive:
-        return self._drive
 
     def write(self, rows: Tensor | None, qpos: Tensor, qvel: Tensor) -> None:
         ids, order = self._ids(rows)
@@ -126,16 +95,11 @@ class CpuBackend:
         n = self._num_envs if ids is None else len(ids)
         names = sorted(self._outputs)
         widths = [self._rows.shape[1], *(self._outputs[name][0].numel() for name in names)]
-        if snapshot.shape not in ((n, sum(widths)), (n, widths[0])):
-            raise PoiseError(
-                f"the snapshot has shape {tuple(snapshot.shape)}, but this backend needs "
-                f"({n}, {sum(widths)}), or ({n}, {widths[0]}) without derived fields",
-                hint="Restore into the same model, with the same state fields bound.",
-            )
+        derived = self._holds_derived(snapshot, n, sum(widths), widths[0])
         to = slice(None) if ids is None else torch.from_numpy(ids).long()
         source = snapshot if order is None else snapshot[order]
         self._rows[to] = source[:, : widths[0]].to(self._rows)
-        if snapshot.shape[1] == widths[0]:
+        if not derived:
             self._run("forward", ids)
             return
         for name, value in zip(names, source.split(widths, dim=1)[1:], strict=True):
@@ -152,17 +116,6 @@ class CpuBackend:
 
     def set_const(self, rows: Tensor | None = None) -> None:
         self._run("set_const", self._ids(rows)[0])
-
-    def contacts(self) -> Tensor:
-        if not len(self._contact_bodies):
-            raise PoiseError(
-                "the model has no contact force sensors",
-                hint="Call poise.sim.add_contact_sensors(spec) before making the backend.",
-            )
-        out = self._rows.new_zeros(self._num_envs, self._model.nbody, 3)
-        # The sensed force is what the first body exerts on the others, so the sign turns.
-        out[:, self._contact_bodies] = -self._state["sensordata"][:, self._contact_columns]
-        return out
 
     def unstable(self) -> Tensor:
         counts = self._live.warning[:, _BAD, 1]
@@ -215,20 +168,10 @@ class CpuBackend:
         """Sorted int32 ids for Batch, and the order that sorts the caller's rows likewise."""
         if rows is None:
             return None, None
-        rows = torch.as_tensor(rows)
-        if rows.dtype == torch.bool:
-            if rows.shape != (self._num_envs,):
-                raise PoiseError(f"a row mask must be ({self._num_envs},), got {tuple(rows.shape)}")
-            return torch.nonzero(rows)[:, 0].to(torch.int32).numpy(), None
-        rows = rows.reshape(-1).long()
-        get_up = len(rows) and bool((rows.diff() > 0).all())
-        if get_up and rows[0] >= 0 and rows[-1] < self._num_envs:
+        rows = row_index(rows, self._num_envs)
+        if bool((rows.diff() > 0).all()):
             return rows.to(torch.int32).numpy(), None
         values, order = rows.sort()
-        if len(values) and (values[0] < 0 or values[-1] >= self._num_envs or (values.diff() == 0).any()):
-            raise PoiseError(
-                f"rows must be distinct and in 0 to {self._num_envs - 1}, got {rows.tolist()[:12]}"
-            )
         return values.to(torch.int32).numpy(), order
 
     def _run(self, call: str, ids: np.ndarray | None, **options: int) -> None:

@@ -73,21 +73,6 @@ class Drive:
         self.qfrc_applied.zero_()
         self.xfrc_applied.zero_()
 
-    def add_ctrl(self, ctrl: Tensor) -> None:
-        """Add actuator inputs `(N, nu)`."""
-        self.ctrl.add_(ctrl)
-
-    def add_root_wrench(self, force_w: Tensor, torque_b: Tensor, dof: int = 0) -> None:
-        """Add a wrench at a free joint, by its generalized force.
-
-        Args:
-            force_w: `(N, 3)` N, world axes, acting at the root body's origin `xpos`.
-            torque_b: `(N, 3)` Nm, in the root body's axes.
-            dof: the first degree of freedom of the free joint.
-        """
-        self.qfrc_applied[:, dof : dof + 3].add_(force_w)
-        self.qfrc_applied[:, dof + 3 : dof + 6].add_(torque_b)
-
     def add_wrench_at(
         self,
         body: int | Sequence[int] | Tensor,

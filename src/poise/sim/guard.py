@@ -78,7 +78,6 @@ class NanGuard:
         speed_limit: a joint speed above it is a failure (rad/s, or m/s for a sliding or free joint).
         where: given a world, says where it is ("walk.bvh, clip frame 57"), for the message.
         seed: the run's seed, noted in the dump.
-        on_failure: "raise" an UnstableError, or "return" the failures for the environment to reset.
         max_dumps: save no more files than this, since one bad setting can fail thousands of worlds.
     """
 
@@ -90,28 +89,28 @@ class NanGuard:
         speed_limit: float = 1000.0,
         where: Callable[[int], str] | None = None,
         seed: int | None = None,
-        on_failure: str = "raise",
         max_dumps: int = 4,
     ) -> None:
-        if on_failure not in ("raise", "return"):
-            raise PoiseError(f"on_failure must be 'raise' or 'return', got '{on_failure}'", "NanGuard")
         if not speed_limit > 0:
             raise PoiseError(f"speed_limit must be above 0, got {speed_limit}", "NanGuard")
         self.backend, self.speed_limit, self.seed = backend, float(speed_limit), seed
         self.folder = None if folder is None else Path(folder)
-        self.where, self.on_failure, self.max_dumps = where, on_failure, max_dumps
+        self.where, self.max_dumps = where, max_dumps
         self.count, self._dumps = 0, 0
         self._before = backend.snapshot(derived=False)
 
-    def step(self, nstep: int = 1) -> list[Failure]:
-        """One control step of nstep physics steps; the failures, if any, in the order of worlds."""
+    def step(self, nstep: int = 1) -> None:
+        """One control step of nstep physics steps.
+
+        Raises:
+            UnstableError: worlds went bad; its failures are in the order of the worlds.
+        """
         self.backend.snapshot(derived=False, out=self._before)
         self.backend.step(nstep)
         failures = [self._report(env, nstep) for env in self._bad_envs()]
         self.count += 1
-        if failures and self.on_failure == "raise":
+        if failures:
             raise UnstableError(failures)
-        return failures
 
     def _bad_envs(self) -> list[int]:
         qpos, qvel = self.backend.state.qpos, self.backend.state.qvel

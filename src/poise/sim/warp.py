@@ -12,10 +12,7 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
-from poise.sim.backend import STANDARD_FIELDS, SimState
-from poise.sim.checks import check_state, compile_model, row_index
-from poise.sim.contacts import contact_columns
-from poise.sim.drive import Drive
+from poise.sim.backend import STANDARD_FIELDS
 from poise.sim.warp_model import WarpModel
 from poise.sim.warp_setup import (
     Capacity,
@@ -26,6 +23,7 @@ from poise.sim.warp_setup import (
     load_warp,
     resolve_device,
 )
+from poise.sim.worlds import Worlds, check_state, compile_model, row_index
 
 _STATE = (
     "time", "qpos", "qvel", "act", "history", "plastic", "qacc_warmstart", "ctrl", "qfrc_applied",
@@ -48,7 +46,7 @@ _BINDABLE: frozenset[str] = frozenset((*STANDARD_FIELDS, *_STATE, *_FORCES, *_DE
 _HUGE = 1e10  # MuJoCo's mjMAXVAL, above which it calls a value bad.
 
 
-class WarpBackend:
+class WarpBackend(Worlds):
     """`num_envs` worlds of one model on a GPU, or on the CPU for tests; see `Backend`.
 
     All numbers are float32. The state, the drive and the bound fields are Warp's own arrays.
@@ -74,10 +72,7 @@ class WarpBackend:
         constraints_per_world: int | None = None,
         deterministic: bool = False,
     ) -> None:
-        if num_envs < 1:
-            raise PoiseError(f"num_envs must be above 0, got {num_envs}")
-        self._model, self._num_envs = compile_model(spec_or_model), num_envs
-        self._device = resolve_device(device)
+        super().__init__(compile_model(spec_or_model), num_envs, resolve_device(device))
         self._wp, self._mjw = load_warp()
         self._room = capacity(self._model, contacts_per_world, constraints_per_world)
         self._check_room()
@@ -93,39 +88,13 @@ class WarpBackend:
         self._sensors = torch.zeros_like(self._tensor("sensordata"))
         self._step_sensors = self._wp.zeros_like(self._d.sensordata)
         self._felt = self._force_sensors()
-        self._state = SimState(self._views)
-        self._drive = Drive(**self._views(["ctrl", "qfrc_applied", "xfrc_applied"]))
-        self._contact_bodies, self._contact_columns = (
-            torch.from_numpy(x).to(self._device) for x in contact_columns(self._model)
-        )
-        if len(self._contact_bodies):
-            self._state.bind(["sensordata"])
+        self._show()
         self.forward()
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        return self._model
-
-    @property
-    def num_envs(self) -> int:
-        return self._num_envs
-
-    @property
-    def device(self) -> torch.device:
-        return self._device
 
     @property
     def capacity(self) -> Capacity:
         """The room that each world has for contacts and constraint rows."""
         return self._room
-
-    @property
-    def state(self) -> SimState:
-        return self._state
-
-    @property
-    def drive(self) -> Drive:
-        return self._drive
 
     def write(self, rows: Tensor | None, qpos: Tensor, qvel: Tensor) -> None:
         to = self._rows(rows)
@@ -168,13 +137,7 @@ class WarpBackend:
         n = len(to) if isinstance(to, Tensor) else self._num_envs
         widths = [[v[0].numel() for v in self._kept(derived)] for derived in (False, True)]
         short, full = (sum(w) for w in widths)
-        if snapshot.shape not in ((n, full), (n, short)):
-            raise PoiseError(
-                f"the snapshot has shape {tuple(snapshot.shape)}, but this backend needs "
-                f"({n}, {full}), or ({n}, {short}) without derived fields",
-                hint="Restore into the same model, with the same state fields bound.",
-            )
-        derived = snapshot.shape[1] == full
+        derived = self._holds_derived(snapshot, n, full, short)
         parts = list(zip(self._kept(derived), snapshot.split(widths[derived], dim=1), strict=True))
 
         def put() -> None:
@@ -198,17 +161,6 @@ class WarpBackend:
         self._graphs.clear()
         self._shared.set_const(ids)
         self.forward()
-
-    def contacts(self) -> Tensor:
-        if not len(self._contact_bodies):
-            raise PoiseError(
-                "the model has no contact force sensors",
-                hint="Call poise.sim.add_contact_sensors(spec) before making the backend.",
-            )
-        out = self._sensors.new_zeros(self._num_envs, self._model.nbody, 3)
-        # The sensed force is what the first body exerts on the others, so the sign turns.
-        out[:, self._contact_bodies] = -self._sensors[:, self._contact_columns]
-        return out
 
     def unstable(self) -> Tensor:
         bad = torch.zeros(self._num_envs, dtype=torch.bool, device=self._device)

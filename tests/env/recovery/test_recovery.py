@@ -13,7 +13,7 @@ from poise.env import DoneTerm, ImitationEnv, ObsTerm, Recovery
 from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import CONTINUED, FALLEN, FAR, TRACKED, toward
 from poise.env.recovery.falls import Drop, lies
-from poise.env.terms import done, phc_obs, phc_recovery
+from poise.env.terms import done, phc_obs, phc_reward
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, PPOConfig
 from toy_human import swing
@@ -28,7 +28,7 @@ WALK = swing(2.0, speed=1.0, name="walk")
 def built(make_phc):
     """The PHC task of a walk with Eq. 4's rewards; `recovery` is set by `env_of`."""
     task = make_phc(WALK)
-    rewards = phc_recovery.recovery_terms(task.task.rewards)
+    rewards = phc_reward.recovery_terms(task.task.rewards)
     dones = (DoneTerm("too_far", done.bodies_too_far),)
     return replace(task, task=replace(task.task, rewards=rewards, dones=dones, recovery=QUICK))
 
@@ -65,7 +65,7 @@ def test_settings_that_cannot_be_are_refused(built):
     ):  # fmt: skip
         with pytest.raises(PoiseError):
             Recovery(**wrong)
-    with pytest.raises(PoiseError, match="torques or an action"):
+    with pytest.raises(PoiseError, match="by cannot be 'gravity'"):
         Drop(by="gravity")  # type: ignore[arg-type]
     with pytest.raises(PoiseError, match="far from the reference alone"):
         replace(built.task, recovery=None)
@@ -277,10 +277,10 @@ def test_the_codes_reward_counts_progress_everywhere_and_imitation_by_half(built
     plain = (*built.task.rewards,)
     assert [t.when for t in plain] == ["near"] * 5 + ["far", "far"]
     base = tuple(replace(t, when="always") for t in plain[:5])
-    code = {t.name: t for t in phc_recovery.recovery_terms(base, "code")}
+    code = {t.name: t for t in phc_reward.recovery_terms(base, "code")}
     assert code["body_positions"].weight == 0.25 and code["body_positions"].when == "near"
     assert code["energy"].weight == base[4].weight and code["energy"].when == "always"
-    paper = {t.name: t for t in phc_recovery.recovery_terms(base)}
+    paper = {t.name: t for t in phc_reward.recovery_terms(base)}
     assert paper["energy_far"].weight == pytest.approx(0.1 * base[4].weight)
     env = env_of(built, 3, rewards=tuple(code.values()))
     frame = env._frame()

@@ -1,42 +1,67 @@
-"""The frames of N motions that become known as they go, as packed poses."""
+"""Goals of which only some frames are known, as they come: what streams and generators share."""
 
 from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.goals.goal import extrapolated
+from poise.env.goals.goal import Goal, extrapolated
 from poise.env.plugins import Start
 from poise.env.poser import Poser
 from poise.sim import difference
 
 
-class FrameBuffer:
-    """The last L frames of N motions.
+class BufferedGoal(Goal):
+    """Worlds read along the last L frames of N motions.
 
-    Frames are counted from 0 on; `count (N,)` says how many are known. Frames before the last L are
-    forgotten and read as the oldest that is kept; frames beyond the last are extrapolated.
+    Frames are counted from 0 on; frames before the last L are forgotten and read as the oldest that is
+    kept; frames beyond the last are extrapolated.
 
     Velocities are differences to the frame before, so that none waits for a frame to come: a stream's
     last frame has one, too. The first frame stands still.
+
+    Attributes:
+        at: `(N,)` the frame that each world is at.
+        qpos: `(N, L, 7 + n)`, frame k at k mod L.
+        qvel: `(N, L, 6 + n)`, the velocities there.
+        count: `(N,)` how many frames are known.
+        low: `(N,)` the lowest root height so far, m.
+        last: `(N,)` index of the last frame of all, where that is known; else far away.
     """
 
     def __init__(
-        self, humanoid: Humanoid, rate_hz: float, num_envs: int, size: int, device: torch.device
+        self,
+        humanoid: Humanoid,
+        rate_hz: float,
+        num_envs: int,
+        size: int,
+        device: torch.device,
+        seed: int,
     ):
-        self.humanoid, self.rate_hz, self.size = humanoid, rate_hz, size
-        self.poser, self.device = Poser(humanoid), device
-        self.layout = self.poser.layout()
+        self.humanoid, self.bodies, self.rate_hz = humanoid, (humanoid,), rate_hz
+        self.num_envs, self.device, self.size, self.notes = num_envs, device, size, []
+        self.rng = torch.Generator().manual_seed(seed)
+        # Frames become poses on the CPU; what terms ask for is worked out where the worlds are.
+        self._poser, self._there = Poser(humanoid), Poser(humanoid, device)
+        self.layout = self._poser.layout()
         nq, nv = humanoid.model.nq, humanoid.model.nv
         self.qpos = torch.zeros(num_envs, size, nq, dtype=torch.float64, device=device)
         self.qpos[..., 3] = 1.0
         self.qvel = torch.zeros(num_envs, size, nv, dtype=torch.float64, device=device)
-        self.count = torch.zeros(num_envs, dtype=torch.long, device=device)
-        #: `(N,)` the lowest root height so far, m.
+        self.at = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.count, self._wait = torch.zeros_like(self.at), torch.zeros_like(self.at)
         self.low = torch.full((num_envs,), torch.inf, dtype=torch.float64, device=device)
-        #: `(N,)` index of the last frame of all, where that is known; else far away.
         self.last = torch.full_like(self.count, 2**62)
+        self._every = torch.arange(num_envs, device=device)
+        self._ahead, self._hinges = self.packed(self._every, self.at), self.qpos[:, 0, 7:].clone()
+        # Worlds with a next frame that may have changed since it was looked up.
+        self._stale = torch.zeros(num_envs, dtype=torch.bool, device=device)
+
+    # --- what is known ------------------------------------------------------------------------
 
     def clear(self, ids: Tensor) -> None:
         """Worlds `ids (n,)` know no frame."""
@@ -71,13 +96,67 @@ class FrameBuffer:
     def packed(self, ids: Tensor, index: Tensor) -> Tensor:
         """Packed poses `(n, W)` of frames `index (n,)`; the place says where the motion ends."""
         qpos, qvel = (x.cpu() for x in self.coordinates(ids, index))
-        pose = self.poser.live(qpos, qvel)
+        pose = self._poser.live(qpos, qvel)
         end = (index >= self.last[ids]).float().cpu()
         low = torch.where(self.low[ids].isfinite(), self.low[ids], 0.0).float().cpu()
         place = torch.stack((torch.zeros_like(end), low, end, torch.zeros_like(end)), 1)
         return self.layout.pack(pose, place).to(self.device)
 
+    # --- what a goal tells --------------------------------------------------------------------
+
+    def local(self, qpos: Tensor) -> Tensor:
+        return self._there.local(qpos)
+
+    @abstractmethod
+    def supply(self, ids: Tensor) -> None:
+        """Frames for worlds `ids (n,)` that are about to be read, as far as there are any."""
+
+    def start(self, ids: Tensor | None) -> Start:
+        ids = self._every if ids is None else ids
+        return self.coordinates(ids, self.at[ids])
+
+    def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
+        ids = self._every if ids is None else ids
+        self._wait = torch.zeros_like(self.at) if held is None else held.long()
+        self.supply(ids)
+        self._stale[ids] = True
+
+    def _look(self) -> None:
+        """Looks up the next frames where they may have changed."""
+        ids = self._stale.nonzero().squeeze(-1)
+        if not len(ids):
+            return
+        index = self.at[ids] + 1 - self._wait[ids]
+        self._ahead = self._ahead.clone()
+        self._ahead[ids] = self.packed(ids, index)
+        self._hinges[ids] = self.coordinates(ids, index)[0][:, 7:]
+        self._stale[ids] = False
+
+    def now(self, ids: Tensor | None = None) -> Tensor:
+        ids = self._every if ids is None else ids
+        return self.packed(ids, self.at[ids])
+
+    def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
+        if k == 1:
+            self._look()
+            return self._ahead if ids is None else self._ahead[ids]
+        ids = self._every if ids is None else ids
+        return self.packed(ids, self.at[ids] + k)
+
+    def targets(self) -> tuple[Tensor, Tensor]:
+        self._look()
+        return self._hinges, self._every
+
+    def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
+        now = self.ahead()
+        self.at += 1 if waited is None else 1 - waited.long()
+        self.aim(None, held)
+        return now, self.ahead()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        super().load_state(state)
+        self._stale[:] = True
+
     def rows(self) -> dict[str, Tensor]:
-        """Its tensors, a row per world."""
-        names = ("qpos", "qvel", "count", "last", "low")
+        names = ("at", "qpos", "qvel", "count", "last", "low")
         return {name: getattr(self, name) for name in names}

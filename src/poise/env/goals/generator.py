@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.goals.known import BufferedGoal
+from poise.env.goals.buffer import BufferedGoal
 from poise.errors import PoiseError
 
 
@@ -71,19 +71,19 @@ class GeneratorGoal(BufferedGoal):
                 f"{want}",
                 type(self.generator).__name__,
             )
-        self.buffer.clear(ids)
+        self.clear(ids)
         for k in range(self.generator.past):
-            self.buffer.append(ids, frames[:, k].to(self.buffer.qpos))
+            self.append(ids, frames[:, k].to(self.qpos))
         self.at[ids] = self.generator.past - 1
 
     def supply(self, ids: Tensor) -> None:
-        b, g = self.buffer, self.generator
-        begun = b.count[ids] > 0
-        short = ids[begun & (self.at[ids] + 1 >= b.count[ids]) & (self.at[ids] < b.last[ids])]
+        g = self.generator
+        begun = self.count[ids] > 0
+        short = ids[begun & (self.at[ids] + 1 >= self.count[ids]) & (self.at[ids] < self.last[ids])]
         if not len(short):
             return
-        index = b.count[short].unsqueeze(1) - g.past + torch.arange(g.past, device=self.device)
-        past = b.qpos[short.unsqueeze(1), index.clamp_min(0) % b.size]
+        index = self.count[short].unsqueeze(1) - g.past + torch.arange(g.past, device=self.device)
+        past = self.qpos[short.unsqueeze(1), index.clamp_min(0) % self.size]
         made = g.generate(past, short, self.rng).to(past)
         if made.shape != (len(short), g.future, past.shape[-1]):
             raise PoiseError(
@@ -93,14 +93,14 @@ class GeneratorGoal(BufferedGoal):
             )
         good = made.isfinite().all(-1).all(-1)
         for i in short[~good].tolist():
-            b.last[i] = b.count[i] - 1
+            self.last[i] = self.count[i] - 1
             self.notes.append(
-                f"The generator made what is no motion in world {i} after frame {int(b.count[i]) - 1}; "
+                f"The generator made what is no motion in world {i} after frame {int(self.last[i])}; "
                 "the character is to stand still there."
             )
         kept = short[good]
         for k in range(g.future if len(kept) else 0):
-            b.append(kept, made[good, k])
+            self.append(kept, made[good, k])
 
     def rows(self) -> dict[str, Tensor]:
         own = {f"generator/{k}": v for k, v in self.generator.rows().items()}

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.goals.known import BufferedGoal
+from poise.env.goals.buffer import BufferedGoal
 from poise.errors import PoiseError
 
 #: m/s beyond which a root did not move but jumped.
@@ -67,21 +67,21 @@ class StreamGoal(BufferedGoal):
         qpos = torch.cat(
             (qpos[:, :3], torch.nn.functional.normalize(qpos[:, 3:7], dim=-1), qpos[:, 7:]), -1
         )
-        known = self.buffer.count[ids]
-        before = self.buffer.qpos[ids, (known - 1) % SIZE]
+        known = self.count[ids]
+        before = self.qpos[ids, (known - 1) % SIZE]
         apart = (qpos[:, :3] - before[:, :3]).norm(dim=-1)
         jumped = (known > 0) & (apart * self.rate_hz > JUMP)
         if bool(jumped.any()):
             far = f"{float(apart[jumped].max()):.1f}"
             self._note(ids[jumped], f"jumped by {far} m between two frames; the goal is there now")
-        self.buffer.append(ids, qpos, jumped)
+        self.append(ids, qpos, jumped)
         self._stalled[ids] = False
         self._stale[ids] = True
 
     def close(self, ids: Tensor | None = None) -> None:
         """The streams of worlds `ids`, all for None, have ended with their last frames."""
         ids = self._every if ids is None else ids
-        self.buffer.last[ids] = (self.buffer.count[ids] - 1).clamp_min(0)
+        self.last[ids] = (self.count[ids] - 1).clamp_min(0)
         self._note(ids, "ended")
         self._stale[ids] = True
 
@@ -91,13 +91,13 @@ class StreamGoal(BufferedGoal):
         Raises:
             PoiseError: nothing has arrived yet.
         """
-        self.at[ids] = self.buffer.count[ids] - 1
+        self.at[ids] = self.count[ids] - 1
         if bool((self.at[ids] < 0).any()):
             raise PoiseError("nothing has arrived yet", "the stream", "Push a frame before the reset")
 
     def supply(self, ids: Tensor) -> None:
-        late = self.at[ids] + 1 - self.buffer.count[ids]
-        stalled = (late > STALL_S * self.rate_hz) & (self.at[ids] < self.buffer.last[ids])
+        late = self.at[ids] + 1 - self.count[ids]
+        stalled = (late > STALL_S * self.rate_hz) & (self.at[ids] < self.last[ids])
         fresh = ids[stalled & ~self._stalled[ids]]
         if len(fresh):
             self._stalled[fresh] = True

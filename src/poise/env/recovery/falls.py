@@ -12,6 +12,7 @@ from poise.body import Humanoid
 from poise.control import PDTargets
 from poise.errors import PoiseError
 from poise.kin import Kinematics, lowest_height
+from poise.settings import validate
 from poise.sim import Backend
 from poise.spatial import normalize
 
@@ -45,8 +46,7 @@ class Drop:
     count: int = 512
 
     def __post_init__(self) -> None:
-        if self.by not in ("torques", "action"):
-            raise PoiseError(f"a fall is driven by torques or an action, got '{self.by}'", "Drop")
+        validate(self)
         for name in ("size", "steps", "count"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "Drop")

@@ -26,8 +26,8 @@ from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, write_run
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
+from poise.learn.checkpoint import PolicyMeta
 from poise.learn.run import interruptible
-from poise.learn.schema import PolicyMeta
 from poise.learn.state import prefixed
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation

@@ -8,9 +8,9 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.terms.phc_reward`, `learn.Amp`         |
 | Sec. 3.1 relaxed early termination                | `env.terms.done`, `all_but_feet`            |
 | Sec. 3.2 progressive primitives, hard negatives   | `jobs.perpetual.stage_order`                |
-| Alg. 1, line 3: until success no longer improves  | `learn.converge`, `learn.mining`            |
+| Alg. 1, line 3: until success no longer improves  | `learn.mining`                              |
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
-| fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_recovery`    |
+| fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_reward`      |
 | P^(F) on Q^loco; interleaved recovery             | `jobs.perpetual.evaluation`                 |
 | in place of them, by default: recovery clips      | `jobs.perpetual.demonstrations`             |
 | Eqs. 5, 6 multiplicative composer                 | `learn.compose`, `nets.Composer`            |
@@ -33,7 +33,7 @@ from poise.body import BodyTable, Humanoid
 from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
 from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskConfig
 from poise.env.terms import done, phc_obs, phc_reward, reward
-from poise.env.terms.phc_recovery import recovery_terms
+from poise.env.terms.phc_reward import recovery_terms
 from poise.kin import fit_humanoid
 from poise.kin.place import on_own_body
 from poise.recipes.imitation import Clips, Imitation, as_library
