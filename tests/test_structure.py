@@ -32,7 +32,7 @@ EXPLAINED = {
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/contacts.py:add_contact_sensors",
-        "sim/guard.py:replay_dump", "view/data.py:decode_track", "sim/drive.py:Drive.add_ctrl",
+        "sim/guard.py:replay_dump", "sim/drive.py:Drive.add_ctrl",
         "sim/drive.py:Drive.add_root_wrench", "nets/gaussian.py:GaussianPolicy.entropy",
         "plan/inverse_dynamics.py:InverseDynamics.on_bodies",
     ),
