@@ -49,6 +49,7 @@ _NEXT = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "fo
 class CommonPose:
     """A skeleton facing +x with vertical legs, arms 45 degrees from its sides and flat feet.
 
+    roles: the skeleton and its parts.
     pos: `(J, 3)` m, the middle between the hip joints at the origin. rot: `(J, 4)` wxyz, world.
     above: `(J, 4)` wxyz, local rotations that joints above the pelvis keep.
     treads: `(2, 3)` m, in the frame of the left and right foot, the point on which it stands and rolls
@@ -58,6 +59,7 @@ class CommonPose:
     evidence: from what the pose was found, in a sentence.
     """
 
+    roles: Roles
     pos: np.ndarray
     rot: np.ndarray
     above: np.ndarray
@@ -67,11 +69,18 @@ class CommonPose:
     sole: float
     evidence: str
 
-    def lowest(self, roles: Roles, pos: Tensor, quat: Tensor, joints: Collection[int]) -> Tensor:
-        """`(T)` m, the lowest of those of `joints` that are parts of the body, of their tips and treads.
+    def depth(self, world: World, ground: float = 0.0, joints: Collection[int] | None = None) -> Tensor:
+        """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
 
-        pos, quat: `(T, J, 3)` and `(T, J, 4)`, world. Without any part it is infinite.
+        The floor lies as far under the `ground` of the treads as the soles do while standing.
         """
+        return (ground - self.sole - self.lowest(world, joints)).clamp_min(0.0)
+
+    def lowest(self, world: World, joints: Collection[int] | None = None) -> Tensor:
+        """`(T)` m, the lowest of those of `joints` (default: all) that are parts of the body, of their
+        tips and treads; infinite without any part."""
+        roles, (pos, quat) = self.roles, world
+        joints = range(len(roles.skeleton)) if joints is None else joints
         heights = [pos[:, r.joint, 2] for r in roles.rows if r.joint in joints]
         feet = [(roles.joint(f"{side}_foot"), t) for side, t in zip(SIDES, self.treads, strict=True)]
         for j, tip in (*self.tips, *feet):
@@ -191,8 +200,8 @@ class _Builder:
         tread = float(np.mean(heights))
         tips = tuple((r.joint, v) for r in self.roles.rows if (v := self._believed(r.joint)) is not None)
         arrays = pos.numpy(), rot.numpy(), above.numpy(), treads.numpy()
-        pose = CommonPose(*arrays, -tread, tips, 0.0, self.evidence)
-        low = pose.lowest(self.roles, pos[None], rot[None], range(len(self.skeleton)))
+        pose = CommonPose(self.roles, *arrays, -tread, tips, 0.0, self.evidence)
+        low = pose.lowest(World(pos[None], rot[None]))
         return replace(pose, sole=max(0.0, tread - float(low[0])))
 
     def _align_hinge(self, rot: Tensor, side: str, kinds: tuple[str, str, str]) -> None:

@@ -16,12 +16,9 @@ from torch import Tensor
 from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.kin.ground import fit_heights
-from poise.kin.retarget.common_pose import CommonPose
-from poise.kin.retarget.plant import Scale
+from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
-from poise.kin.retarget.transfer import passage, transfer
 from poise.motion import Clip, Skeleton
-from poise.motion.joint_map import JointMap
 from poise.motion.keypoints import Keypoints
 from poise.motion.points.fit import FitConfig, bones_of, fit_clip
 from poise.motion.points.labels import NEEDED, find_places
@@ -41,7 +38,7 @@ class PointBody:
     """A measured performer and the humanoid that it moves.
 
     names: labels of the keypoints. onto, table: the humanoid's skeleton and bodies. rest, share, bones:
-    the measured skeleton. joints, here, there, scale: see `retarget`. lift: m, how far the humanoid is
+    the measured skeleton. passage: from it to the humanoid. lift: m, how far the humanoid is
     lifted so that its soles stand on z = 0. notes: what was assumed.
     """
 
@@ -52,10 +49,7 @@ class PointBody:
     rest: Rest
     share: dict[str, float]
     bones: list[tuple[str, str, float]]
-    joints: JointMap
-    here: CommonPose
-    there: CommonPose
-    scale: Scale
+    passage: Passage
     lift: float
     notes: tuple[str, ...]
 
@@ -85,13 +79,10 @@ class PointBody:
         share = spine_shares({**seen, "neck": tracks["neck"], "pelvis": tracks["pelvis"]})
         rest = measure(tracks, spine, [])
         clip = fit_clip(points, config)
-        world = World.of(clip)
-        joints, here, there = passage(clip, onto, world=world)
-        scale = Scale.between(world, clip.fps, joints, here, there, None)
         skeleton = onto if isinstance(onto, Skeleton) else onto.skeleton
         body = cls(
             points.names, skeleton, table, {p: found[p] for p in seen}, rest, share, bones_of(rest),
-            joints, here, there, scale, 0.0, clip.skeleton.source.notes,
+            Passage.between(clip, onto), 0.0, clip.skeleton.source.notes,
         )  # fmt: skip
         places = np.stack([_mean(points.positions, k) for k in body.places.values()], 1)
         pos, quat = body.pose(places)
@@ -110,8 +101,7 @@ class PointBody:
 
         places: `(T, P, 3)` m, the tracks of `self.places` in order.
         """
-        world_in = self._performer(places)
-        rot, root = transfer(world_in, self.joints, self.here, self.there, self.scale)
+        rot, root = self.passage.transfer(self._performer(places))
         offsets = torch.tensor(self.onto.offsets)
         pos, quat = forward_kinematics(self.onto.parents, offsets, root, rot)
         rows = [r.joint for r in self.table.rows]
