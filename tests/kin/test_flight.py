@@ -12,12 +12,7 @@ import torch
 
 from poise.body import generate_table, make_humanoid
 from poise.kin import Kinematics, clip_to_qpos, fit_ground, fit_humanoid
-from poise.kin.flight import (
-    Flight,
-    find_flights,
-    likely_rate,
-    rate_sentence,
-)
+from poise.kin.flight import Flight, find_flights, likely_rate, rate_sentence
 from poise.kin.ground import clip_flights
 from poise.kin.solids import centre_of_mass
 from poise.motion import Clip, read_clip

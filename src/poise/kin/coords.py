@@ -12,7 +12,7 @@ from poise.motion import Clip, Skeleton
 from poise.spatial import (
     forward_kinematics,
     normalize,
-    quat_conj,
+    quat_between,
     quat_mul,
     quat_rotate,
     unwrap_quats,
@@ -39,9 +39,9 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
     columns = [pos[:, pelvis], unwrap_quats(quat[:, pelvis])]
     for row in rows[1:]:
         anchor = rows[row.parent].joint
-        rel = quat_mul(quat_conj(quat[:, anchor]), quat[:, row.joint])
+        rel = quat_between(quat[:, anchor], quat[:, row.joint])
         rest = torch.tensor(row.quat, dtype=torch.float64)
-        rot = quat_mul(quat_conj(rest).expand_as(rel), rel)
+        rot = quat_between(rest, rel)
         columns.append(chain_angles(rot, row.order, torch.tensor(row.frame, dtype=torch.float64)))
     return torch.cat(columns, -1).numpy()
 
@@ -84,7 +84,7 @@ def qpos_to_clip(
         shift = shift + quat_rotate(lead, torch.tensor(skeleton.offsets[pelvis]).expand(frames, 3))
     root_pos = q[:, :3] - shift
     world[pelvis] = normalize(q[:, 3:7])
-    rot[:, pelvis] = quat_mul(quat_conj(lead), world[pelvis])
+    rot[:, pelvis] = quat_between(lead, world[pelvis])
     by_joint = {r.joint: (i, r) for i, r in enumerate(rows)}
     start = _starts(table)
     for j in range(len(skeleton)):
@@ -100,7 +100,7 @@ def qpos_to_clip(
                 turn = chain_quat(angles, row.order, frame.expand(frames, 4))
                 anchor = world[rows[row.parent].joint]
                 full = quat_mul(anchor, quat_mul(rest, turn))
-                rot[:, j] = quat_mul(quat_conj(world[parent]), full)
+                rot[:, j] = quat_between(world[parent], full)
         world[j] = quat_mul(world.get(parent, lead), rot[:, j])
     return Clip(skeleton, root_pos.numpy(), normalize(rot).numpy(), fps, name)
 

@@ -19,7 +19,7 @@ from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
 from poise.kin.ground import GroundFit, clip_flights
 from poise.kin.place import on_own_body, place_on_body
 from poise.motion import Clip, ClipLibrary, resample
-from poise.spatial import quat_conj, quat_mul, quat_to_euler
+from poise.spatial import quat_between, quat_mul, quat_to_euler
 
 #: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
 OVERLAP_M = 0.01
@@ -160,8 +160,8 @@ def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
         anchor = rows[row.parent].joint
         rest = torch.tensor(row.quat, dtype=torch.float64)
         frame = torch.tensor(row.frame, dtype=torch.float64)
-        rel = torch.cat([quat_mul(quat_conj(w[:, anchor]), w[:, row.joint]) for w in worlds])
-        turns = quat_mul(quat_mul(quat_conj(quat_mul(rest, frame)).expand_as(rel), rel), frame)
+        rel = torch.cat([quat_between(w[:, anchor], w[:, row.joint]) for w in worlds])
+        turns = quat_mul(quat_between(quat_mul(rest, frame), rel), frame)
         orders = [row.order, *("".join(p) for p in itertools.permutations("XYZ"))]
         reach = [float(quat_to_euler(turns, o)[:, 1].abs().max()) for o in orders]
         if reach[0] > GIMBAL:

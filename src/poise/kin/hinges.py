@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.kin.branches import euler_path
-from poise.spatial import euler_to_quat, quat_conj, quat_mul, quat_to_euler
+from poise.spatial import euler_to_quat, quat_between, quat_conj, quat_mul, quat_to_euler
 
 
 def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
     third angle and one hinge takes the twist about its axis: both exact for rotations that lie in
     the chain. The whole sequence is shifted by full turns to lie nearest `prefer (n)` (default 0).
     """
-    local = quat_mul(quat_mul(quat_conj(frame), rot), frame)
+    local = quat_mul(quat_between(frame, rot), frame)
     if not order:
         return local.new_zeros(*local.shape[:-1], 0)
     if len(order) == 1:

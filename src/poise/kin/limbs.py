@@ -18,7 +18,7 @@ from poise.spatial import (
     axis_angle_to_quat,
     forward_kinematics,
     normalize,
-    quat_conj,
+    quat_between,
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
@@ -224,9 +224,9 @@ def _turn(
         one[:, 0] = 1.0
         return quat[:, parents[j]] if parents[j] >= 0 else one
 
-    rot[:, limb.root] = quat_mul(quat_conj(above(limb.root)), quat_mul(swing, quat[:, limb.root]))
-    rot[:, limb.mid] = quat_mul(quat_conj(above(limb.mid)), quat_mul(bend, quat[:, limb.mid]))
-    rot[:, limb.end] = quat_mul(quat_conj(quat_mul(both, above(limb.end))), quat[:, limb.end])
+    rot[:, limb.root] = quat_between(above(limb.root), quat_mul(swing, quat[:, limb.root]))
+    rot[:, limb.mid] = quat_between(above(limb.mid), quat_mul(bend, quat[:, limb.mid]))
+    rot[:, limb.end] = quat_between(quat_mul(both, above(limb.end)), quat[:, limb.end])
 
 
 def _direction(v: Tensor) -> Tensor:

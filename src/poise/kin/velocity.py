@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from poise.spatial import quat_conj, quat_mul, quat_to_rotvec
+from poise.spatial import quat_between, quat_to_rotvec
 
 
 def qpos_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
@@ -21,6 +21,6 @@ def qpos_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
     dt = (ahead - behind).to(q.dtype).unsqueeze(-1) / fps
     linear = (q[ahead, :3] - q[behind, :3]) / dt
     # w_b = log(q_behind^-1 q_ahead) / dt, in the root's frame
-    turn = quat_to_rotvec(quat_mul(quat_conj(q[behind, 3:7]), q[ahead, 3:7])) / dt
+    turn = quat_to_rotvec(quat_between(q[behind, 3:7], q[ahead, 3:7])) / dt
     hinges = (q[ahead, 7:] - q[behind, 7:]) / dt
     return torch.cat((linear, turn, hinges), -1).numpy()

@@ -21,7 +21,7 @@ from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
 from poise.motion.clip import Clip
 from poise.motion.joint_map import map_joints
-from poise.spatial import forward_kinematics, normalize, quat_conj, quat_mul, unwrap_quats
+from poise.spatial import forward_kinematics, normalize, quat_between, quat_mul, unwrap_quats
 
 Path = tuple[Tensor, Tensor]
 
@@ -60,7 +60,7 @@ class OtherRig:
         """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it."""
         before, after = self.to_clip(self.to_model(known)), self.to_clip(filled)
         root = known[0] + after[0] - before[0]
-        turn = quat_mul(quat_conj(before[1]), after[1])
+        turn = quat_between(before[1], after[1])
         return root, unwrap_quats(normalize(quat_mul(known[1], turn)))
 
     @staticmethod

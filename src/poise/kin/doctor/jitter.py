@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.kin.doctor.faults import Fault, spell_faults
 from poise.motion import Clip
-from poise.spatial import normalize, quat_conj, quat_mul, quat_rotate, quat_to_rotvec, unwrap_quats
+from poise.spatial import normalize, quat_between, quat_mul, quat_rotate, quat_to_rotvec, unwrap_quats
 
 #: Noise (m, rms) of the root, and of one end of a bone against the other, that counts as trembling.
 ROOT_M, BONE_M = 0.003, 0.003
@@ -95,7 +95,7 @@ def mend_jitter(clip: Clip) -> Clip:
             continue
         own = smooth[j]
         turned[:, j] = world[:, j] if own is None else own
-        local = turned[:, j] if above is None else quat_mul(quat_conj(above), turned[:, j])
+        local = turned[:, j] if above is None else quat_between(above, turned[:, j])
         changed = (turned[:, j] != world[:, j]).any(-1)
         if parent >= 0:
             changed |= (turned[:, parent] != world[:, parent]).any(-1)
@@ -128,7 +128,7 @@ def _calmer(local: Tensor, world: Tensor) -> bool:
 
 
 def _shaking(track: Tensor) -> Tensor:
-    steps = quat_to_rotvec(quat_mul(quat_conj(track[:-1]), track[1:]))
+    steps = quat_to_rotvec(quat_between(track[:-1], track[1:]))
     return torch.diff(steps, n=3, dim=0).square().mean() if len(steps) > 3 else steps.sum() * 0
 
 

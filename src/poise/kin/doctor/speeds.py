@@ -11,7 +11,7 @@ from torch import Tensor
 from poise.body import Anatomy
 from poise.kin.runs import find_runs
 from poise.motion import Clip
-from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, slerp, unwrap_quats
+from poise.spatial import normalize, quat_angle, quat_between, slerp, unwrap_quats
 
 #: rad/s that no human joint reaches. Elbows come nearest to it: 2,300 degrees per second (40 rad/s) in
 #: professional pitchers (Fleisig et al. 1999, J. Biomech. 32). Only their shoulders are faster, about
@@ -93,11 +93,11 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
 
 def _steps(track: Tensor) -> Tensor:
     """Angles (rad) between neighbouring frames."""
-    return quat_angle(quat_mul(quat_conj(track[:-1]), track[1:]))
+    return quat_angle(quat_between(track[:-1], track[1:]))
 
 
 def _change(old: Tensor, new: Tensor) -> float:
-    return float(quat_angle(quat_mul(quat_conj(old), new)).max())
+    return float(quat_angle(quat_between(old, new)).max())
 
 
 def _repair(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[str, tuple[int, int]]:
@@ -134,7 +134,7 @@ def _shortest(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[
         if a <= 0 or b >= frames - 1:
             short = b - a <= max(1, round(END_S * fps))
             return (-1 if a <= 0 else a, frames if b >= frames - 1 else b) if short else None
-        turn = float(quat_angle(quat_mul(quat_conj(track[a]), track[b])))
+        turn = float(quat_angle(quat_between(track[a], track[b])))
         if turn * fps / (b - a) <= limit / 2:
             return a, b
         a, b = a - 1, b + 1

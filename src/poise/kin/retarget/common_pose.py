@@ -25,7 +25,7 @@ from poise.motion.roles import SIDES
 from poise.spatial import (
     axis_angle_to_quat,
     normalize,
-    quat_conj,
+    quat_between,
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
@@ -184,7 +184,7 @@ class _Builder:
                 self._align_hinge(rot, side, kinds)
         parents = self.skeleton.parents
         local = torch.stack(
-            [rot[0]] + [quat_mul(quat_conj(rot[p]), rot[j]) for j, p in enumerate(parents) if p >= 0]
+            [rot[0]] + [quat_between(rot[p], rot[j]) for j, p in enumerate(parents) if p >= 0]
         )
         pos, rot = pose_positions(self.roles, local)
         hips = (pos[self._joint("left_thigh")] + pos[self._joint("right_thigh")]) / 2

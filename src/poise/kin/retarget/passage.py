@@ -17,7 +17,15 @@ from poise.kin.retarget.standing import World
 from poise.motion import Clip, Skeleton
 from poise.motion.joint_map import SHARED, JointMap, map_joints
 from poise.motion.roles import SIDES
-from poise.spatial import forward_kinematics, normalize, quat_conj, quat_mul, quat_rotate, slerp
+from poise.spatial import (
+    forward_kinematics,
+    normalize,
+    quat_between,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    slerp,
+)
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ class Passage:
         target = joints.target.skeleton
         source_pos, source_quat = world_in
         frames = len(source_pos)
-        turned = quat_mul(source_quat, quat_conj(torch.tensor(here.rot)).expand_as(source_quat))
+        turned = quat_mul(source_quat, quat_conj(torch.tensor(here.rot)))
         rest = torch.tensor(there.rot)
         moves = dict((b, a) for a, b in joints.direct)
         shared = _shared(self, turned)
@@ -111,19 +119,19 @@ class Passage:
         world: list[Tensor] = []
         for j, parent in enumerate(target.parents):
             if j in moves:
-                q = quat_mul(turned[:, moves[j]], rest[j].expand(frames, 4))
+                q = quat_mul(turned[:, moves[j]], rest[j])
             elif j in shared:
-                q = quat_mul(shared[j], rest[j].expand(frames, 4))
+                q = quat_mul(shared[j], rest[j])
             elif j in above:
                 own = torch.tensor(there.above[j]).expand(frames, 4)
                 q = own if parent < 0 else quat_mul(world[parent], own)
             else:
-                local = quat_mul(quat_conj(rest[parent]), rest[j])
-                q = quat_mul(world[parent], local.expand(frames, 4))
+                local = quat_between(rest[parent], rest[j])
+                q = quat_mul(world[parent], local)
             world.append(normalize(q))
         rot = torch.stack(
             [
-                q if p < 0 else quat_mul(quat_conj(world[p]), q)
+                q if p < 0 else quat_between(world[p], q)
                 for q, p in zip(world, target.parents, strict=True)
             ],
             1,
