@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 
 #: Below this distance (m) of ankle or toes, whichever is less, a foot shuffles, turns or rolls.
 LEAST_M = 0.05

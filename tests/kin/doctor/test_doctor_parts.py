@@ -13,9 +13,9 @@ from planted_faults import exchanged, lifted
 from poise.body import Anatomy
 from poise.errors import PoiseError
 from poise.kin import anatomy_of, examine, find_guesses, fit_humanoid, grounded, heal, support_of
+from poise.kin.doctor.doctor import limit_faults
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import trembling
-from poise.kin.doctor.limits import limit_faults
 from poise.kin.doctor.sides import side_votes
 from poise.kin.doctor.slides import mend_slides
 from poise.kin.doctor.support import foot_slips, slide_faults

@@ -12,7 +12,7 @@ from poise.body import find_anatomy, generate_table
 from poise.kin import clean_clip, clip_to_qpos, fit_humanoid, qpos_to_clip
 from poise.kin.doctor.flips import neutral_pose, unflip
 from poise.kin.doctor.speeds import TRUNK_SPEED
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.motion import Clip, read_clip
 from poise.spatial import quat_angle, quat_conj, quat_mul, rotvec_to_quat
 from toy_human import human, swing

@@ -15,7 +15,7 @@ from torch import Tensor
 from poise.body import BodyTable
 from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs, gaussian
 from poise.kin.solids import centre_of_mass
 from poise.motion import Clip
 from poise.spatial import GRAVITY, quat_rotate
@@ -152,10 +152,10 @@ def balance_point(com: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
     The path is smoothed by a Gaussian of `SMOOTH_S`, going on beyond its ends as it comes.
     """
     reach = min(round(4 * SMOOTH_S * fps), len(com) - 1)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (SMOOTH_S * fps)) ** 2)
+    kernel = gaussian(SMOOTH_S * fps, reach)
     # An odd reflection keeps the speed at the ends, where an even one would stop the body.
     padded = np.pad(com, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
-    smooth = np.stack([np.convolve(x, kernel / kernel.sum(), "valid") for x in padded.T], -1)
+    smooth = np.stack([np.convolve(x, kernel, "valid") for x in padded.T], -1)
     acc = np.gradient(np.gradient(smooth, axis=0), axis=0) * fps**2
     up = GRAVITY + acc[:, 2]
     held = np.maximum(up, LEAST_WEIGHT * GRAVITY)

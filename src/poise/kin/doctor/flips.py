@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Anatomy
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
 from poise.spatial import normalize, quat_angle, quat_between, quat_mul, quat_to_rotvec, rotvec_to_quat
 
@@ -38,11 +38,6 @@ class Flip:
     angle_deg: float
     before_deg: float
     after_deg: float
-
-    @property
-    def frames(self) -> int:
-        """How many frames were turned back."""
-        return self.stop - self.start + 1
 
 
 def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip, ...]]:

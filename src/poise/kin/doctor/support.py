@@ -14,7 +14,7 @@ from poise.errors import PoiseError
 from poise.kin.doctor.faults import Fault, spell_faults
 from poise.kin.feet.contact import NEAR_M, soles_of
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.kin.solids import centre_of_mass, lowest_height
 from poise.metrics import foot_contacts
 from poise.motion import Clip
@@ -132,11 +132,6 @@ def _low_points(
             margins.append(TIP_M)
             names.append(skeleton.names[j])
     return torch.stack(columns, -1).numpy(), np.array(margins), tuple(names)
-
-
-def support_faults(clip: Clip, support: Support) -> list[Fault]:
-    """Floating, penetration and sliding feet."""
-    return [*height_faults(clip, support), *slide_faults(clip, support)]
 
 
 def height_faults(clip: Clip, support: Support) -> list[Fault]:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.kin.doctor.faults import Fault
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.motion import Clip
 from poise.motion.io.guess import root_jumps
 from poise.spatial import quat_distance, slerp

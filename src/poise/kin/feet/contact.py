@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from poise.body import BodyTable
 from poise.body.table import BodyRow, Geom
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
 from poise.spatial import quat_rotate
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from poise.body import BodyTable
 from poise.kin.feet.contact import Sole, bearing, dragged, soles_of
 from poise.kin.feet.lead import lead, led
-from poise.kin.ground import smooth_lift
+from poise.kin.series import smooth_lift
 from poise.kin.solids import lowest_height
 from poise.motion import Clip, Skeleton
 from poise.spatial import forward_kinematics

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from poise.kin.feet.contact import TOUCH_M, contact_labels
-from poise.kin.ground import smooth_lift
 from poise.kin.limbs import Limb, match_positions
 from poise.kin.retarget.common_pose import hanging
 from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
+from poise.kin.series import smooth_lift
 from poise.motion import Clip
 from poise.motion.roles import SIDES
 from poise.spatial import forward_kinematics, quat_rotate
