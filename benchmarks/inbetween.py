@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from inbetween_baselines import Baseline
 
 from poise.errors import PoiseError
 from poise.eval.inbetween import (
@@ -45,7 +46,6 @@ from poise.learn.inbetween import BlockStats
 from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.nets.between import BetweenConfig, parameter_count
 from poise.nets.transition import Known
-from poise.synth.baselines import Baseline
 
 PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}
 #: What is tried on validation, at one length; the iterations (0 to 7) are chosen at each.

@@ -15,7 +15,7 @@ EXPLAINED = {
         "sim/backend.py:body_linear_velocity_w", "sim/backend.py:body_com_velocity_w",
         "metrics/plausibility.py:uhc_skate", "metrics/plausibility.py:uhc_penetration",
         "metrics/plausibility.py:physdiff_penetrate", "metrics/plausibility.py:physdiff_float",
-        "metrics/tracking.py:mpjpe_pa", "synth/baselines.py:Baseline",
+        "metrics/tracking.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
         "eval/inbetween.py:truth_rows", "eval/inbetween.py:markdown", "eval/recovery.py:write_recovery",
@@ -24,8 +24,8 @@ EXPLAINED = {
         "nets/between.py:parameter_count",
     ),
     "analytic inverse kinematics, which keyframes will need": (
-        "kin/ik/analytic.py:clip_ik", "kin/ik/angles.py:count_jumps", "kin/ik/body.py:body_points",
-        "kin/ik/paper.py:paper_humanoid", "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
+        "kin/ik/analytic.py:clip_ik",
+        "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
     ),
     "for users of the library": (
         "jobs/imitate.py:imitate", "jobs/track/clips.py:track_clip", "env/gym.py:GymVectorEnv",

@@ -18,7 +18,6 @@ from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik.analytic import analytic_ik, clip_ik
 from poise.kin.ik.body import IkBody, ik_body
 from poise.kin.ik.config import CORRECTIONS, IkConfig
-from poise.kin.ik.paper import paper_humanoid
 from poise.kin.ik.polish import PolishConfig, polish
 from poise.kin.limbs import limb_of, match_positions, two_bone
 from poise.kin.place import place_on_body
@@ -64,7 +63,6 @@ __all__ = [
     "limb_of",
     "lowest_height",
     "match_positions",
-    "paper_humanoid",
     "place_on_body",
     "polish",
     "qpos_to_clip",

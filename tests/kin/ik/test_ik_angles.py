@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from paper_humanoid import count_jumps
 
 from poise.kin.ik.angles import (
     continuous_euler,
-    count_jumps,
     euler_angles,
     one_turn_check,
     pointing_angles,

@@ -7,12 +7,12 @@ import sys
 import numpy as np
 import pytest
 import torch
+from paper_humanoid import body_points
 
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
 from poise.kin import IkBody, Kinematics, PolishConfig, clip_ik, polish
-from poise.kin.ik.body import body_points
 from poise.spatial import quat_to_matrix
 
 pytest.importorskip("mink")

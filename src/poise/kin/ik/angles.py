@@ -126,11 +126,6 @@ def _about(v: np.ndarray, w: np.ndarray, axis: int) -> np.ndarray:
     return np.arctan2(v[:, a] * w[:, b] - v[:, b] * w[:, a], v[:, a] * w[:, a] + v[:, b] * w[:, b])
 
 
-def count_jumps(angles: np.ndarray, limit: float = math.pi / 2) -> np.ndarray:
-    """How often each angle `(T, n)` steps by more than `limit` rad from one frame to the next: `(n)`."""
-    return (np.abs(np.diff(angles, axis=0)) > limit).sum(0)
-
-
 def by_order(orders: Sequence[str]) -> dict[str, list[int]]:
     """Indices of equal hinge orders."""
     out: dict[str, list[int]] = {}
