@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyConfig, BodyTable, generate_table
+from poise.kin.ik.bend import rotate
 from poise.kin.ik.body import IkBody, ik_body
-from poise.kin.ik.vectors import rotate
 from poise.motion import Skeleton
 from poise.spatial import matrix_to_quat
 

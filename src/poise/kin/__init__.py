@@ -1,6 +1,6 @@
 """Kinematics of a humanoid: clips cleaned and healed, to generalized coordinates and back, ground."""
 
-from poise.kin.coords import clip_to_qpos, qpos_to_clip
+from poise.kin.coords import clip_to_qpos, qpos_to_clip, qpos_velocity
 from poise.kin.cycle import close_cycle, cycle_step, cycle_velocity
 from poise.kin.doctor.clean import clean_clip, find_faults
 from poise.kin.doctor.doctor import Examination, examine, heal
@@ -17,14 +17,13 @@ from poise.kin.ground import fit_ground
 from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik.analytic import analytic_ik, clip_ik
 from poise.kin.ik.body import IkBody, ik_body
-from poise.kin.ik.config import CORRECTIONS, IkConfig
-from poise.kin.ik.polish import PolishConfig, polish
+from poise.kin.ik.frames import CORRECTIONS, IkConfig
+from poise.kin.ik.polish import polish
 from poise.kin.limbs import limb_of, match_positions, two_bone
 from poise.kin.place import place_on_body
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
-from poise.kin.velocity import qpos_velocity
 
 __all__ = [
     "CORRECTIONS",
@@ -34,7 +33,6 @@ __all__ = [
     "IkBody",
     "IkConfig",
     "Kinematics",
-    "PolishConfig",
     "RetargetConfig",
     "RetargetReport",
     "Support",

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.velocity import qpos_velocity
+from poise.kin.coords import qpos_velocity
 from poise.spatial import (
     heading_quat,
     quat_between,

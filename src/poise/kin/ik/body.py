@@ -12,7 +12,7 @@ from torch import Tensor
 
 from poise.body import BodyTable, Humanoid, find_anatomy
 from poise.kin.fk import Kinematics
-from poise.kin.ik.vectors import frame_of, square_to
+from poise.kin.ik.bend import frame_of, square_to
 from poise.motion import Skeleton
 from poise.spatial import normalize, quat_to_matrix
 
