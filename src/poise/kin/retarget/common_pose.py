@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body.topology import subtree
 from poise.errors import PoiseError
 from poise.kin.retarget.standing import (
     Stances,
@@ -20,7 +21,7 @@ from poise.kin.retarget.standing import (
     pose_positions,
     rest_axes,
 )
-from poise.motion import Clip, Roles, Skeleton
+from poise.motion import Clip, Roles
 from poise.motion.roles import SIDES
 from poise.spatial import (
     axis_angle_to_quat,
@@ -222,8 +223,8 @@ class _Builder:
         angle = torch.atan2(torch.linalg.cross(now, wanted) @ way, now @ wanted)
         if float(angle.abs()) > _MOST_TWIST:
             return
-        ends = hanging(self.skeleton, limb[2])
-        for j in hanging(self.skeleton, limb[0]) - ends:
+        ends = subtree(self.skeleton, limb[2])
+        for j in set(subtree(self.skeleton, limb[0])) - set(ends):
             rot[j] = quat_mul(axis_angle_to_quat(way, angle), rot[j])
 
     def _joint(self, role: str) -> int:
@@ -330,12 +331,3 @@ def _way(side: str, kind: str) -> Tensor:
     out = 1.0 if side == "left" else -1.0
     leg = kind in ("thigh", "shin")
     return normalize(torch.tensor([0.0, 0.0 if leg else out, -1.0], dtype=torch.float64))
-
-
-def hanging(skeleton: Skeleton, joint: int) -> set[int]:
-    """`joint` and all that hangs on it."""
-    out = {joint}
-    for j in range(joint + 1, len(skeleton)):
-        if skeleton.parents[j] in out:
-            out.add(j)
-    return out

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body.topology import subtree
 from poise.kin.feet.contact import TOUCH_M, contact_labels
 from poise.kin.limbs import Limb, match_positions
-from poise.kin.retarget.common_pose import hanging
 from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
 from poise.kin.series import smooth_lift
@@ -102,7 +103,7 @@ def plant(
     offsets = torch.tensor(skeleton.offsets)
     depth = passage.here.depth(world, scale.ground) * scale.factor
 
-    def lift(pos: Tensor, quat: Tensor, parts: set[int]) -> Tensor:
+    def lift(pos: Tensor, quat: Tensor, parts: Collection[int]) -> Tensor:
         """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
         excess = passage.there.depth(World(pos, quat), scale.ground, parts) - depth
         if float(excess.max()) < 1e-6:
@@ -110,7 +111,7 @@ def plant(
         return torch.tensor(smooth_lift(excess.clamp_min(0.0).numpy(), clip.fps, LIFT_S, clip.cyclic))
 
     if clear:
-        ends = {j for foot in feet for j in hanging(skeleton, foot.target)}
+        ends = {j for foot in feet for j in subtree(skeleton, foot.target)}
         pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
         up = torch.zeros_like(root)
         up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
@@ -126,7 +127,7 @@ def plant(
         if clear:
             moved = pos + (goal - pos[:, foot.target])[:, None]
             up = torch.zeros_like(goal)
-            up[:, 2] = lift(moved, quat, hanging(skeleton, foot.target))
+            up[:, 2] = lift(moved, quat, subtree(skeleton, foot.target))
             goal = goal + up
         goals[foot.target] = goal
     by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
@@ -134,7 +135,7 @@ def plant(
     if clear:
         pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
         up = torch.zeros_like(root)
-        up[:, 2] = lift(pos, quat, set(range(len(skeleton))))
+        up[:, 2] = lift(pos, quat, range(len(skeleton)))
         root = root + up
     return rot, root
 
