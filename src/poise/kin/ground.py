@@ -13,7 +13,7 @@ from poise.kin.feet.contact import stance_heights
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, find_flights
 from poise.kin.series import find_runs, smooth_hull, smooth_lift
-from poise.kin.solids import centre_of_mass, lowest_height
+from poise.kin.solids import heights, poses_of
 from poise.motion import Clip
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
@@ -72,10 +72,7 @@ class GroundFit:
 
 def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
     """The flights of a clip at its own frame rate."""
-    joints = [r.joint for r in table.rows]
-    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
-    low = lowest_height(table, pos, quat).min(-1).values.numpy()
-    return find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), clip.fps)
+    return find_flights(*heights(table, *poses_of(clip, table)), clip.fps)
 
 
 def fit_ground(
@@ -119,8 +116,8 @@ def fit_heights(
 
     See `fit_ground`, which does it.
     """
-    low = lowest_height(table, pos, quat).min(-1).values.numpy()
-    flights = find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), fps)
+    low, height = heights(table, pos, quat)
+    flights = find_flights(low, height, fps)
     stance = stance_heights(table, pos, quat, fps)
     lift = -float(np.quantile(low, 0.1))
     if len(stance) >= 3:

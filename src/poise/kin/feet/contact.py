@@ -23,6 +23,7 @@ from torch.nn import functional
 
 from poise.body import BodyTable
 from poise.body.table import BodyRow, Geom
+from poise.kin.fk import carried
 from poise.kin.series import find_runs
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
 from poise.spatial import quat_rotate
@@ -69,9 +70,8 @@ def soles_of(table: BodyTable, pos: Tensor, quat: Tensor) -> dict[int, Sole]:
         turn, middle = (torch.tensor(x, dtype=pos.dtype) for x in (box.quat, box.pos))
         ends = []
         for end in (-1.0, 1.0):
-            corner = torch.tensor([end * box.size[0], 0.0, -box.size[2]], dtype=pos.dtype)
-            local = middle + quat_rotate(turn, corner)
-            ends.append(pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i])))
+            corner = carried(middle, turn, (end * box.size[0], 0.0, -box.size[2]))
+            ends.append(carried(pos[:, i], quat[:, i], corner))
         out[i] = Sole(pos[:, i], torch.stack(ends, 1))
     return out
 
@@ -168,7 +168,7 @@ def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> n
         turn = torch.tensor(box.quat, dtype=pos.dtype)
         up = quat_rotate(turn, torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype))
         sole = torch.tensor(box.pos, dtype=pos.dtype) - up * box.size[2]
-        point = pos[:, i] + quat_rotate(quat[:, i], sole.expand_as(pos[:, i]))
+        point = carried(pos[:, i], quat[:, i], sole)
         level = quat_rotate(quat[:, i], up.expand_as(pos[:, i]))[:, 2] > LEVEL
         found.append(point[level & (point_speed(point, fps) < STAND_SPEED), 2])
     heights = torch.cat(found).numpy() if found else np.zeros(0)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kin.feet.contact import lowest_and_slow, sole_boxes
+from poise.kin.fk import carried
 from poise.motion import Clip
 from poise.spatial import quat_between, quat_conj, quat_mul, quat_rotate, shortest_arc
 
@@ -60,9 +61,7 @@ def level_feet(clip: Clip, table: BodyTable) -> Levelled:
     turns: dict[int, Tensor] = {}
     for _, row, box in sole_boxes(table):
         normal = quat_rotate(torch.tensor(box.quat, dtype=pos.dtype), up)
-        place = pos[:, row.joint] + quat_rotate(
-            quat[:, row.joint], torch.tensor(box.pos, dtype=pos.dtype).expand(len(pos), 3)
-        )
+        place = carried(pos[:, row.joint], quat[:, row.joint], box.pos)
         stands = lowest_and_slow(place, clip.fps)
         if int(stands.sum()) < ENOUGH_FRAMES:
             continue

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from poise.body.topology import subtree
 from poise.errors import PoiseError
+from poise.kin.fk import carried
 from poise.kin.retarget.standing import (
     Stances,
     World,
@@ -86,8 +87,7 @@ class CommonPose:
         feet = [(roles.joint(f"{side}_foot"), t) for side, t in zip(SIDES, self.treads, strict=True)]
         for j, tip in (*self.tips, *feet):
             if j in joints:
-                reach = torch.tensor(tip, dtype=pos.dtype).expand(len(pos), 3)
-                heights.append((pos[:, j] + quat_rotate(quat[:, j], reach))[:, 2])
+                heights.append(carried(pos[:, j], quat[:, j], tip)[:, 2])
         if not heights:
             return torch.full((len(pos),), torch.inf, dtype=pos.dtype)
         return torch.stack(heights, -1).min(-1).values

@@ -12,20 +12,13 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.kin.feet.contact import rest_height
+from poise.kin.fk import carried
 from poise.kin.retarget.common_pose import CommonPose, common_pose
 from poise.kin.retarget.standing import World
 from poise.motion import Clip, Skeleton
 from poise.motion.joint_map import SHARED, JointMap, map_joints
 from poise.motion.roles import SIDES
-from poise.spatial import (
-    forward_kinematics,
-    normalize,
-    quat_between,
-    quat_conj,
-    quat_mul,
-    quat_rotate,
-    slerp,
-)
+from poise.spatial import forward_kinematics, normalize, quat_between, quat_conj, quat_mul, slerp
 
 
 @dataclass(frozen=True)
@@ -46,9 +39,7 @@ class Scale:
         treads = []
         for side, tread in zip(SIDES, here.treads, strict=True):
             foot = here.roles.joint(f"{side}_foot") or 0
-            treads.append(
-                pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3))
-            )
+            treads.append(carried(pos[:, foot], quat[:, foot], tread))
         ground = rest_height(torch.stack(treads, 1), fps)
         hips = [pos[0, here.roles.joint(f"{s}_thigh") or 0] for s in SIDES]
         middle = (hips[0] + hips[1]) / 2

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from poise.body.topology import subtree
 from poise.kin.feet.contact import TOUCH_M, contact_labels
+from poise.kin.fk import carried
 from poise.kin.limbs import Limb, match_positions
 from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
@@ -43,7 +44,7 @@ class Foot:
     def points(self, pos: Tensor, quat: Tensor, target: bool) -> Tensor:
         """`(T, 3)` m, where the held point is."""
         joint, tread = (self.target, self.tread_target) if target else (self.source, self.tread_source)
-        return pos[:, joint] + quat_rotate(quat[:, joint], tread.expand(len(pos), 3))
+        return carried(pos[:, joint], quat[:, joint], tread)
 
 
 def feet_of(passage: Passage) -> tuple[Foot, ...]:
