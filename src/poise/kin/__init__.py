@@ -7,7 +7,7 @@ from poise.kin.doctor.doctor import Examination, examine, heal
 from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.guesses import find_guesses, grounded
 from poise.kin.doctor.sides import swap_sides
-from poise.kin.doctor.support import Support, anatomy_of, support_of
+from poise.kin.doctor.support import anatomy_of, support_of
 from poise.kin.feet.contact import contact_labels
 from poise.kin.feet.hold import hold_feet
 from poise.kin.feet.level import level_feet
@@ -35,7 +35,6 @@ __all__ = [
     "Kinematics",
     "RetargetConfig",
     "RetargetReport",
-    "Support",
     "analytic_ik",
     "anatomy_of",
     "by_kind",

@@ -177,7 +177,6 @@ def bar_plot(
     items: Sequence[tuple[str, float]],
     title: str,
     xlabel: str,
-    path: Path | str | None = None,
     *,
     most: float | None = None,
     color: str = COLORS[0],
@@ -216,7 +215,7 @@ def bar_plot(
         x = max(px(value), px(0.0)) if math.isfinite(value) else px(0.0)
         out.append(f'<text class="pp-k" x="{x + 8:.1f}" y="{y + 20:g}">{text}</text>')
     out.append(_labels(xlabel, "", "", "", left, end, up, down))
-    return _write("".join(out).replace(" data-plot", "", 1) + "</svg>", path)
+    return "".join(out).replace(" data-plot", "", 1) + "</svg>"
 
 
 def _few(values: np.ndarray) -> list[float | None]:

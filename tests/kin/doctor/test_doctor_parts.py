@@ -165,7 +165,7 @@ def test_a_stated_floor_is_believed_by_the_body() -> None:
     known = grounded(clip, None, 0.17)
     assert known.skeleton.source.ground_m == 0.17
     _, held, report = fit_humanoid(known)
-    assert report.ground[0].lift_m == 0.0
+    assert report.clips[0].ground.lift_m == 0.0
     # Without it the soles decide, and they stand 20 cm up.
     assert free[0][:, 2].mean() < clip.root_pos[:, 2].mean() - 0.1
     assert abs(held[0][:, 2].mean() - known.root_pos[:, 2].mean()) < 0.04

@@ -148,7 +148,7 @@ def test_planted_branch_flips_of_the_hinges_vanish(clip):
     broken = qpos_to_clip(other, table, clip.skeleton, clip.fps, clip)
     _, (mended,), report = fit_humanoid(broken, None, 60.0)
     np.testing.assert_allclose(mended, fit_humanoid(clip, None, 60.0)[1][0], atol=1e-6)
-    assert not report.clean[0] and np.abs(np.diff(mended[:, 7:], axis=0)).max() < 0.1
+    assert not report.clips[0].clean and np.abs(np.diff(mended[:, 7:], axis=0)).max() < 0.1
 
 
 @pytest.mark.parametrize(("take", "foot", "least"), [("01", "rFoot", 90), ("02", "lFoot", 60)])
