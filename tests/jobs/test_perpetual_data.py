@@ -89,8 +89,8 @@ def test_all_stand_on_the_floor_and_a_humanoid_takes_them(folder: Path) -> None:
     _, motions, report = fit_humanoid(library)
     assert len(motions) == len(library)
     # Told that the floor is known, the fit moves no clip as a whole.
-    assert [g.lift_m for g in (c.ground for c in report.clips)] == [0.0] * len(library)
-    assert max(g.clear_m.max() + g.settle_m.max() for g in (c.ground for c in report.clips)) < 0.03
+    assert [c.ground.lift_m for c in report.clips] == [0.0] * len(library)
+    assert max(c.ground.clear_m.max() + c.ground.settle_m.max() for c in report.clips) < 0.03
     assert max(c.joint_error_mm for c in report.clips) < 1.0
 
 

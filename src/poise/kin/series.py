@@ -25,15 +25,13 @@ def gaussian(sigma: float, reach: int | None = None) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-def gaussian_mean(path: Tensor, sigma: float) -> tuple[Tensor, int]:
-    """Means `(T, n)` of `path (T, n)` over three deviations `sigma`, the ends held; and the reach.
-
-    The mean of quaternions without jumps of sign is theirs after normalisation.
-    """
+def gaussian_sums(path: Tensor, sigma: float) -> tuple[Tensor, Tensor, int]:
+    """Weighted sums `(T, n)` of `path (T, n)` over three deviations `sigma`, the ends held; the sum of
+    the weights; and the reach in frames."""
     reach = math.ceil(3 * sigma)
     kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=path.dtype) / sigma) ** 2)
     padded = torch.cat((path[:1].expand(reach, -1), path, path[-1:].expand(reach, -1)))
-    return (padded.unfold(0, 2 * reach + 1, 1) * kernel).sum(-1) / kernel.sum(), reach
+    return (padded.unfold(0, 2 * reach + 1, 1) * kernel).sum(-1), kernel.sum(), reach
 
 
 def fade_beside(frames: int, start: int, stop: int, reach: int) -> Tensor:

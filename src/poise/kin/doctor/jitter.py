@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 from torch import Tensor
 
 from poise.kin.doctor.faults import Fault, spell_faults
-from poise.kin.series import fade_beside, gaussian_mean
+from poise.kin.series import fade_beside, gaussian_sums
 from poise.motion import Clip
 from poise.spatial import normalize, quat_between, quat_mul, quat_rotate, quat_to_rotvec, unwrap_quats
 
@@ -164,6 +164,6 @@ def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Te
 
 def _blend(path: Tensor, start: int, stop: int, sigma: float) -> Tensor:
     """The Gaussian mean inside the spell, the path itself beyond the filter's reach."""
-    mean, reach = gaussian_mean(path, sigma)
+    total, weights, reach = gaussian_sums(path, sigma)
     weight = fade_beside(len(path), start, stop, reach + 1).unsqueeze(-1)
-    return path + weight * (mean - path)
+    return path + weight * (total / weights - path)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Anatomy
-from poise.kin.series import fade_beside, find_runs, gaussian_mean
+from poise.kin.series import fade_beside, find_runs, gaussian_sums
 from poise.motion import Clip
 from poise.spatial import normalize, quat_angle, quat_between, slerp, unwrap_quats
 
@@ -152,7 +152,7 @@ def _smooth(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[in
     """Blends in the Gaussian mean around frames a to b in place, with the least deviation that does."""
     original, frames, sigma = unwrap_quats(track), len(track), 1.0
     while True:
-        mean, reach = gaussian_mean(original, sigma)
+        mean, _, reach = gaussian_sums(original, sigma)
         # Full weight in the spell, falling to nothing over the filter's reach.
         track[:] = slerp(original, normalize(mean), fade_beside(frames, a, b, reach))
         lo, hi = max(a - reach, 0), min(b + reach, frames - 1)

@@ -76,20 +76,17 @@ class Passage:
     ) -> Passage:
         """The passage of a clip; see `retarget`. factor: of the scale."""
         target, shown = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)
-        joints, world = map_joints(clip.skeleton, target, mapping), World.of(clip)
-        if example is not None and not clip.skeleton.same_bones(example.skeleton, 0.0):
+        source, world = clip.skeleton, World.of(clip)
+        joints = map_joints(source, target, mapping)
+        if example is None:
+            here = common_pose(joints.source, clip, world)
+        elif source.same_bones(example.skeleton, 0.0):
+            here = common_pose(joints.source, example)
+        else:
             raise PoiseError("the example is on another skeleton than the source", example.name)
-        here = (
-            common_pose(joints.source, clip, world)
-            if example is None
-            else common_pose(joints.source, example)
-        )
         there = here
-        if not clip.skeleton.same_bones(target, 0.0):
-            if shown is None and (clip.skeleton.names, clip.skeleton.parents) == (
-                target.names,
-                target.parents,
-            ):
+        if not source.same_bones(target, 0.0):
+            if shown is None and (source.names, source.parents) == (target.names, target.parents):
                 # The same hierarchy at another size, such as another subject of one data set.
                 shown = Clip(target, clip.root_pos, clip.rot, clip.fps, clip.name)
             there = common_pose(joints.target, shown)
@@ -117,16 +114,10 @@ class Passage:
                 own = torch.tensor(there.above[j]).expand(frames, 4)
                 q = own if parent < 0 else quat_mul(world[parent], own)
             else:
-                local = quat_between(rest[parent], rest[j])
-                q = quat_mul(world[parent], local)
+                q = quat_mul(world[parent], quat_between(rest[parent], rest[j]))
             world.append(normalize(q))
-        rot = torch.stack(
-            [
-                q if p < 0 else quat_between(world[p], q)
-                for q, p in zip(world, target.parents, strict=True)
-            ],
-            1,
-        )
+        both = zip(world, target.parents, strict=True)
+        rot = torch.stack([q if p < 0 else quat_between(world[p], q) for q, p in both], 1)
         zero = torch.zeros(frames, 3, dtype=torch.float64)
         pos, _ = forward_kinematics(target.parents, torch.tensor(target.offsets), zero, rot)
         root = self.scale.place(hip_middle(joints, source_pos, 0)) - hip_middle(joints, pos, 1)

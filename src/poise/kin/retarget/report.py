@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -54,9 +54,7 @@ class RetargetReport:
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain numbers, lists and names, ready for JSON."""
-        out = {
-            k: v for k, v in ((n, getattr(self, n)) for n in self.__dataclass_fields__) if k != "joints"
-        }
+        out = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "joints"}
         source, target = self.joints.source.skeleton.names, self.joints.target.skeleton.names
         out["bones"] = {name: {"mean_deg": a, "max_deg": b} for name, a, b in self.bones}
         out["ends"] = dict(self.ends)
