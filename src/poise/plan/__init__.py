@@ -1,6 +1,7 @@
 """Planning over an environment: experts, trajectory optimisation, sampling-based control."""
 
 from poise.plan.expert import Expert, ExpertConfig, Plan, make_plan
+from poise.plan.lookahead import Lookahead, LookaheadConfig
 from poise.plan.lqr_teacher import LqrTeacher
 from poise.plan.sampling import SamplingConfig, SamplingControl, SamplingResult
 from poise.plan.trajopt import TrajectoryOptimizer
@@ -9,6 +10,8 @@ from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
 __all__ = [
     "Expert",
     "ExpertConfig",
+    "Lookahead",
+    "LookaheadConfig",
     "LqrTeacher",
     "Plan",
     "SamplingConfig",

@@ -1,0 +1,261 @@
+"""Lookahead: before it acts, a controller simulates what a policy and small changes of it would do.
+
+    control = Lookahead(copies, policy, value)
+    control.watch(env)
+    simulate(env, control, obs, steps)
+
+Every few control steps the worlds of `copies` become copies of the character as it stands. Each acts as
+the policy plus an offset of its own, is simulated some steps ahead, and costs
+
+    c = - sum_h gamma^h r_h - gamma^H V(o_H) + prices,
+
+with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`). What the
+best of them began with is done. Nothing is trained, nothing helps, and the goal is seen no farther than it
+tells: a clip its frames, a stream or a generator what it knows.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.env.env import ImitationEnv
+from poise.env.goals.led import LOST
+from poise.env.snapshot import Snapshot
+from poise.env.task import Acts
+from poise.errors import PoiseError
+from poise.kin.solids import shapes_of
+from poise.metrics import mpjpe_global
+from poise.plan.prices import motion_price
+
+#: Copies below which there is nothing to choose from.
+FEWEST = 4
+#: Frames before a prediction that its jerk needs.
+PAST = 3
+
+
+@dataclass(frozen=True)
+class LookaheadConfig:
+    """How a controller looks ahead.
+
+    Attributes:
+        candidates: copies of the character that try at once.
+        horizon: control steps that each is simulated.
+        hold_steps: control steps from one decision to the next, for which an offset is held; it fades
+            over the rest of the horizon.
+        noise_range: (low, high) rad, between which the deviation of a copy's offsets is drawn, evenly in
+            its logarithm.
+        warm: share of the copies with offsets about those that the last decision had planned to go on
+            with; the others have theirs about none.
+        smoothing: shares of the last action that actions keep; the copies take them in turns.
+        jerk_price: cost of 1 km/s^3 of the bodies' mean jerk in a control step.
+        slide_price: cost of 1 m/s with which points of the soles slide in a control step.
+        slack: how much more than the best one a copy may cost in tracking alone, and still be chosen.
+        discount: gamma.
+        seed: seed of all draws.
+    """
+
+    candidates: int = 64
+    horizon: int = 12
+    hold_steps: int = 4
+    noise_range: tuple[float, float] = (0.03, 0.3)
+    warm: float = 0.5
+    smoothing: tuple[float, ...] = (0.0, 0.5, 0.7)
+    jerk_price: float = 1.5
+    slide_price: float = 4.0
+    slack: float = 1.0
+    discount: float = 0.97
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.candidates < max(FEWEST, 2 * len(self.smoothing)):
+            least = max(FEWEST, 2 * len(self.smoothing))
+            what = f"lookahead needs at least {least} candidates, got {self.candidates}"
+            raise PoiseError(what, hint=f"Give {least * self.horizon / self.hold_steps:g} steps or more")
+        if not 1 <= self.hold_steps <= self.horizon:
+            what = f"hold_steps must lie in 1 to the horizon {self.horizon}, got {self.hold_steps}"
+            raise PoiseError(what, "LookaheadConfig")
+        low, high = self.noise_range
+        if not 0 < low <= high or not 0 < self.discount <= 1 or not 0 <= self.warm <= 1:
+            what = "noise_range must rise from above 0, discount and warm must lie in 0 to 1"
+            raise PoiseError(what, "LookaheadConfig")
+        if not self.smoothing or not all(0 <= s < 1 for s in self.smoothing):
+            what = f"shares of smoothing must lie in 0 to below 1, got {self.smoothing}"
+            raise PoiseError(what, "LookaheadConfig")
+        if min(self.jerk_price, self.slide_price, self.slack) < 0:
+            raise PoiseError("prices and slack must be at least 0", "LookaheadConfig")
+
+    @property
+    def budget(self) -> float:
+        """Simulated control steps for each that is made."""
+        return self.candidates * self.horizon / self.hold_steps
+
+
+class _Choice(NamedTuple):
+    """What a decision came to.
+
+    Attributes:
+        offsets: `(H, A)` rad, by control step from now on.
+        smoothing: share of the last action that actions keep.
+    """
+
+    offsets: Tensor
+    smoothing: float
+
+
+@dataclass(eq=False)
+class _World:
+    """What a controller remembers of a world.
+
+    Attributes:
+        choice: what it does now; None before the first decision.
+        step: control steps since the decision.
+        past: `(k, B, 3)` m, the bodies in the last frames, up to `PAST`.
+    """
+
+    choice: _Choice | None = None
+    step: int = 0
+    past: list[Tensor] = field(default_factory=list)
+
+
+class Lookahead:
+    """Acts as a policy does, after it has looked ahead; `watch` tells it which environment it acts in.
+
+    Args:
+        copies: an environment of the same body and kind of goal in which it tries, of as many worlds as
+            there are candidates: without ends and automatic restarts, with rewards (`Imitation.bare`).
+        policy: acts on observations of both environments.
+        value: the return `(N,)` that the policy is still to earn, of observations `(N, O)`.
+        config: see `LookaheadConfig`.
+
+    Attributes:
+        seconds: of each decision.
+        steps: control steps that were simulated for the decisions.
+    """
+
+    def __init__(
+        self,
+        copies: ImitationEnv,
+        policy: Acts,
+        value: Callable[[Tensor], Tensor],
+        config: LookaheadConfig | None = None,
+    ):
+        self.copies, self.policy, self.value = copies, policy, value
+        self.config = c = config or LookaheadConfig(candidates=copies.num_envs)
+        if copies.num_envs != c.candidates:
+            what = f"{c.candidates} candidates need as many copies, got {copies.num_envs}"
+            raise PoiseError(what, "Lookahead")
+        humanoid = copies.goal.humanoid
+        self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
+        shares = torch.tensor(c.smoothing)
+        self._keep = shares[torch.arange(c.candidates) % len(shares)].unsqueeze(1)
+        # Held, then fading to nothing at the horizon.
+        left = torch.arange(1, c.horizon + 1) - c.hold_steps
+        self._shape = 1.0 - left.clamp_min(0) / max(1, c.horizon - c.hold_steps)
+        self._rng = torch.Generator().manual_seed(c.seed)
+        self._env: ImitationEnv | None = None
+        self._worlds: list[_World] = []
+        self.seconds: list[float] = []
+        self.steps = 0
+
+    def watch(self, env: ImitationEnv) -> None:
+        """Acts in the worlds of `env` from now on."""
+        self._env = env
+        self._worlds = [_World() for _ in range(env.num_envs)]
+        self._rng.manual_seed(self.config.seed)
+
+    @property
+    def num_obs(self) -> int:
+        """Width of the observations."""
+        return self.copies.num_obs
+
+    @property
+    def num_actions(self) -> int:
+        """Width of the actions."""
+        return self.copies.num_actions
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions `(N, A)` for observations `(N, O)` of the worlds as they stand.
+
+        Raises:
+            PoiseError: it watches no environment.
+        """
+        env = self._env
+        if env is None:
+            raise PoiseError("a lookahead acts in an environment", hint="Call watch(env) first")
+        pos, fresh = env.pose().pos, (env.age == 0).tolist()
+        offsets, keep = torch.zeros(len(obs), env.num_actions), torch.zeros(len(obs), 1)
+        for i, world in enumerate(self._worlds):
+            if fresh[i]:
+                world.choice, world.past = None, []
+            if world.choice is None or world.step == self.config.hold_steps:
+                world.choice, world.step = self._decide(i, world), 0
+            offsets[i] = world.choice.offsets[world.step]
+            keep[i] = 0.0 if fresh[i] else world.choice.smoothing
+            world.step += 1
+            world.past = [*world.past, pos[i].clone()][-PAST:]
+        return torch.lerp(self.policy.act(obs) + offsets, env.action, keep)
+
+    def _decide(self, i: int, world: _World) -> _Choice:
+        """What world i does next."""
+        assert self._env is not None
+        begun, c = time.perf_counter(), self.config
+        drawn = self._drawn(world.choice)
+        cost, price = self._simulate(self._env.snapshot(torch.tensor([i])), drawn, world.past)
+        allowed = cost <= cost.min() + c.slack
+        best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
+        self.seconds.append(time.perf_counter() - begun)
+        return _Choice(drawn[best], float(self._keep[best]))
+
+    def _drawn(self, last: _Choice | None) -> Tensor:
+        """`(K, H, A)` offsets: none, those planned before, and random ones about either."""
+        c, n = self.config, len(self.config.smoothing)
+        low, high = c.noise_range
+        size = low * (high / low) ** torch.rand(c.candidates, 1, generator=self._rng)
+        noise = size * torch.randn(c.candidates, self.num_actions, generator=self._rng)
+        about = torch.rand(c.candidates, generator=self._rng) < c.warm
+        noise[: 2 * n], about[:n], about[n : 2 * n] = 0.0, False, True
+        # What is not a joint, the residual, is the policy's own.
+        noise[:, self.copies.hinges :] = 0.0
+        out = noise[:, None] * self._shape[:, None]
+        if last is not None:
+            rest = last.offsets[c.hold_steps :]
+            out[about, : len(rest)] += rest
+        return out
+
+    def _simulate(
+        self, snapshot: Snapshot, offsets: Tensor, past: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Costs of tracking and prices `(K,)` of all copies."""
+        c, env = self.config, self.copies
+        obs, start = env.restore(snapshot), env.pose()
+        pos, quat = [start.pos.clone()], [start.quat.clone()]
+        cost, lost = torch.zeros(c.candidates), torch.zeros(c.candidates, dtype=torch.bool)
+        keep, factor = self._keep if past else torch.zeros_like(self._keep), 1.0
+        for h in range(c.horizon):
+            # The last frame of a clip is a goal that is reached.
+            if bool((env.goal.layout.place(env.goal.now()).end > 0).all()):
+                break
+            action = torch.lerp(self.policy.act(obs) + offsets[:, h], env.action, keep)
+            keep = self._keep
+            obs = env.step(action).final_obs
+            pose = env.pose()
+            pos.append(pose.pos.clone())
+            quat.append(pose.quat.clone())
+            off = mpjpe_global(pose.pos, env.goal_pose().pos) / 1000.0
+            lost |= ~(off <= LOST)
+            cost, factor = cost - factor * env.imitation, factor * c.discount
+        cost = cost - factor * self.value(obs)
+        self.steps += c.candidates * (len(pos) - 1)
+        before = torch.stack(past) if past else pos[0][:0]
+        price = motion_price(
+            torch.stack(pos, 1), torch.stack(quat, 1), before, self._shapes, self._feet,
+            env.goal.rate_hz, c.jerk_price, c.slide_price,
+        )  # fmt: skip
+        whole = ~lost & cost.isfinite() & price.isfinite()
+        return torch.where(whole, cost, torch.inf), price

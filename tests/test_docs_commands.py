@@ -1,0 +1,153 @@
+"""Every `poise` command line of the README and the docs is run, with short settings."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from poise.cli.main import main
+from poise.motion import Clip, read_clip, trim
+from poise.motion.io import write_clip
+from poise.recipes import ResidualForce
+from poise.settings import to_toml
+from test_docs import WALK, _commands
+from toy_policy import toy_run
+
+#: What needs a machine of its own: a GPU, a Ray cluster.
+ELSEWHERE = ("--device cuda", "--address")
+#: Exit codes of a command that did what it says: done, or done but a motion was lost.
+DONE = (0, 3)
+TINY = ("--iterations", "2", "--envs", "16", "--threads", "1")
+#: Frames of the motions; the docs name frame 60.
+FRAMES = 64
+#: Roles that the docs map, as the embedded walk calls them.
+ROLES = {"left_foot": "LeftFoot"}
+#: Keypoints of a file, and the joints of the embedded walk that they are.
+POINTS = {
+    f"{side[0]}{name}": side + joint
+    for side in ("Left", "Right")
+    for name, joint in (
+        ("Hip", "UpLeg"), ("Knee", "Leg"), ("Ankle", "Foot"), ("BigToe", "Toe"),
+        ("Shoulder", "Arm"), ("Elbow", "ForeArm"), ("Wrist", "Hand"),
+    )
+} | {"Neck": "Neck", "Head": "Head"}  # fmt: skip
+
+
+def _shortened(line: str) -> list[str]:
+    """The arguments of a command line that does the same with less of everything."""
+    line = line.split("|")[0].replace("/shared/", "shared/").replace(" --open", "")
+    line = re.sub(r"--minutes \d+|--seeds \S+", "", line)
+    line = re.sub(r"--learn \d+", "--learn 0.02", line)
+    line = re.sub(r"(=\d+),[\d,]+", r"\1", line)
+    argv = shlex.split(line, comments=True)[1:]
+    if "--search" in argv:
+        argv += ["--characters", "8"]
+    if argv[0] == "imitate" and "--print-config" not in argv:
+        argv += TINY
+        if "--resume" in argv:
+            argv[argv.index("--iterations") + 1] = "3"
+    if argv[:2] == ["train", "perpetual"]:
+        argv += [*TINY, "--single", "--no-expert", "--no-style", "--no-recovery"]
+    if argv[:2] == ["train", "inbetween"]:
+        argv += ["--iterations", "1", "--threads", "1"]
+    if "--preset" in argv:
+        argv += ["--ppo.horizon", "8"]
+    if argv[0] == "fleet":
+        argv += ["--set", "envs=16", "--set", "iterations=2", "--workers", "2"]
+    return argv
+
+
+def _points(walk: Clip) -> np.ndarray:
+    """`(T, K, 3)` m, Y up."""
+    joints = walk.skeleton.names
+    at = walk.world()[0][:, [joints.index(name) for name in POINTS.values()]]
+    return at[..., [1, 2, 0]]
+
+
+def _write_trc(path: Path, walk: Clip) -> None:
+    points, rate = _points(walk), f"{walk.fps:g}"
+    words = (
+        "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
+    )
+    head = words.replace(" ", "\t")
+    stated = (rate, rate, str(walk.frames), str(len(POINTS)), "m", rate, "1", str(walk.frames))
+    lines = [f"PathFileType\t4\t(X/Y/Z)\t{path.name}", head, "\t".join(stated)]
+    lines += ["Frame#\tTime\t" + "\t\t\t".join(POINTS) + "\t\t", "\t\t" + "X1\tY1\tZ1\t" * len(POINTS)]
+    lines += [
+        "\t".join([str(t + 1), f"{t / walk.fps:.6f}", *(f"{v:.6f}" for v in row.ravel())])
+        for t, row in enumerate(points)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _write_c3d(path: Path, walk: Clip) -> None:
+    file = pytest.importorskip("ezc3d").c3d()
+    points, point = _points(walk), file["parameters"]["POINT"]
+    point["RATE"]["value"], point["UNITS"]["value"] = [walk.fps], ["m"]
+    point["LABELS"]["value"] = tuple(POINTS)
+    data = np.ones((4, len(POINTS), walk.frames))
+    data[:3] = points.transpose(2, 1, 0)
+    file["data"]["points"] = data
+    file.write(str(path))
+
+
+def _provide(path: Path, bones: dict[str, str]) -> None:
+    """Makes an input that a command line names: of the kind that its name says. bones: other names for
+    joints of the walk."""
+    walk = trim(read_clip(WALK), 0, FRAMES)
+    names = tuple(bones.get(name, name) for name in walk.skeleton.names)
+    walk = walk.replaced(skeleton=replace(walk.skeleton, names=names))
+    if path.name == "clips":
+        path.mkdir()
+        for name in ("one", "two"):
+            write_clip(walk, path / f"{name}.bvh")
+    elif path.name == "run":
+        toy_run(path)
+    elif path.suffix == ".toml":
+        path.write_text(to_toml(ResidualForce(seed=1)))
+    elif path.suffix == ".trc":
+        _write_trc(path, walk)
+    elif path.suffix == ".c3d":
+        _write_c3d(path, walk)
+    elif path.suffix in (".bvh", ".glb"):
+        write_clip(walk, path)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("page", sorted({page for page, _ in _commands()}))
+def test_commands_run(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for line in (line for of, line in _commands() if of == page):
+        if any(words in line for words in ELSEWHERE):
+            continue
+        argv = _shortened(line)
+        made = {argv[i + 1] for i, word in enumerate(argv) if word == "-o"}
+        made |= {argv[2]} if argv[0] == "convert" else set()
+        # The maps of the page are of this rig.
+        maps = [argv[i + 1].split("=") for i, word in enumerate(argv) if word == "--map"]
+        bones = {ROLES.get(of, of): bone for of, bone in maps}
+        for word in argv[1:]:
+            path = Path(word)
+            stale = bool(bones) and path.stem == "rig"
+            if _is_input(word) and word not in made and (stale or not path.exists()):
+                _provide(path, bones if stale else {})
+        capsys.readouterr()
+        code = main(argv)
+        said = capsys.readouterr()
+        assert code in DONE, f"{line}\n{said.err}"
+        assert all(Path(out).exists() for out in made), line
+        if "--json" in argv:
+            assert json.loads(said.out)["result"]["outcome"] in ("tracked", "lost"), line
+
+
+def _is_input(word: str) -> bool:
+    known = (".bvh", ".glb", ".trc", ".c3d", ".toml")
+    return Path(word).suffix in known or word.rstrip("/") in ("clips", "run")
