@@ -18,7 +18,8 @@ from pathlib import Path
 import torch
 
 from poise.jobs.deliver import deliver
-from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
+from poise.jobs.run_file import learning_curve
+from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip

@@ -20,7 +20,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -34,16 +34,16 @@ from poise.eval.inbetween import (
     Row,
     TestSet,
     evaluate,
-    markdown,
     predict,
     score,
+    slide,
     test_set,
-    truth_rows,
 )
-from poise.jobs.inbetween import Inbetween, Task, begin, train
+from poise.jobs.inbetween.training import Inbetween, Task, begin, train
 from poise.learn.adapt import Adaptation, adapt, best_setting, choose_iterations
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import MODEL, InbetweenModel, load_model
+from poise.metrics import physics
 from poise.nets.between import BetweenConfig, parameter_count
 from poise.nets.transition import Known
 
@@ -56,6 +56,37 @@ SETTINGS = (
 #: Windows of the validation part that choices are made on.
 _ENOUGH = 128
 _LENGTH = 30
+
+
+def truth_rows(test: TestSet) -> list[Row]:
+    """The recorded motion's own figures: zero errors, and its FP, FQ, JQ and SM."""
+    rows = []
+    for n in test.protocol.lengths:
+        pos = test.truth(n)[0]
+        rows.append(Row(n, 0.0, 0.0, 0.0, *physics(pos, test.feet, test.fps), 0.0, slide(test, pos, n)))
+    return rows
+
+
+def markdown(name: str, methods: Mapping[str, Sequence[Row]]) -> str:
+    """One table per figure, methods down and lengths across, under the name of the data."""
+    figures = {
+        "L2P": ("l2p", "{:.3f}"), "L2Q": ("l2q", "{:.3f}"), "NPSS": ("npss", "{:.4f}"),
+        "FP, mm": ("fp_mm", "{:.3f}"), "FQ": ("fq", "{:.2%}"), "JQ": ("jq", "{:.2%}"),
+        "SM, mm/frame": ("sm_mm", "{:.1f}"),
+        "slide, mm/frame": ("slide_mm", "{:.2f}"),
+    }  # fmt: skip
+    lengths = [row.length for row in next(iter(methods.values()))]
+    lines = []
+    for title, (key, form) in figures.items():
+        lines += [f"**{name}, {title}**", ""]
+        lines += ["| method | " + " | ".join(map(str, lengths)) + " |"]
+        lines += ["|---" * (len(lengths) + 1) + "|"]
+        for method, rows in methods.items():
+            lines.append(
+                f"| {method} | " + " | ".join(form.format(getattr(r, key)) for r in rows) + " |"
+            )
+        lines.append("")
+    return "\n".join(lines)
 
 
 def settings(protocol: Protocol, net: str, seed: int, args: argparse.Namespace) -> Inbetween:

@@ -21,12 +21,12 @@ import os
 from pathlib import Path
 
 import torch
-from inbetween import adapted_rows, cost
+from inbetween import adapted_rows, cost, truth_rows
 from inbetween_baselines import Baseline
 
-from poise.eval.inbetween import Protocol, evaluate, test_set, truth_rows
-from poise.jobs.inbetween import Inbetween, begin, train
-from poise.jobs.library import LibraryConfig
+from poise.eval.inbetween import Protocol, evaluate, test_set
+from poise.jobs.inbetween.training import Inbetween, begin, train
+from poise.jobs.library.clips import LibraryConfig
 from poise.learn.between import BetweenTraining
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import save_model

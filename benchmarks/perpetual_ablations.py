@@ -18,12 +18,12 @@ from pathlib import Path
 from tracker import SIXTY
 
 from poise.body import BodyConfig
-from poise.cli.callbacks import beginning
-from poise.cli.perpetual_shown import training as shown
-from poise.jobs.library.folder import LibraryConfig
+from poise.cli.train_perpetual import training as shown
+from poise.cli.training import beginning
+from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.result import RESULT
 from poise.jobs.perpetual.run import begin, clips_of, resume, train
-from poise.jobs.runs import RUN_FILE
+from poise.jobs.run_file import RUN_FILE
 from poise.learn import Until
 from poise.recipes.perpetual import Perpetual
 

@@ -42,7 +42,7 @@ def noisy(run: Run, folders: Sequence[Path], tell: Tell) -> dict[str, Any]:
     for file in (f for folder in folders for f in motion_files_of(folder)):
         try:
             clip = read_clip(file.path)
-            done = track(run.tracker, points_of(clip, Stated()) or clip, TrackConfig())
+            done = track(points_of(clip, Stated()) or clip, run.tracker, TrackConfig())
         except PoiseError as problem:
             refused.append({"file": file.name, "why": problem.what})
             continue

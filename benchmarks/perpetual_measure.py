@@ -27,10 +27,10 @@ from poise.jobs.library.files import BACKWARDS, MIRRORED, matches, subject_of
 from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.runs import RUN_FILE
+from poise.jobs.run_file import RUN_FILE
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker, tracker_of
+from poise.jobs.tracker import Tracker
 from poise.learn import LATEST, PolicyBundle, load_checkpoint, load_policy
 from poise.learn.progressive import primitive
 from poise.motion import Clip, ClipLibrary
@@ -65,11 +65,11 @@ class Run:
             folder = folder / "run"
         if not (folder / RUN_FILE).exists():
             raise PoiseError(f"is no run folder: there is no {RUN_FILE} in it", folder)
-        imitation = open_run(folder).task
+        run = open_run(folder)
         owner = None
         if (folder / LATEST).exists():
             owner = load_checkpoint(folder / LATEST)[0].get("ledger/owner")
-        return cls(name, folder, imitation, tracker_of(folder, imitation), owner)
+        return cls(name, folder, run.task, run.tracker, owner)
 
     @property
     def policy(self) -> PolicyBundle:

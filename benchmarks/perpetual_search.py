@@ -1,4 +1,4 @@
-"""What many characters find of the motions that the policy alone loses (`jobs.track.searching`)."""
+"""What many characters find of the motions that the policy alone loses (`jobs.track.recovering`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from poise.env import Acts, ImitationEnv
 from poise.eval.episodes import run_episodes
 from poise.eval.rolloutset import RolloutSet
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.track.searching import replay, search
+from poise.jobs.track.recovering import look_for, replay
 from poise.plan import SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
 
@@ -35,7 +35,7 @@ def searched(
         if won:
             continue
         began = time.perf_counter()
-        found[c] = search(run.tracker, task, config, c, threads)
+        found[c] = look_for(run.tracker, task, config, c, threads)
         name, f = task.reference.names[c], found[c]
         row = {"clip": name, "steps": len(f.actions), "reached": f.reached, "tries": f.tries}
         rows.append(row | {"seconds": round(time.perf_counter() - began, 1)})

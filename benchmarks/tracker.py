@@ -5,7 +5,7 @@
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
 that need none. Ctrl-C and --resume as in `poise train perpetual`; the policy is written with
-`poise.jobs.track.policy.save_tracker` and measured by `perpetual.py`.
+`poise.jobs.tracker.save_tracker` and measured by `perpetual.py`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from poise.body import BodyConfig
-from poise.cli.callbacks import beginning
-from poise.cli.perpetual_shown import training as shown
-from poise.jobs.library.folder import LibraryConfig
+from poise.cli.train_perpetual import training as shown
+from poise.cli.training import beginning
+from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.run import begin, clips_of, resume, train
 from poise.learn import ConvergenceConfig, Until
 from poise.plan import TrajOptConfig

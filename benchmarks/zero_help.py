@@ -28,7 +28,8 @@ import torch
 
 from poise.eval import RolloutSet
 from poise.jobs.deliver import deliver
-from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
+from poise.jobs.run_file import learning_curve
+from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.learn import IterationStats, Until
 from poise.motion import ClipLibrary
 from poise.motion.io import read_clip

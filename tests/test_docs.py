@@ -50,7 +50,7 @@ def _example_clip(request: pytest.FixtureRequest) -> Path:
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a toy `run` and its `policy.safetensors`."""
     from poise.jobs.open import open_run
-    from poise.jobs.track.policy import save_tracker
+    from poise.jobs.tracker import save_tracker
     from toy_policy import toy_run
 
     folder = tmp_path_factory.mktemp("policy")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from poise.errors import PoiseError
-from poise.jobs.inbetween import Inbetween
+from poise.jobs.inbetween.training import Inbetween
 from poise.learn import PPOConfig
 from poise.recipes import ResidualForce
 from poise.recipes.perpetual import Perpetual, RecoveryPlan

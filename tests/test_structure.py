@@ -18,7 +18,7 @@ EXPLAINED = {
         "metrics/tracking.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
-        "eval/inbetween.py:truth_rows", "eval/inbetween.py:markdown", "eval/recovery.py:write_recovery",
+        
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
         "learn/adapt.py:adapt_each", "learn/adapt.py:choose_iterations", "learn/adapt.py:best_setting",
         "nets/between.py:parameter_count",
@@ -28,7 +28,7 @@ EXPLAINED = {
         "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
     ),
     "for users of the library": (
-        "jobs/imitate.py:imitate", "jobs/track/clips.py:track_clip", "env/gym.py:GymVectorEnv",
+        "jobs/imitate.py:imitate", "eval/card.py:read_score", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/contacts.py:add_contact_sensors",

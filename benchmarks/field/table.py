@@ -17,8 +17,7 @@ from torch import Tensor
 
 from field.card import FIGURES, ClipErrors, Errors, FieldTable, View
 from poise.errors import PoiseError
-from poise.eval.judged import Sums, judge
-from poise.eval.rolloutset import RolloutSet
+from poise.eval.rolloutset import RolloutSet, Sums, judge
 from poise.metrics import (
     SuccessRule,
     acceleration_error,

@@ -74,7 +74,7 @@ def _score(
     limit: float,
 ) -> dict[str, Any]:
     config = imitation.config
-    rollouts, _ = run_episodes(make, policy, clip, frame, limit, limit)
+    rollouts, _ = run_episodes(make, policy, clip, frame, limit)
     card = score_rollouts(rollouts, method=config.method, seed=config.seed)
     return {
         "episodes": card.episodes,

@@ -21,11 +21,10 @@ from poise.version import __version__
 
 if TYPE_CHECKING:
     from poise.jobs.imitate import Imitated, imitate
-    from poise.jobs.inbetween import Inbetween
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
+    from poise.jobs.inbetween.training import Inbetween
     from poise.jobs.open import Run, open_run
-    from poise.jobs.track import TrackConfig, Tracked
-    from poise.jobs.track.clips import track_clip as track
+    from poise.jobs.track import TrackConfig, Tracked, track
     from poise.motion import Clip, ClipLibrary
     from poise.motion import read_clip as read
     from poise.motion import write_clip as write
@@ -37,7 +36,7 @@ _PLACES = {
     "Clip": "poise.motion",
     "ClipLibrary": "poise.motion",
     "Imitated": "poise.jobs.imitate",
-    "Inbetween": "poise.jobs.inbetween",
+    "Inbetween": "poise.jobs.inbetween.training",
     "Inbetweened": "poise.jobs.inbetween.fill",
     "Perpetual": "poise.recipes.perpetual",
     "ResidualForce": "poise.recipes",
@@ -48,7 +47,7 @@ _PLACES = {
     "inbetween": "poise.jobs.inbetween.fill",
     "open_run": "poise.jobs.open",
     "read": "poise.motion:read_clip",
-    "track": "poise.jobs.track.clips:track_clip",
+    "track": "poise.jobs.track",
     "write": "poise.motion:write_clip",
 }
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -64,6 +65,20 @@ class Migration:
 def to_data(config: Any) -> dict[str, Any]:
     """The settings as JSON data."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def plain(value: Any) -> Any:
+    """Results as JSON data: dataclasses as tables, tuples as lists, paths as text, and null for a number
+    that is not finite."""
+    if is_dataclass(value):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
 def from_data(kind: type[T], data: Any, where: Path | str | None = None) -> T:

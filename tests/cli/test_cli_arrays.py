@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poise.cli.folder import _is_clip
 from poise.cli.main import main
+from poise.jobs.library.files import is_motion
 from poise.motion import read_clip, write_clip
 
 
@@ -36,5 +36,5 @@ def test_a_pickle_is_asked_for_and_becomes_npz_and_csv(
     assert a.positions()[:, a.skeleton.index("head"), 2].min() > 1.3
     # A library takes arrays along, but never a pickle that happens to lie in its folder.
     write_clip(b, tmp_path / "b.poise.npz")
-    found = {path.name for path in tmp_path.iterdir() if _is_clip(path)}
+    found = {path.name for path in tmp_path.iterdir() if is_motion(path)}
     assert found == {"a.npz", "a.csv", "b.poise.npz"}

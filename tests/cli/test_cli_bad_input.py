@@ -45,7 +45,7 @@ def test_missing_files_and_folders(tmp_path: Path, refused) -> None:
     refused("info", tmp_path / "no.bvh", words=("no.bvh", "no such file"))
     refused("imitate", tmp_path / "no.bvh", "-o", tmp_path / "out", words=("no such file",))
     refused("info", tmp_path, words=("folder",))
-    refused("eval", tmp_path / "no", words=("no such folder",))
+    refused("eval", tmp_path / "no", words=("no such file or folder",))
     refused("play", tmp_path, words=("is no run folder",))
     refused("body", tmp_path / "no.bvh", words=("no such file",))
     refused("convert", tmp_path / "no.bvh", tmp_path / "x.bvh", words=("no such file",))

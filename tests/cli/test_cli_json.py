@@ -13,10 +13,11 @@ import pytest
 from tiny_clips import MINIATURE
 
 import poise
-from poise.cli.answer import Answer, document, plain
+from poise.cli.answer import Answer, document
 from poise.cli.main import VERBS, main
 from poise.errors import PoiseError
 from poise.motion import read_clip, trim, write_clip
+from poise.settings import plain
 from toy_policy import WALK, toy_run
 
 KEYS = ("poise", "verb", "ok", "exit_code", "inputs", "outputs", "notes", "result", "error")

@@ -14,7 +14,7 @@ from poise.cli.main import main
 from poise.cli.parse import parse
 from poise.cli.settings import SOURCES, _fields_of, configured, dotted, stated
 from poise.errors import PoiseError
-from poise.jobs.inbetween import Inbetween
+from poise.jobs.inbetween.training import Inbetween
 from poise.jobs.presets import preset_of
 from poise.motion import read_clip
 from poise.plan import TrajOptConfig

@@ -103,7 +103,7 @@ def test_what_cannot_be_learned_is_refused(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["track", str(short), "--policy", str(file), "-o", str(tmp_path / "o.bvh"), "--learn"]
-    assert main([*argv, "-1"]) == 2 and "minutes of at least 0" in capsys.readouterr().err
+    assert main([*argv, "-1"]) == 2 and "--learn must lie in 0 to" in capsys.readouterr().err
     assert main([*argv, "1", "--noise", "jitter:1"]) == 2
     assert "without errors" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()

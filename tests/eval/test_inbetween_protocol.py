@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from inbetween import truth_rows
 from inbetween_baselines import Baseline
 
 from poise.eval.inbetween import (
@@ -22,7 +23,6 @@ from poise.eval.inbetween import (
     evaluate,
     slide,
     test_set,
-    truth_rows,
 )
 from poise.eval.inbetween import TestSet as InbetweenTestSet
 from poise.motion import read_clip

@@ -10,14 +10,9 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.eval.scorecard import (
-    PLAUSIBILITY,
-    TRACKING,
-    RolloutSet,
-    read_score,
-    score_rollouts,
-    write_score,
-)
+from poise.eval.card import read_score, write_score
+from poise.eval.rolloutset import RolloutSet
+from poise.eval.scorecard import PLAUSIBILITY, TRACKING, score_rollouts
 from poise.metrics import KINDS, Shapes
 
 KEYS = [

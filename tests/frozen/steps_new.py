@@ -24,9 +24,10 @@ from poise.jobs.deliver import deliver
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.demonstrations import odds, practised
-from poise.jobs.perpetual.progress import Stage
 from poise.jobs.perpetual.stage_initialisation import staged
-from poise.jobs.runs import begin, evaluate, learning_curve, train, trained_policy
+from poise.jobs.perpetual.stage_order import Stage
+from poise.jobs.run_file import learning_curve
+from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, Tracked, imitation_of, track, write
 from poise.jobs.track.noise import noise_of
 from poise.jobs.track.placement import place
@@ -256,25 +257,25 @@ def aside(metres: float) -> Clip:
 
 
 def job_track(folder: Path) -> dict[str, np.ndarray]:
-    return _tracked(track(open_run().tracker, walk()), folder)
+    return _tracked(track(walk(), open_run().tracker), folder)
 
 
 def job_track_search(folder: Path) -> dict[str, np.ndarray]:
     search = SamplingConfig(characters=64, retries=2, rounds=2)
-    done = track(open_run().tracker, aside(0.6), TrackConfig(search=search, search_threads=1))
+    done = track(aside(0.6), open_run().tracker, TrackConfig(search=search, threads=1))
     assert done.found is not None and done.found.whole
     return _tracked(done, folder)
 
 
 def job_track_recover(folder: Path) -> dict[str, np.ndarray]:
-    done = track(open_run().tracker, aside(2.0), TrackConfig(recover=True))
+    done = track(aside(2.0), open_run().tracker, TrackConfig(recover=True))
     assert done.losses is not None
     return _tracked(done, folder)
 
 
 def job_track_noise_crowd(folder: Path) -> dict[str, np.ndarray]:
     config = TrackConfig(noise=noise_of(("jitter:0.5",)), count=2, reset_on_fail=True)
-    done = track(open_run().tracker, trim(walk(), 0, 50), config)
+    done = track(trim(walk(), 0, 50), open_run().tracker, config)
     return _tracked(done, folder)
 
 
@@ -332,7 +333,7 @@ def job_perpetual_run(folder: Path) -> dict[str, np.ndarray]:
 def job_perpetual_ways_run(folder: Path) -> dict[str, np.ndarray]:
     how = {"help_start": 0.0, "expert": False, "action": "additive", "recovery": True, "num_envs": 8}
     out = _perpetual(folder, lively(), tiny(**how), 10)
-    return out | _tracked(track(open_run(folder / "run").tracker, walk(0, 40)), folder)
+    return out | _tracked(track(walk(0, 40), open_run(folder / "run").tracker), folder)
 
 
 def job_verbs(folder: Path) -> dict[str, np.ndarray]:

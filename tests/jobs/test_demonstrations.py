@@ -11,13 +11,13 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.demonstrations import demonstrations, odds, practised
-from poise.jobs.perpetual.progress import Progress, Stage
-from poise.jobs.perpetual.recovery import try_recovery
-from poise.jobs.perpetual.run import Earlier, begin, going_on, resume, train
+from poise.jobs.perpetual.evaluation import try_recovery
+from poise.jobs.perpetual.run import begin, going_on, resume, train
 from poise.jobs.perpetual.stage_initialisation import Owners, staged
+from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.track import TrackConfig, track
 from poise.jobs.track.learning import learn
-from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
+from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.learn import Until, load_policy
 from poise.nets import Composer
 from poise.recipes.perpetual import Perpetual, build
@@ -81,8 +81,7 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
         told.append((p.stage.name, p.stage.number))
 
     whole, until = tmp_path / "whole", Until(iterations=8)
-    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
-    own = begin(whole, lively(), config, earlier=went)
+    own = begin(whole, lively(), config, earlier=tracker)
     done = train(own, whole, until, show, 1, False, trained=tracker.policy)
     assert list(dict.fromkeys(told)) == [("recovery", 2), ("composer", 3)]
     assert done.recovery is not None and (whole / "recovery.safetensors").exists()
@@ -94,7 +93,7 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
         assert torch.equal(a, b)
     # Cut in every stage and gone on with: the same.
     parts = tmp_path / "parts"
-    begin(parts, lively(), config, earlier=went)
+    begin(parts, lively(), config, earlier=tracker)
     for stop in (2, 5, 99):
         again = resume(parts, config)
         cut = lambda p, stop=stop: p.iteration < stop  # noqa: E731
@@ -113,8 +112,7 @@ def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
     config = going_on(tracker.config, replace(tiny(recovery=True), single=True))
     assert config.single and config.recovery and config.recovering.demonstrations == 4
     run, told = tmp_path / "run", []
-    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
-    own = begin(run, lively(), config, earlier=went)
+    own = begin(run, lively(), config, earlier=tracker)
     show = lambda p: told.append(p.stage.name)  # noqa: E731
     done = train(own, run, Until(iterations=2), show, 1, False, trained=tracker.policy)
     assert set(told) == {"single with recovery"} and done.recovery is not None
@@ -141,8 +139,7 @@ def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
         told.append((p.stage.name, p.clips))
 
     whole, until = tmp_path / "whole", Until(iterations=8)
-    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
-    own = begin(whole, lively(), config, earlier=went)
+    own = begin(whole, lively(), config, earlier=tracker)
     done = train(own, whole, until, show, 1, False, trained=tracker.policy)
     # What was given is evaluated, and what it fails is learned by the second primitive.
     rows = (whole / "success.csv").read_text().splitlines()[1:]
@@ -160,7 +157,7 @@ def test_more_primitives_learn_what_a_policy_that_comes_back_fails(
         assert torch.equal(a, b)
     # Killed before the first checkpoint, in each stage, and gone on with: the same.
     parts = tmp_path / "parts"
-    begin(parts, lively(), config, earlier=went)
+    begin(parts, lively(), config, earlier=tracker)
     for stop in (1, 5, 99):
         cut = lambda p, stop=stop: p.iteration < stop  # noqa: E731
         train(resume(parts, config), parts, until, cut, 1, False, trained=tracker.policy)
@@ -183,8 +180,7 @@ def test_a_policy_that_fails_nothing_is_done(
         path = f"poise.jobs.perpetual.{module}.evaluate_clips"
         monkeypatch.setattr(path, Scripted(lambda *_: True))
     config = going_on(tracker.config, tiny(recovery=True), returns=True)
-    went = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
-    own = begin(tmp_path, lively(), config, earlier=went)
+    own = begin(tmp_path, lively(), config, earlier=tracker)
     done = train(own, tmp_path, Until(iterations=8), None, 1, False, trained=tracker.policy)
     assert done.solved and done.last is None and done.recovery is not None
     assert open_run(tmp_path).tracker.recovery_clips is not None
@@ -194,18 +190,18 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     """With a policy that hardly stands, so that it is lost; what comes out holds together."""
     config = TrackConfig(recover=True)
     with pytest.raises(PoiseError, match="has not learned to come back"):
-        track(tracker, swing(4.0, name="long"), config)
+        track(swing(4.0, name="long"), tracker, config)
     made = build(lively(), tiny(recovery=True, **PLAIN))
     able = replace(tracker, recovery_clips=made.recovery_clips)
     clip = swing(4.0, name="long")
-    done = track(able, clip, config)
-    again = track(able, clip, config)
+    done = track(clip, able, config)
+    again = track(clip, able, config)
     assert (done.evaluation.recordings[0].qpos == again.evaluation.recordings[0].qpos).all()
     assert done.losses is not None and done.failures[0] == (0, done.losses.lost[0])
     frames = len(done.evaluation.recordings[0].qpos)
     assert frames == int(done.imitation.reference.length[0]) == len(done.placed.qpos)
     # Up to where it was lost everything is as without.
-    plain = track(able, clip)
+    plain = track(clip, able)
     upto = round(done.losses.lost[0] * 30)
     a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
     assert abs(a - b).max() < 1e-9

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +10,9 @@ import pytest
 
 from poise.cli.main import main
 from poise.errors import PoiseError
-from poise.jobs.inbetween import FRAMES, Inbetween, begin, prepare, small, steps_in, train
 from poise.jobs.inbetween.data import library_bank, motion_files
-from poise.jobs.runs import RUN_FILE
+from poise.jobs.inbetween.training import FRAMES, Inbetween, begin, prepare, small, steps_in, train
+from poise.jobs.run_file import RUN_FILE
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.model import load_model, save_model
 from poise.motion import read_clip, write_bvh
@@ -165,10 +164,7 @@ def test_train_inbetween_says_what_it_needs(capsys: pytest.CaptureFixture[str], 
 def test_resuming_the_command_line(
     library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import poise.jobs.inbetween as recipe
-
-    made: Callable[..., Inbetween] = recipe.Inbetween
-    monkeypatch.setattr(recipe, "Inbetween", lambda **k: small(made(**k)))
+    monkeypatch.setattr("poise.cli.train.class_of", lambda recipe: lambda: small(Inbetween()))
     argv = ["train", "inbetween", "--library", str(library), "-o", str(tmp_path / "run")]
     argv += ["--iterations", "3", "--threads", "1", "--hold-out", "sad"]
     assert main(argv) == 0

@@ -20,13 +20,12 @@ import torch
 from poise.eval import ScoreCard
 from poise.jobs.open import open_run
 from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.perpetual.recovery import try_recovery
+from poise.jobs.perpetual.evaluation import evaluate_clips, try_recovery
 from poise.jobs.runs import evaluate, train, trained_policy
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker
-from poise.jobs.track.searching import replay, search
+from poise.jobs.track.recovering import look_for, replay
+from poise.jobs.tracker import Tracker
 from poise.learn import Until, load_checkpoint
 from poise.motion import read_clip, trim
 from poise.plan import SamplingConfig, SamplingResult
@@ -55,7 +54,7 @@ def perpetual_results(name: str) -> Results:
     policy, _ = trained_policy(OLD / name, task)
     r = evaluate_clips(task, policy, threads=1)
     card = try_recovery(task, policy, 2, threads=1)
-    tracked = track(open_run(OLD / name).tracker, trim(read_clip(OLD / "walk.bvh"), 0, 40))
+    tracked = track(trim(read_clip(OLD / "walk.bvh"), 0, 40), open_run(OLD / name).tracker)
     found = {
         "succeeded": r.succeeded.tolist(),
         "tracked": r.tracked.tolist(),
@@ -69,7 +68,7 @@ def perpetual_results(name: str) -> Results:
 
 def tracker_results() -> Results:
     """The embedded walk with the shipped policy."""
-    done = track(open_run(TRACKER).tracker, read_clip(OLD / "walk.bvh"))
+    done = track(read_clip(OLD / "walk.bvh"), open_run(TRACKER).tracker)
     return _figures(done.evaluation.card), {"qpos": done.evaluation.recordings[0].qpos}
 
 
@@ -82,7 +81,7 @@ def search_results() -> Results:
 
 def _searched(tracker: Tracker) -> SamplingResult:
     task = imitation_of(tracker, [place(read_clip(OLD / "aside.bvh"), tracker)])
-    return search(tracker, task, SamplingConfig(characters=64, retries=2), threads=1)
+    return look_for(tracker, task, SamplingConfig(characters=64, retries=2), threads=1)
 
 
 def _figures(card: ScoreCard) -> dict[str, Any]:
@@ -149,7 +148,7 @@ def test_a_motion_that_was_found_is_found_again_and_replays(
 ) -> None:
     tracker = open_run(TRACKER).tracker
     clip = read_clip(OLD / "aside.bvh")
-    assert track(tracker, clip, TrackConfig()).failures
+    assert track(clip, tracker, TrackConfig()).failures
     task = imitation_of(tracker, [place(clip, tracker)])
     figures, found = search_results()
     # Which of many characters is best may be another one on another machine; that it is found may not.

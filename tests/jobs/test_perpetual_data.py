@@ -13,8 +13,9 @@ import torch
 from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.jobs.library import folder as perpetual_data
+from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.files import content_key, is_motion, motion_files_of, subject_of
-from poise.jobs.library.folder import LibraryConfig, library_of, split
+from poise.jobs.library.folder import library_of, split
 from poise.jobs.library.report import LibraryReport
 from poise.kin import Kinematics, fit_humanoid
 from poise.kin.coords import clip_to_qpos

@@ -11,9 +11,9 @@ import torch
 
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.run import Earlier, begin, going_on, train
+from poise.jobs.perpetual.run import begin, going_on, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
+from poise.jobs.tracker import load_tracker, save_tracker
 from poise.learn import Until
 from poise.motion import ClipLibrary
 from poise.spatial import quat_mul
@@ -32,15 +32,11 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "policy.safetensors"
 
 
-def earlier(tracker: Tracker) -> Earlier:
-    return Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
-
-
 def test_it_begins_with_the_policys_weights_and_counts_its_cost(policy: Path, tmp_path: Path) -> None:
     tracker = load_tracker(policy)
     config = going_on(tracker.config, tiny(seed=7))
     assert config.single and config.seed == 7 and not config.expert and config.trajopt is None
-    imitation = begin(tmp_path, library(), config, earlier=earlier(tracker))
+    imitation = begin(tmp_path, library(), config, earlier=tracker)
     stages = StageTrainer(
         imitation, tmp_path, Until(iterations=1), 1, tensorboard=False, trained=tracker.policy
     )
@@ -65,11 +61,11 @@ def test_a_larger_library_keeps_the_policys_body(policy: Path, tmp_path: Path) -
         rot[:, knee], torch.tensor([math.cos(0.8), 0.0, -math.sin(0.8), 0.0]).double()
     )
     more = ClipLibrary.of([*library(), back.replaced(rot=rot.numpy())])
-    imitation = begin(tmp_path, more, going_on(tracker.config, tiny()), earlier=earlier(tracker))
+    imitation = begin(tmp_path, more, going_on(tracker.config, tiny()), earlier=tracker)
     assert imitation.humanoid.table.rows == tracker.humanoid.table.rows
     # Additive actions are in radians, so that ranges may grow with the clips.
     added = replace(going_on(tracker.config, tiny()), action="additive")
-    wide = begin(tmp_path / "added", more, added, earlier=earlier(tracker)).humanoid.table.rows
+    wide = begin(tmp_path / "added", more, added, earlier=tracker).humanoid.table.rows
     assert wide != tracker.humanoid.table.rows
     rows = [replace(r, ranges=()) for r in wide]
     assert rows == [replace(r, ranges=()) for r in tracker.humanoid.table.rows]
@@ -80,10 +76,11 @@ def test_a_larger_library_keeps_the_policys_body(policy: Path, tmp_path: Path) -
 
 
 def test_another_body_and_a_composer_are_refused(policy: Path, tmp_path: Path) -> None:
-    target = load_tracker(policy).target
-    other = replace(target, skeleton=swing(0.5, scale=1.1).skeleton)
+    tracker = load_tracker(policy)
+    body = replace(tracker.humanoid, skeleton=swing(0.5, scale=1.1).skeleton)
+    other = replace(tracker, humanoid=body)
     with pytest.raises(PoiseError, match="another skeleton than the policy's body"):
-        begin(tmp_path / "run", library(), ONE, earlier=Earlier(1, 1.0, other))
+        begin(tmp_path / "run", library(), ONE, earlier=other)
     assert not (tmp_path / "run").exists()
     with pytest.raises(PoiseError, match="primitives and a composer"):
         going_on(replace(ONE, single=False), ONE)

@@ -16,13 +16,13 @@ from poise.errors import PoiseError
 from poise.eval import ClipResults
 from poise.jobs.library.folder import library_of
 from poise.jobs.open import open_run
-from poise.jobs.perpetual import recovery as perpetual_recovery
-from poise.jobs.perpetual.progress import Progress, Stage
-from poise.jobs.perpetual.recovery import back, check_falls, try_recovery
+from poise.jobs.perpetual import evaluation as perpetual_recovery
+from poise.jobs.perpetual.evaluation import back, check_falls, try_recovery
 from poise.jobs.perpetual.run import begin, config_of, to_data, train
 from poise.jobs.perpetual.stage_initialisation import Owners, staged
+from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.perpetual.stage_record import RECOVERY_WORTH, StageRecord
-from poise.jobs.runs import FINAL, RUN_FILE
+from poise.jobs.run_file import FINAL, RUN_FILE
 from poise.learn import Until, compose, first_column, load_checkpoint, load_policy, next_column
 from poise.learn.checkpoint import save_checkpoint
 from poise.learn.progressive import primitive

@@ -13,10 +13,10 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.perpetual import stage_initialisation as perpetual_next
 from poise.jobs.perpetual import stage_trainer as perpetual_stages
-from poise.jobs.perpetual.progress import Progress, Stage
 from poise.jobs.perpetual.run import begin, config_of, resume, to_data, train
+from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.runs import FINAL
+from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual
@@ -171,7 +171,7 @@ def test_another_run_in_the_folder_is_refused(tmp_path: Path) -> None:
     begin(tmp_path, library(), CONFIG, "here")
     with pytest.raises(PoiseError, match=r"other settings \(max_primitives, recovery, seed\)"):
         begin(tmp_path, library(), tiny(seed=2), "here")
-    with pytest.raises(PoiseError, match=r"other clips \(3, here 2\)"):
+    with pytest.raises(PoiseError, match=r"other clips \(calm, walk, turn\)"):
         begin(tmp_path, ClipLibrary(library().clips[:2]), CONFIG, "here")
     with pytest.raises(PoiseError, match="on the library here"):
         resume(tmp_path, CONFIG, "there")

@@ -14,10 +14,10 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.perpetual import result as perpetual_result
 from poise.jobs.perpetual import stage_evaluation as perpetual_judge
-from poise.jobs.perpetual.progress import Progress, share_of
 from poise.jobs.perpetual.run import PerpetualResult, begin, train
+from poise.jobs.perpetual.stage_order import Progress, share_of
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.runs import FINAL
+from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, ConvergenceConfig, IterationStats, Trainer, Until, load_policy
 from poise.learn.progressive import primitive
 from poise.nets import Composer

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.jobs.perpetual.demonstrations import PATHS
 from poise.jobs.perpetual.run import begin, train
-from poise.jobs.perpetual.trajectories import PATHS
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, Until, load_checkpoint, save_checkpoint
 from poise.plan import TrajOptConfig, TrajOptStats

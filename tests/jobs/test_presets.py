@@ -10,7 +10,7 @@ import pytest
 from poise.control import ImplicitResidual
 from poise.env.terms import phc_reward, reward
 from poise.errors import PoiseError
-from poise.jobs.inbetween import Inbetween
+from poise.jobs.inbetween.training import Inbetween
 from poise.jobs.presets import NAMES, preset_of
 from poise.recipes import ResidualForce, build
 from poise.recipes.perpetual import Perpetual

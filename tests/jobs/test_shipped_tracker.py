@@ -11,10 +11,10 @@ from poise.env import Reference
 from poise.eval.recovery import KINDS
 from poise.jobs.library.files import subject_of
 from poise.jobs.open import open_run
-from poise.jobs.perpetual.recovery import try_recovery
+from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import SHIPPED, Tracker
+from poise.jobs.tracker import SHIPPED, Tracker
 from poise.motion import read_clip
 from toy_policy import WALK
 
@@ -37,7 +37,7 @@ def test_it_is_small_and_says_what_it_learned(tracker: Tracker) -> None:
 
 
 def test_the_embedded_walk_is_done_without_help(tracker: Tracker) -> None:
-    tracked = track(tracker, read_clip(WALK))
+    tracked = track(read_clip(WALK), tracker)
     card = tracked.evaluation.card
     assert not tracked.failures and card.succ == 1.0 and card.help.limit_n == 0.0
     assert card.mpjpe_mm < 60
@@ -57,7 +57,7 @@ def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
     clip = read_clip(WALK)
     pos = clip.root_pos.copy()
     pos[clip.frames // 2 :, 1] += 2.0
-    tracked = track(tracker, clip.replaced(root_pos=pos), TrackConfig(recover=True))
+    tracked = track(clip.replaced(root_pos=pos), tracker, TrackConfig(recover=True))
     losses = tracked.losses
     assert losses is not None and len(losses.back) == len(losses.lost)
     assert "came back" in losses.sentence()
@@ -66,5 +66,5 @@ def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
 
 
 def test_a_held_out_take_is_followed_for_a_while(tracker: Tracker, data_dir: Path) -> None:
-    tracked = track(tracker, read_clip(data_dir / "cmu_bvh/ad/14_14.bvh"))
+    tracked = track(read_clip(data_dir / "cmu_bvh/ad/14_14.bvh"), tracker)
     assert not tracked.failures or tracked.failures[0][1] > 1.0

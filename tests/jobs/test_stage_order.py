@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from poise.errors import PoiseError
-from poise.jobs.perpetual.cloning import MOST, clone_for
-from poise.jobs.perpetual.progress import Stage
+from poise.jobs.perpetual.demonstrations import MOST, clone_for
 from poise.jobs.perpetual.stage_order import (
+    Stage,
     ends,
     first_stage,
     following,

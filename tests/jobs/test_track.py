@@ -16,10 +16,10 @@ from poise.errors import PoiseError
 from poise.eval import Recording, run_episodes, score_rollouts
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
-from poise.jobs.track import Keeper, TrackConfig, check_fits, imitation_of, track, write
+from poise.jobs.track import Keeper, TrackConfig, imitation_of, track, write
 from poise.jobs.track.placement import home, place
 from poise.jobs.track.points import points_of
-from poise.jobs.track.policy import Tracker
+from poise.jobs.tracker import Tracker
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, read_clip
 from poise.motion.io.raw import ReadOptions as Options
@@ -54,7 +54,7 @@ def points(clip: Clip) -> Keypoints:
 
 def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> None:
     clip = walk(0, 40)
-    tracked = track(tracker, clip)
+    tracked = track(clip, tracker)
     card = tracked.evaluation.card
     assert tracked.placed.moved is None and card.help.limit_n == 0.0 and card.method
     assert card.episodes == 1 and card.succ == 0.0
@@ -71,7 +71,7 @@ def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> N
     back = read_clip(tmp_path / "out.bvh")
     assert back.skeleton.names == clip.skeleton.names and back.frames == 40
     # The same again gives the same.
-    again = track(tracker, clip)
+    again = track(clip, tracker)
     np.testing.assert_array_equal(
         again.evaluation.recordings[0].qpos, tracked.evaluation.recordings[0].qpos
     )
@@ -99,7 +99,7 @@ def test_the_reference_on_the_body_comes_home_as_it_was(tracker: Tracker, tmp_pa
 
 def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) -> None:
     source = swing(0.5, 60.0, scale=1.1)
-    tracked = track(tracker, source)
+    tracked = track(source, tracker)
     done = write(tracked, tmp_path, tmp_path / "out.npz", hold=False)
     assert set(done.paths) == {"simulated", "body", "score", "report"}
     back, body = read_clip(done.paths["simulated"]), read_clip(done.paths["body"])
@@ -110,8 +110,8 @@ def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) ->
 
 
 def test_resets_change_nothing_before_the_first_failure(tracker: Tracker) -> None:
-    plain = track(tracker, walk())
-    again = track(tracker, walk(), TrackConfig(reset_on_fail=True))
+    plain = track(walk(), tracker)
+    again = track(walk(), tracker, TrackConfig(reset_on_fail=True))
     assert len(again.failed_s) > 1 and again.failed_s[0] == plain.failed_s[0]
     # The score is that of the character that was not put back.
     assert again.evaluation.card.mpjpe_mm == plain.evaluation.card.mpjpe_mm
@@ -129,7 +129,7 @@ def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
     placed = [place(walk(0, 40), tracker), place(walk(20, 60), tracker)]
     imitation = imitation_of(tracker, placed)
     env = imitation.env(2, auto_reset=False, threads=1, help_scale=0.0)
-    keeper = Keeper(env, tracker.policy, True)
+    keeper = Keeper(env, tracker.policy)
     try:
         obs = env.reset_to(torch.tensor([0, 1]), torch.zeros(2, dtype=torch.long))
         for _ in range(3):
@@ -149,7 +149,7 @@ def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
 
 def test_keypoints_are_streamed_to_a_policy_of_keypoints(pointed: Tracker) -> None:
     given = points(swing(1.0, 60.0, speed=0.5))
-    tracked = track(pointed, given)
+    tracked = track(given, pointed)
     assert any("Each goal comes from the keypoints" in note for note in tracked.notes)
     fit = imitation_of(pointed, [tracked.placed]).reference.pose
     pose = tracked.imitation.reference.pose
@@ -159,20 +159,20 @@ def test_keypoints_are_streamed_to_a_policy_of_keypoints(pointed: Tracker) -> No
     speed = (pose.pos[2:] - pose.pos[:-2]) * 15.0
     assert torch.allclose(pose.linvel[1:-1], speed, atol=0.02)
     # With gaps and noise it goes on.
-    noisy = track(pointed, given, TrackConfig(noise=(Jitter(strength=0.2),), seed=1))
+    noisy = track(given, pointed, TrackConfig(noise=(Jitter(strength=0.2),), seed=1))
     assert any("without noise" in note for note in noisy.notes)
 
 
 def test_keypoints_are_fitted_for_a_policy_of_rotations(tracker: Tracker, pointed: Tracker) -> None:
     given = points(swing(0.5, 60.0))
-    tracked = track(tracker, given)
+    tracked = track(given, tracker)
     assert any("fitted to the keypoints" in note for note in tracked.notes)
     assert set(tracked.placed.source.skeleton.names) >= set(JOINT_PLACES) - {"Neck", "Head"}
     lost = given.positions.copy()
     lost[:, given.names.index("Nose")] = np.nan
     lost[5:8, given.names.index("LWrist")] = np.nan
     holes = given.replaced(positions=lost)
-    assert any("longest gap" in note for note in track(pointed, holes).notes)
+    assert any("longest gap" in note for note in track(holes, pointed).notes)
 
 
 def test_files_of_keypoints_are_known(data_dir: Path) -> None:
@@ -186,11 +186,11 @@ def test_files_of_keypoints_are_known(data_dir: Path) -> None:
 
 def test_noise_moves_the_input_and_says_so(tracker: Tracker) -> None:
     config = TrackConfig(noise=(Jitter(),), seed=4)
-    tracked = track(tracker, walk(0, 30), config)
+    tracked = track(walk(0, 30), tracker, config)
     (note,) = [n for n in tracked.notes if "without noise" in n]
     assert "input with noise" in note
-    assert track(tracker, walk(0, 30), config).notes == tracked.notes
-    other = track(tracker, walk(0, 30), replace(config, seed=5))
+    assert track(walk(0, 30), tracker, config).notes == tracked.notes
+    other = track(walk(0, 30), tracker, replace(config, seed=5))
     assert not np.array_equal(other.placed.qpos, tracked.placed.qpos)
 
 
@@ -204,7 +204,7 @@ def test_angles_come_within_a_turn_of_their_ranges(tracker: Tracker) -> None:
 
 def test_it_agrees_with_an_evaluation_of_the_run(tracker: Tracker) -> None:
     """A clip on the body's skeleton is scored as the run's own evaluation would score it."""
-    tracked = track(tracker, walk(0, 30))
+    tracked = track(walk(0, 30), tracker)
 
     def make(worlds: int) -> ImitationEnv:
         return tracked.imitation.env(worlds, auto_reset=False, threads=1, help_scale=0.0)
@@ -216,17 +216,15 @@ def test_it_agrees_with_an_evaluation_of_the_run(tracker: Tracker) -> None:
 
 def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:
     with pytest.raises(PoiseError, match="needs at least 3"):
-        track(tracker, walk(0, 2))
+        track(walk(0, 2), tracker)
     chain = Skeleton(("a", "b", "c"), (-1, 0, 1), np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 1.0]]))
     rot = np.tile([1.0, 0, 0, 0], (10, 3, 1))
     with pytest.raises(PoiseError):
-        track(tracker, Clip(chain, np.zeros((10, 3)), rot, 30.0, "chain"))
+        track(Clip(chain, np.zeros((10, 3)), rot, 30.0, "chain"), tracker)
     mixed = replace(tracker, policy=pointed.policy)
-    with pytest.raises(PoiseError, match=r"observations .* another body"):
-        track(mixed, walk(0, 20))
-    env = imitation_of(tracker, [place(walk(0, 20), tracker)]).env(1, threads=1)
-    check_fits(tracker, env)
-    env.close()
+    for resets in (False, True):
+        with pytest.raises(PoiseError, match=r"observations .* another body"):
+            track(walk(0, 20), mixed, reset_on_fail=resets)
 
 
 def test_a_joint_beyond_its_range_is_no_blow(tracker: Tracker) -> None:

@@ -13,9 +13,9 @@ import torch
 
 from poise.errors import PoiseError
 from poise.jobs import runs
+from poise.jobs import tracker as track_policy
 from poise.jobs.open import open_run
-from poise.jobs.track import policy as track_policy
-from poise.jobs.track.policy import (
+from poise.jobs.tracker import (
     KIND,
     Tracker,
     load_tracker,

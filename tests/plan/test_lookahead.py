@@ -11,11 +11,11 @@ from torch import Tensor
 from poise.env import ImitationEnv
 from poise.env.goals import StreamGoal
 from poise.errors import PoiseError
-from poise.eval import record
+from poise.eval import run_episodes
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker
+from poise.jobs.tracker import Tracker
 from poise.metrics.shapes import BOX, Shapes
 from poise.plan import Lookahead, LookaheadConfig
 from poise.plan.prices import motion_price
@@ -99,11 +99,11 @@ def test_it_goes_on_where_the_policy_is_lost(task: Imitation, tracker: Tracker) 
     zero = torch.zeros(1, dtype=torch.long)
 
     def off(env: ImitationEnv, acts: object) -> Tensor:
-        rollouts, _ = record(env, acts, zero, zero, cycles=1)  # type: ignore[arg-type]
+        rollouts, _ = run_episodes(lambda _: env, acts, zero, zero, cycles=1)  # type: ignore[arg-type]
         return (rollouts.pos - rollouts.ref_pos).norm(dim=-1).mean(-1)[0]
 
     env, control = alone(task), made(task, tracker, LookaheadConfig(candidates=48, horizon=8, seed=3))
-    plain = off(env, tracker.policy)
+    plain = off(alone(task), tracker.policy)
     control.watch(env)
     ahead = off(env, control)
     lost = int((plain > 0.5).nonzero()[0])

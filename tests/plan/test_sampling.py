@@ -13,8 +13,8 @@ from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.policy import Tracker, load_tracker, save_tracker
-from poise.jobs.track.searching import replay, search
+from poise.jobs.track.recovering import look_for, replay
+from poise.jobs.tracker import Tracker, load_tracker, save_tracker
 from poise.motion import read_clip
 from poise.plan import SamplingConfig
 from toy_policy import toy_run, walk
@@ -30,10 +30,10 @@ def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
 
 def test_what_is_found_is_one_simulation(tracker: Tracker) -> None:
     clip = walk(0, 40)
-    plain = track(tracker, clip)
+    plain = track(clip, tracker)
     (lost,) = plain.failed_s
     shown: list[tuple[int, int]] = []
-    done = track(tracker, clip, TrackConfig(search=FEW), lambda *x: shown.append(x))
+    done = track(clip, tracker, TrackConfig(search=FEW), on_search=lambda *x: shown.append(x))
     found = done.found
     assert found is not None and found.reached > round(lost * 30) and found.tries >= 32 * found.reached
     assert shown[0] == (0, 39) and all(a <= found.reached for a, _ in shown)
@@ -46,13 +46,13 @@ def test_what_is_found_is_one_simulation(tracker: Tracker) -> None:
         steps = len(found.actions)
         assert float(again.global_mm) * (steps + 1) / steps == pytest.approx(found.error_mm, abs=0.1)
     # The same seed finds the same, another one something else.
-    same = search(tracker, imitation, FEW, threads=2)
+    same = look_for(tracker, imitation, FEW, threads=2)
     assert torch.equal(same.actions, found.actions) and same.reached == found.reached
-    other = search(tracker, imitation, replace(FEW, seed=1))
+    other = look_for(tracker, imitation, replace(FEW, seed=1))
     assert not torch.equal(other.actions, found.actions)
     # Without a critic it goes by what was so far.
     assert tracker.value is not None
-    blind = search(replace(tracker, value=None), imitation, FEW)
+    blind = look_for(replace(tracker, value=None), imitation, FEW)
     assert blind.reached > 0 and not torch.equal(blind.actions, found.actions)
 
 
@@ -60,8 +60,8 @@ def test_another_round_comes_no_farther_away(tracker: Tracker) -> None:
     clip = walk(0, 14)
     imitation = imitation_of(tracker, [place(clip, tracker)])
     shown: list[tuple[int, int]] = []
-    once = search(tracker, imitation, FEW)
-    twice = search(tracker, imitation, replace(FEW, rounds=2), show=lambda *x: shown.append(x))
+    once = look_for(tracker, imitation, FEW)
+    twice = look_for(tracker, imitation, replace(FEW, rounds=2), show=lambda *x: shown.append(x))
     assert once.whole and twice.whole and twice.error_mm < once.error_mm
     assert twice.tries == 2 * once.tries and shown[0] == (0, 26) and shown[-1][0] > 13
     again = evaluate_clips(imitation, replay(twice, tracker.policy), threads=1)
@@ -73,7 +73,7 @@ def test_where_nobody_comes_through_the_search_ends(tracker: Tracker) -> None:
     clip = walk(0, 40)
     pos = clip.root_pos.copy()
     pos[12:, 1] += 3.0
-    tracked = track(tracker, clip.replaced(root_pos=pos), TrackConfig(search=FEW))
+    tracked = track(clip.replaced(root_pos=pos), tracker, TrackConfig(search=FEW))
     found = tracked.found
     assert found is not None and not found.whole and found.reached <= 12
     # Tried anew from farther back, so that more was tried than one way there.
@@ -104,13 +104,13 @@ def test_bad_settings_are_refused() -> None:
 
 
 def test_a_motion_that_is_not_lost_is_not_searched() -> None:
-    tracked = track(open_run().tracker, walk(), TrackConfig(search=FEW))
+    tracked = track(walk(), open_run().tracker, TrackConfig(search=FEW))
     assert tracked.found is None and not tracked.failures
 
 
 def test_a_kick_that_the_policy_loses_is_found(data_dir: Path) -> None:
     clip = read_clip(data_dir / "deepmimic_txt/humanoid3d_spinkick.txt")
-    tracked = track(open_run().tracker, clip, TrackConfig(search=SamplingConfig()))
+    tracked = track(clip, open_run().tracker, TrackConfig(search=SamplingConfig()))
     assert tracked.found is not None and tracked.found.whole
     card = tracked.evaluation.card
     assert not tracked.failures and card.succ == 1.0 and card.help.limit_n == 0.0

@@ -8,8 +8,7 @@ import pytest
 
 from poise.errors import PoiseError
 from poise.recipes import ResidualForce, build
-from poise.recipes.imitation import Imitation
-from poise.recipes.memory import check_memory, free_bytes, learner_bytes
+from poise.recipes.imitation import Imitation, check_memory, free_bytes, learner_bytes
 from toy_human import swing
 
 

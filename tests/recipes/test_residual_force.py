@@ -104,7 +104,7 @@ def test_evaluation_starts_on_the_reference_and_counts_no_help(built):
     width = env.num_actions
     env.close()
     rollouts, recordings = run_episodes(
-        lambda n: built.env(n, auto_reset=False), Nothing(width), clip[:3], start[:3], 100.0, 100.0
+        lambda n: built.env(n, auto_reset=False), Nothing(width), clip[:3], start[:3], 100.0
     )
     assert rollouts.lengths.tolist() == [31, 30, 29]
     assert rollouts.alive.sum(1).tolist() == [31, 30, 29]

@@ -62,7 +62,7 @@ def test_thresholds_are_stated_beside_the_figures():
 
 
 def test_thresholds_are_those_of_the_score_card():
-    verdicts = pytest.importorskip("poise.eval.verdicts")
+    verdicts = pytest.importorskip("poise.eval.card")
     for key, bounds in THRESHOLDS.items():
         card = verdicts.THRESHOLDS[key]
         assert (card.good, card.fair) == bounds, key

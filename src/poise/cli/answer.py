@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -56,6 +55,8 @@ def document(
     verb: str, inputs: Sequence[Path], answer: Answer, error: PoiseError | None
 ) -> dict[str, Any]:
     """The document of `--json`, the same for every verb; numbers that are not finite become null."""
+    from poise.settings import plain
+
     told = None if error is None else {"what": error.what, "where": error.where, "hint": error.hint}
     return plain(
         {
@@ -70,17 +71,6 @@ def document(
             "error": told,
         }
     )
-
-
-def plain(value: Any) -> Any:
-    """JSON data: paths as text, tuples as lists, NaN and infinity as null."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
 
 
 def failure(problem: BaseException) -> tuple[int, PoiseError]:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from poise.eval import ScoreCard
+
 
 #: Columns of a table that goes to a file or a pipe, where no window limits it.
 _PIPE_WIDTH = 120
@@ -97,3 +102,25 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], lef
     for row in rows:
         grid.add_row(*(c if isinstance(c, Text) else Text(str(c)) for c in row))
     out().print(grid)
+
+
+_STYLES = {"good": "green", "fair": "yellow", "poor": "red"}
+
+
+def print_card(card: ScoreCard) -> None:
+    """The score card with its verdicts, then the one sentence that sums it up."""
+    from poise.eval import table as rows_of
+    from poise.view.verdict import sentence
+
+    rows = [
+        (label, "-" if math.isnan(value) else f"{value:,.4g}", unit, _verdict(verdict))
+        for label, value, unit, verdict in rows_of(card)
+    ]
+    episodes = "1 episode" if card.episodes == 1 else f"{card.episodes} episodes"
+    title = f"{card.clip or 'run'}: {episodes}, {card.frames:,} frames"
+    table(title, ("", "value", "unit", "verdict"), rows)
+    say(sentence(card.to_dict()))
+
+
+def _verdict(word: str) -> Text:
+    return Text(word, style=_STYLES.get(word, ""))

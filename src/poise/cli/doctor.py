@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from rich.text import Text
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -26,9 +26,6 @@ from poise.cli.folder import each
 from poise.cli.options import Flag, Reading
 from poise.cli.output import claimed
 from poise.errors import PoiseError
-
-if TYPE_CHECKING:
-    from poise.motion import Skeleton
 
 State = Literal["ok", "missing", "optional"]
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "firefox")
@@ -166,15 +163,14 @@ def cache() -> Check:
 
 
 def speed() -> Check:
-    """Steps per second of the physics, on a body made here."""
+    """Steps per second of the physics, with the body of the policy that comes with Poise."""
     try:
         import torch
 
-        from poise.body import generate_table, make_humanoid
+        from poise.jobs.open import open_run
         from poise.sim import CpuBackend, SimConfig
 
-        humanoid = make_humanoid(skeleton := _skeleton(), generate_table(skeleton))
-        SimConfig().apply(humanoid.model)
+        humanoid = open_run().tracker.humanoid
         backend = CpuBackend(humanoid.model, _SPEED_ENVS)
     except Exception as problem:
         said = f"{type(problem).__name__}: {problem}"
@@ -193,32 +189,6 @@ def speed() -> Check:
     if fine:
         return Check("physics", "ok", found)
     return Check("physics", "missing", "the simulation diverged", "install mujoco again")
-
-
-def _skeleton() -> Skeleton:
-    """A person in metres, Z up, for the speed check."""
-    import numpy as np
-
-    from poise.motion import Skeleton
-
-    rows = [
-        ("hips", -1, (0, 0, 0)),
-        ("spine", 0, (0, 0, 0.12)),
-        ("neck", 1, (0, 0, 0.40)),
-        ("head", 2, (0, 0, 0.10)),
-    ]
-    for side, y in (("left", 1.0), ("right", -1.0)):
-        first = len(rows)
-        rows += [
-            (f"{side}_upleg", 0, (0, 0.09 * y, 0)),
-            (f"{side}_leg", first, (0, 0, -0.42)),
-            (f"{side}_foot", first + 1, (0, 0, -0.42)),
-            (f"{side}_arm", 1, (0, 0.18 * y, 0.34)),
-            (f"{side}_forearm", first + 3, (0, 0.28 * y, 0)),
-            (f"{side}_hand", first + 4, (0, 0.25 * y, 0)),
-        ]
-    names, parents, offsets = zip(*rows, strict=True)
-    return Skeleton(names, parents, np.array(offsets, dtype=float))
 
 
 CHECKS: tuple[Callable[[], Check], ...] = (

@@ -10,10 +10,9 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from poise.cli.answer import Answer
+from poise.cli.console import print_card
 from poise.cli.options import Device, Flag, Rule, check_device
-from poise.cli.output import run_folder
 from poise.cli.progress import working
-from poise.cli.results import print_card
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,10 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
     check_device(options.device)
-    folder = run_folder(options.run)
     from poise.jobs.open import open_run
 
     with working("simulating every start frame"):
         o = options
-        card = open_run(folder).score(o.rule, o.help_limit, o.device)
+        card = open_run(o.run).score(o.rule, o.help_limit, o.device)
     print_card(card)
     return Answer(card.to_dict())

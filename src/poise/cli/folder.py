@@ -19,12 +19,14 @@ def clips_in(given: Sequence[Path], out: Path | None = None) -> list[tuple[str, 
     Raises:
         PoiseError: no such file, or no motion in it.
     """
+    from poise.jobs.library.files import is_motion
+
     found: list[tuple[str, Path]] = []
     for path in given:
         if not path.exists():
             raise PoiseError("there is no such file or folder", path, "Give a folder of motion files")
         root = path.absolute()
-        files = [root] if path.is_file() else sorted(f for f in root.rglob("*") if _is_clip(f))
+        files = [root] if path.is_file() else sorted(f for f in root.rglob("*") if is_motion(f))
         base = root.parent if path.is_file() else root
         found += [
             ("-".join(f.relative_to(base).with_suffix("").parts), f)
@@ -40,21 +42,6 @@ def clips_in(given: Sequence[Path], out: Path | None = None) -> list[tuple[str, 
         seen[name] = seen.get(name, 0) + 1
         named.append((name if seen[name] == 1 else f"{name}-{seen[name]}", path))
     return named
-
-
-def _is_clip(path: Path) -> bool:
-    """Whether a file of a library is a motion; text files that are none may lie beside."""
-    from poise.motion.io.formats import READERS
-
-    suffix = path.suffix.lower()
-    if suffix in (".bvh", ".amc"):
-        return path.is_file()
-    readers = [r for r in READERS if suffix in r.suffixes and r.name != "ASF" and not r.asks]
-    if not path.is_file() or not readers:
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096).lstrip()
-    return any(r.looks_like(head) for r in readers)
 
 
 def each(

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
-from poise.cli.callbacks import first_delivery
+from poise.cli.console import print_card
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
 from poise.cli.output import may_deliver, places
 from poise.cli.progress import working
-from poise.cli.results import print_card
 from poise.cli.settings import given
-from poise.cli.training import Job, command_line, stopped
+from poise.cli.training import Job, command_line, first_delivery, stopped
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         hint = "Give one clip, or all of them to poise fleet DIR -o OUT"
         raise PoiseError("is a folder", o.clip, hint)
     again = command_line("imitate", argv)
-    from poise.jobs.runs import RUN_FILE
+    from poise.jobs.run_file import RUN_FILE
 
     out, motion = places(o.out)
     # A run that is not resumed is refused by `Job`, with or without --force: training takes hours.
@@ -87,7 +86,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if comm.rank:
         return Answer()
     from poise.jobs.deliver import deliver
-    from poise.jobs.runs import evaluate, learning_curve, trained_policy
+    from poise.jobs.run_file import learning_curve
+    from poise.jobs.runs import evaluate, trained_policy
 
     try:
         with working("simulating every start frame"):

@@ -14,7 +14,7 @@ from poise.cli.answer import Answer
 from poise.cli.console import say, tell
 from poise.cli.options import Flag, Reading
 from poise.cli.output import may_write
-from poise.cli.progress import clock, showing
+from poise.cli.progress import left, showing
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -75,8 +75,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
         def count(done: int, of: int) -> None:
             took = max(1e-9, time.monotonic() - begun)
-            left = clock(took / done * (of - done))
-            show(done / of, f"gap {done} of {of}, {done / took:.1f} gaps/s, {left} left")
+            how = f"{done / took:.1f} gaps/s, {left(took, done / of)}"
+            show(done / of, f"gap {done} of {of}, {how}")
 
         filled = inbetween(
             clip, keys, o.model, samples=o.samples, foot_lock=o.foot_lock, adapt=o.adapt, seed=o.seed,

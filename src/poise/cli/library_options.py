@@ -14,7 +14,7 @@ from poise.cli.options import Flag
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.jobs.library import LibraryConfig
+    from poise.jobs.library.clips import LibraryConfig
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Library:
 
     def reading(self) -> LibraryConfig:
         """How the files of the library are read."""
-        from poise.jobs.library import LibraryConfig
+        from poise.jobs.library.clips import LibraryConfig
 
         rates = []
         for pattern, text in _pairs("library-fps", self.library_fps, "cmu=120"):

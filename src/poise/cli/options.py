@@ -135,6 +135,13 @@ class Body:
         return configured(BodyConfig(), {k.partition(".")[2]: v for k, v in values.items()})
 
 
+def check_range(name: str, value: float | None, low: float, high: float = 2**31 - 1) -> None:
+    """Refuses an option --`name` that does not lie in `low` to `high`; None was not given."""
+    if value is not None and not low <= value <= high:
+        where = f"be at least {low:g}" if high == 2**31 - 1 else f"lie in {low:g} to {high:g}"
+        raise PoiseError(f"--{name} must {where}, got {value}")
+
+
 def check_device(name: str) -> None:
     """Refuses a device on which nothing could run, before anything is read or made."""
     if name != "cpu":
@@ -189,12 +196,10 @@ class Training:
         for name, value in (("limit", chosen.help_limit), ("start", chosen.help_start)):
             if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise PoiseError(f"--help-{name} must be a number of at least 0 newtons, got {value:g}")
-        numbers = {"envs": chosen.num_envs, "seed": chosen.seed}
-        numbers |= {"threads": self.threads, "iterations": self.iterations}
-        for name, value in numbers.items():
-            low = 0 if name in ("threads", "seed") else 1
-            if value is not None and not low <= value < 2**31:
-                raise PoiseError(f"--{name} must be a whole number of at least {low}, got {value}")
+        check_range("envs", chosen.num_envs, 1)
+        check_range("seed", chosen.seed, 0)
+        check_range("threads", self.threads, 0)
+        check_range("iterations", self.iterations, 1)
         check_device(self.device)
 
     def settings(

@@ -107,26 +107,3 @@ def _refusing(folder: Path) -> Iterator[None]:
     except (OSError, ValueError) as problem:
         reason = (getattr(problem, "strerror", None) or str(problem)).lower()
         raise PoiseError(f"cannot be written ({reason})", folder, "Choose another folder") from None
-
-
-def run_folder(path: Path) -> Path:
-    """The run folder that `path` names: itself, or the `run` folder inside a result.
-
-    Raises:
-        PoiseError: there is no such folder, or it is a result of `track`, which has no run.
-    """
-    # The name of the run file stands in poise.jobs.runs, which takes seconds to import.
-    from poise.jobs.runs import RUN_FILE
-
-    if not path.exists():
-        raise PoiseError("there is no such folder", path, "Give the folder of a result or a run")
-    inner = path / "run"
-    held = (path / RUN_FILE).exists() or (inner / RUN_FILE).exists()
-    if (path / "score.json").exists() and not held:
-        learned = path / "learned"
-        if (learned / RUN_FILE).exists():
-            hint = f"Give what --learn trained for it: {learned}"
-        else:
-            hint = "Its score is score.json and its page report.html; or give the run of the policy"
-        raise PoiseError("is a result of poise track, which has no run of its own", path, hint)
-    return inner if not (path / RUN_FILE).exists() and (inner / RUN_FILE).exists() else path

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.options import Flag
-from poise.cli.output import may_write, run_folder
+from poise.cli.output import may_write
 from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
 
@@ -42,7 +42,6 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Simulates one episode to its end and writes its report page."""
-    folder = run_folder(options.run)
     if options.out is not None:
         may_write(options.out, options.force)
     from poise.jobs.deliver import make_report
@@ -50,9 +49,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.view import write_report
 
     with working("simulating"):
-        run = open_run(folder)
+        run = open_run(options.run)
         clip, frame = _place(run.task, options.clip, options.start)
-        page = options.out or folder / "play.html"
+        page = options.out or run.path / "play.html"
         write_report(make_report(run.task, run.episode(clip, frame), run.curve), page)
     if options.open and not webbrowser.open(page.absolute().as_uri()):
         raise PoiseError("no browser could be opened", page, "Open the page by hand")

@@ -29,12 +29,14 @@ def clock(seconds: float) -> str:
 
 def share_done(stats: IterationStats, until: Until) -> float:
     """How much of the nearest limit is used up, 0 to 1."""
-    parts = [0.0]
-    if until.minutes:
-        parts.append(stats.seconds / (60 * until.minutes))
-    if until.iterations:
-        parts.append(stats.iteration / until.iterations)
-    return min(1.0, max(parts))
+    from poise.jobs.perpetual.stage_order import share_of
+
+    return share_of(until, stats.iteration, stats.samples, stats.seconds)
+
+
+def left(seconds: float, share: float) -> str:
+    """What is left of work of which a share took so many seconds: "8:40 left"."""
+    return f"{clock(seconds * (1 / share - 1))} left" if share else "? left"
 
 
 def figures(stats: IterationStats) -> str:
@@ -54,11 +56,10 @@ def figures(stats: IterationStats) -> str:
 def times(stats: IterationStats, until: Until) -> str:
     """Elapsed, limit and what is left: "1:20 of 10:00, 8:40 left"."""
     done = share_done(stats, until)
-    left = stats.seconds * (1 - done) / done if done else math.nan
     if until.iterations and stats.iteration / until.iterations == done:
-        return f"iteration {stats.iteration} of {until.iterations}, {clock(left)} left"
+        return f"iteration {stats.iteration} of {until.iterations}, {left(stats.seconds, done)}"
     limit = f" of {clock(60 * until.minutes)}" if until.minutes else ""
-    return f"{clock(stats.seconds)}{limit}, {clock(left)} left"
+    return f"{clock(stats.seconds)}{limit}, {left(stats.seconds, done)}"
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields, make_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
@@ -25,8 +26,8 @@ T = TypeVar("T")
 #: Where the dataclass of each recipe stands, below the package.
 SOURCES = {
     "residual-force": ("recipes/residual_force.py", "ResidualForce"),
-    "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
+    "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
 }
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.
@@ -36,6 +37,12 @@ _UNSAID = {
     "net": "the network; rtn is that of Harvey et al. 2020.",
 }
 _METAVARS = {float: "X", int: "N", str: "TEXT"}
+
+
+def class_of(recipe: str) -> type:
+    """The dataclass of a recipe's settings, which takes seconds to import."""
+    file, name = SOURCES[recipe]
+    return getattr(import_module("poise." + file.removesuffix(".py").replace("/", ".")), name)
 
 
 def derived(recipe: str, prefix: str, *names: str, **flags: str) -> type:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,21 +12,19 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.answer import INTERRUPTED, LOST, Answer
-from poise.cli.console import say, tell
+from poise.cli.console import print_card, say, tell
 from poise.cli.folder import each
-from poise.cli.options import Flag, Reading
+from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import claimed, may_deliver, may_write, places
-from poise.cli.progress import clock, showing, working
-from poise.cli.results import print_card
+from poise.cli.progress import clock, left, showing, working
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.jobs.perpetual.progress import Progress
+    from poise.jobs.perpetual.stage_order import Progress
     from poise.jobs.track import TrackConfig, Tracked
-    from poise.jobs.track.policy import Tracker
+    from poise.jobs.tracker import Tracker
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
-    from poise.plan import SamplingConfig
 
 #: Failures that are named one by one.
 NAMED = 8
@@ -98,28 +97,22 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 def check(o: Options) -> None:
     """Refuses numbers that make no sense, before anything is read or made."""
-    if not 1 <= o.count <= 64:
-        raise PoiseError(f"--count must lie in 1 to 64, got {o.count}")
-    if not 0 <= o.seed < 2**31:
-        raise PoiseError(f"--seed must be a whole number of at least 0, got {o.seed}")
-    if not 0 <= o.learn <= 100_000:
-        raise PoiseError(f"--learn needs minutes of at least 0, got {o.learn:g}")
+    check_range("count", o.count, 1, 64)
+    check_range("seed", o.seed, 0)
+    check_range("learn", o.learn, 0, 100_000)
+    check_range("characters", o.characters, 8, 65_536)
+    check_range("rounds", o.rounds, 1, 20)
+    check_range("threads", o.threads, 0)
     if o.learn and o.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
         raise PoiseError(what, hint="Leave one out")
-    if not 8 <= o.characters <= 65_536:
-        raise PoiseError(f"--characters must lie in 8 to 65536, got {o.characters}")
-    if not 1 <= o.rounds <= 20:
-        raise PoiseError(f"--rounds must lie in 1 to 20, got {o.rounds}")
-    if o.threads < 0:
-        raise PoiseError(f"--threads must be at least 0, got {o.threads}")
 
 
 def track_one(options: Options, tracker: Tracker | None = None, folder: Path | None = None) -> Answer:
     """Opens the policy, reads, tracks, writes; says where the character failed. folder: of the results,
     where that is settled."""
     o = options
-    from poise.jobs.runs import RUN_FILE
+    from poise.jobs.run_file import RUN_FILE
 
     out, motion = places(o.out) if folder is None else (folder, None)
     goes_on = o.learn > 0 and (out / "learned" / RUN_FILE).exists()
@@ -129,29 +122,29 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     if motion is not None and o.count > 1:
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
     from poise.jobs.open import open_run
-    from poise.jobs.track import TrackConfig, track, write
+    from poise.jobs.track import TrackConfig, write
     from poise.jobs.track.noise import noise_of
-    from poise.jobs.track.policy import save_tracker
+    from poise.jobs.tracker import save_tracker
+    from poise.plan import SamplingConfig
 
     noise = noise_of(o.noise)
     given = read(o.clip, o.reading)
     if tracker is None:
         with working("opening the policy"):
             tracker = open_run(o.policy).tracker
-    config = TrackConfig(noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count)
-    config = replace(config, search=searches(o), search_threads=o.threads)
+    search = SamplingConfig(o.characters, rounds=o.rounds, seed=o.seed) if o.search else None
+    config = TrackConfig(
+        noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count, search, o.threads
+    )
     with claimed(out):
-        with working("tracking"):
-            # What is to be learned is the motion alone.
-            plain = replace(config, recover=o.recover and not o.learn, search=None)
-            tracked = track(tracker, given, plain)
+        # What is to be learned is the motion alone.
+        plain = replace(config, recover=False, search=None) if o.learn else config
+        tracked = follow(tracker, given, plain)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
                 return Answer(exit_code=INTERRUPTED, outcome="interrupted")
             tracker = learned
-            tracked = track(tracker, given, replace(config, search=None))
-        if o.search and tracked.failures:
-            tracked = look(tracker, given, config)
+            tracked = follow(tracker, given, config)
         with working("writing"):
             done = write(tracked, out, motion, o.hold_feet)
             if o.save_policy is not None:
@@ -176,32 +169,27 @@ def is_lost(tracked: Tracked) -> bool:
     return bool(tracked.failures) and (losses is None or len(losses.back) < len(losses.lost))
 
 
-def searches(options: Options) -> SamplingConfig | None:
-    """How a motion is looked for, if it is."""
-    from poise.plan import SamplingConfig
-
-    o = options
-    return SamplingConfig(o.characters, rounds=o.rounds, seed=o.seed) if o.search else None
-
-
-def look(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
-    """The motion as it is found by a search."""
+def follow(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
+    """The motion as it is tracked, with a bar where it is searched."""
     from poise.jobs.track import track
 
-    began = time.monotonic()
-    with showing("searching") as bar:
+    with contextlib.ExitStack() as shown:
+        shown.enter_context(working("tracking"))
+        began, bars = time.monotonic(), list[Callable[[float, str], None]]()
 
         def show(done: int, steps: int) -> None:
+            if not bars:
+                shown.close()
+                bars.append(shown.enter_context(showing("searching")))
             share, spent = done / steps, time.monotonic() - began
-            left = f", {clock(spent * (1 / share - 1))} left" if share else ""
-            bar(share, f"{100 * share:.0f} % searched{left}")
+            bars[0](share, f"{100 * share:.0f} % searched, {left(spent, share)}")
 
-        return track(tracker, given, config, show)
+        return track(given, tracker, config, on_search=show)
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
-    from poise.cli.perpetual_shown import times
+    from poise.cli.train_perpetual import times
     from poise.jobs.track.learning import learn
 
     o, when, rate = options, tracked.failures[0][1], tracker.config.sim.control_hz

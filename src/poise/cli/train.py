@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,19 +13,13 @@ from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
-from poise.cli.perpetual_options import BY_HAND, Primitives, settings
-from poise.cli.settings import given
+from poise.cli.settings import SOURCES, class_of, given
 from poise.cli.train_inbetween import Network
+from poise.cli.train_perpetual import BY_HAND, Primitives, settings
 from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
 
-#: Recipes that can be trained, and where their settings are imported from.
-_KINDS = {
-    "residual-force": ("poise.recipes", "ResidualForce"),
-    "inbetween": ("poise.jobs.inbetween", "Inbetween"),
-    "perpetual": ("poise.recipes.perpetual", "Perpetual"),
-}
-RECIPES = tuple(_KINDS)
+RECIPES = tuple(SOURCES)
 
 
 #: How a single file is read, which is nothing for a folder, and what to do about it.
@@ -111,8 +104,7 @@ def blank() -> Options:
 def config_of(o: Options) -> Any:
     """The recipe's settings, as the command line states them; what belongs to another one is refused."""
     values = given(o.recipe_settings, o.network, o.primitives)
-    module, name = _KINDS[o.recipe]
-    default = getattr(import_module(module), name)()
+    default = class_of(o.recipe)()
     known = {f.name for f in fields(default)}
     own = {"inbetween": ("dropout",), "perpetual": BY_HAND}.get(o.recipe, ())
     for name in [*values, *(given(o.body) if "body" not in known else ())]:

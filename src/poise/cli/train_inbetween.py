@@ -14,12 +14,13 @@ from poise.cli.library_options import Library
 from poise.cli.output import claimed
 from poise.cli.progress import clock, showing
 from poise.cli.settings import derived
+from poise.cli.training import held_already
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.jobs.inbetween import Inbetween
+    from poise.jobs.inbetween.training import Inbetween
     from poise.learn.inbetween import BlockStats
 
 if TYPE_CHECKING:
@@ -43,13 +44,13 @@ def run(library: Library, config: Inbetween, out: Path, training: Training, agai
 
     import torch
 
-    from poise.jobs.inbetween import RUN_FILE, begin, train
+    from poise.jobs.inbetween.training import RUN_FILE, begin, train
 
     folder = library.folder("inbetween")
     if library.backwards:
         raise PoiseError("the recipe inbetween has no --backwards", hint="Leave it out")
     if (out / RUN_FILE).exists() and not training.resume:
-        raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
+        raise held_already(out)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     torch.set_num_threads(training.threads or cores)
     dropout = config.between_training.dropout

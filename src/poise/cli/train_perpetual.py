@@ -4,29 +4,103 @@ from __future__ import annotations
 
 import contextlib
 import os
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+from tyro.conf import arg
 
 from poise.cli import progress
 from poise.cli.answer import Answer
-from poise.cli.callbacks import beginning
-from poise.cli.console import launched, notes, say, tell
+from poise.cli.console import launched, notes, say, table, tell
 from poise.cli.library_options import Library
+from poise.cli.options import Body, Flag, Training
 from poise.cli.output import claimed
-from poise.cli.perpetual_options import check_going_on
-from poise.cli.perpetual_shown import report
-from poise.cli.perpetual_shown import training as shown
-from poise.cli.progress import clock
-from poise.cli.training import stopped
+from poise.cli.progress import clock, left, showing
+from poise.cli.settings import derived, given
+from poise.cli.training import beginning, held_already, stopped
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.cli.options import Training
     from poise.cli.train import Options
-    from poise.jobs.track.policy import Tracker
+    from poise.eval import RecoveryCard
+    from poise.jobs.perpetual.run import PerpetualResult
+    from poise.jobs.perpetual.stage_order import Progress
+    from poise.jobs.tracker import Tracker
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
+
+    _Derived: TypeAlias = Any
+else:
+    _Derived = derived(
+        "perpetual", "perpetual: ", "single", "max_primitives", "goal", "recovery", "multiplicative",
+        "progressive", "termination", "action",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Primitives(_Derived):
+    """What only the recipe perpetual knows."""
+
+    recovery_clips: Flag = True
+    """perpetual: characters that recover are told a point to come back to, as in the paper; by default
+    they follow the library's own clips, where some of them get up and some walk."""
+    going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
+    """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body;
+    with recovery it stays as it is, beside a primitive that recovers or, where it can already, others
+    that learn what it fails (--single: one network)."""
+    paths: Annotated[int, arg(metavar="N")] = 0
+    """perpetual: learn without help, from motions near the clips that need none, found first by so
+    many iterations, 11 say; 0 learns with --help-start at first."""
+    style: Flag = True
+    """perpetual: reward the task alone; by default a discriminator rewards motion like the library's."""
+
+
+#: Options that stand for a policy or for other settings than their names say.
+BY_HAND = ("recovery_clips", "going_on", "paths", "style")
+
+
+def settings(
+    primitives: Primitives, training: Training, body: Body, stated: Mapping[str, Any]
+) -> Perpetual:
+    """The recipe's settings. stated: by name, what the options state."""
+    from poise.recipes import perpetual
+
+    values = {name: value for name, value in stated.items() if name not in BY_HAND}
+    if not 1 <= values.get("max_primitives", 1) <= 64:
+        raise PoiseError(f"--max-primitives must lie in 1 to 64, got {values['max_primitives']}")
+    if primitives.paths and values.get("expert") is False:
+        raise PoiseError(
+            "--paths are for the expert, and --no-expert does without", hint="Leave one out"
+        )
+    if primitives.paths:
+        # The LQR teacher on optimised trajectories needs no help at any time.
+        values |= {"help_start": 0.0, "trajopt.iterations": primitives.paths}
+    if not primitives.recovery_clips:
+        values["recovering.demonstrations"] = 0
+    if not primitives.style:
+        values["style"] = None
+    additive = values.get("action") == "additive"
+    default = perpetual.Perpetual.additive() if additive else perpetual.Perpetual()
+    return training.settings("perpetual", default, body, values)
+
+
+def check_going_on(primitives: Primitives, body: Body, library: Library, returns: bool = True) -> None:
+    """Refuses options that the policy decides from which training goes on.
+
+    returns: the policy tracks recovery motions already, so that primitives may learn what it fails.
+    """
+    if library.onto is not None:
+        what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
+        raise PoiseError(what, hint="Leave --onto out")
+    free = {"recovery", "recovery_clips", "single", "going_on"}
+    if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
+        free.add("max_primitives")
+    names = [name for name in given(primitives, body) if name not in free]
+    if names:
+        what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
+        raise PoiseError(what, hint="Leave it out")
 
 
 def run(o: Options, config: Perpetual, again: str) -> Answer:
@@ -37,12 +111,12 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         hint = "Start it without torchrun; --threads and --device take all of one machine"
         raise PoiseError("the recipe perpetual trains in one process", hint=hint)
     from poise.jobs.perpetual.run import train
-    from poise.jobs.runs import RUN_FILE
+    from poise.jobs.run_file import RUN_FILE
     from poise.learn import Until
 
     held = (out / RUN_FILE).exists()
     if held and not training.resume:
-        raise PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
+        raise held_already(out)
     tracker = None
     if primitives.going_on is not None:
         from poise.jobs.open import open_run
@@ -90,10 +164,6 @@ def begin(
     hold_out, never = ((p,) if p else () for p in (library.hold_out, library.never))
     source = ", without ".join((str(folder.resolve()), *hold_out, *never))
     source = ", ".join((source, *library.source()))
-    earlier = None
-    if tracker is not None:
-        cost = tracker.about["samples"], tracker.about["seconds"]
-        earlier = perpetual_run.Earlier(*cost, tracker.target)
     if held:
         with progress.working("opening the run"):
             return perpetual_run.resume(out, config, source, training.device)
@@ -106,4 +176,94 @@ def begin(
     say(f"{len(clips)} clips, {clock(clips.seconds)}")
     notes(said)
     with claimed(out), progress.working("making the body"):
-        return perpetual_run.begin(out, clips, config, source, training.device, earlier)
+        return perpetual_run.begin(out, clips, config, source, training.device, tracker)
+
+
+# --- what is shown ------------------------------------------------------------------------------
+
+#: Clips that are named in the end.
+NAMED = 10
+
+
+def report(imitation: Imitation, result: PerpetualResult, out: Path) -> Answer:
+    """What the run came to, and which clips are the hardest."""
+    if result.last is None:
+        say(f"{out} had reached its limit before; nothing was trained.")
+    else:
+        stats = result.last.stats
+        say(f"Trained {clock(stats.seconds)}, {stats.samples:,} samples, {parts(result)}")
+    r, names = result.results, imitation.library.names
+    assert r is not None
+    won, total = int(r.succeeded.sum()), len(r.clip)
+    say(f"Without help {won} of {total} clips succeed ({100 * r.rate:.1f} %), {r.error_mm:.0f} mm")
+    if result.recovery is not None:
+        say(recovered(result.recovery))
+    if hard := r.hardest(NAMED):
+        rows = []
+        for c in hard:
+            k = r.clip.tolist().index(c)
+            rows.append((names[c], f"{int(r.tracked[k])} of {int(r.frames[k])}"))
+        table(f"The hardest of {total - won} that fail", ("clip", "frames tracked"), rows)
+    figures = {"succeeded": won, "clips": total, "succ": r.rate, "error_mm": r.error_mm}
+    return Answer(figures, {"run": out})
+
+
+def recovered(card: RecoveryCard) -> str:
+    """What trials of recovery came to: "Recovery: fallen 95 % within 5 s and 99 % within 10 s; ..."."""
+    rows = []
+    for row in card.rows:
+        each = (f"{100 * x:.0f} % within {t:g} s" for x, t in zip(row.within, card.seconds, strict=True))
+        rows.append(f"{row.kind} {' and '.join(each)}")
+    return f"Recovery, {card.rows[0].trials} trials each: {'; '.join(rows)}"
+
+
+def parts(result: PerpetualResult) -> str:
+    """What was trained, in words."""
+    n = result.primitives
+    made = f"{n} primitive{'s' if n > 1 else ''}" if n else "one network"
+    return f"{made}; nothing fails any more" if result.solved else made
+
+
+def figures(p: Progress) -> str:
+    """What one iteration says: the stage, its clips, the speed."""
+    what = "trials" if p.stage.kind == "recovery" else "clips"
+    won = "" if p.succeeded is None else f"  {p.succeeded} of {p.clips} {what}"
+    helped = f"  help at most {p.help_n:.0f} N" if p.help_n else "  no help"
+    reward = p.stats.terms.get("imitation", p.stats.reward)
+    speed = f"{p.stats.samples_per_s:,.0f} samples/s"
+    return f"{p.stage.name}{won}  {speed}  imitation {reward:.3f}{helped}"
+
+
+def times(p: Progress) -> str:
+    """How far it is: "1:20, 8:40 left"."""
+    return f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)}"
+
+
+def events(p: Progress) -> None:
+    """A line for each evaluation, where another stage begins, and for what went wrong."""
+    if p.trouble:
+        tell(
+            f"Gone on from the last checkpoint with other draws, since a simulation failed: {p.trouble}"
+        )
+    if p.results is not None:
+        won, total = int(p.results.succeeded.sum()), len(p.results.clip)
+        tell(
+            f"{clock(p.stats.seconds)}  {p.stage.name}: {won} of {total} clips succeed, "
+            f"{p.results.error_mm:.0f} mm"
+        )
+    if p.recovery is not None:
+        tell(f"{clock(p.stats.seconds)}  {p.stage.name}: {recovered(p.recovery)}")
+    if p.following is not None:
+        tell(f"{clock(p.stats.seconds)}  {p.following.name} begins")
+
+
+@contextlib.contextmanager
+def shown() -> Iterator[Callable[[Progress], None]]:
+    """A bar in a terminal, a line now and then elsewhere, and `events`."""
+    with showing("training") as show:
+
+        def one(p: Progress) -> None:
+            show(p.share, f"{times(p)}  {figures(p)}")
+            events(p)
+
+        yield one

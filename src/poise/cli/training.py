@@ -1,4 +1,5 @@
-"""What `imitate` and `train` share: check, read, build, train, and the way to go on.
+"""What `imitate` and `train` share: check, read, build, train, what is said meanwhile, and
+the way to go on.
 
 Under `torchrun` several processes do one job: rank 0 reads, writes and prints, the others open the
 run folder that it made and train with it.
@@ -8,23 +9,26 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli import progress
 from poise.cli.answer import INTERRUPTED, Answer
-from poise.cli.callbacks import First, beginning
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Reading, Training
 from poise.cli.output import claimed
+from poise.cli.progress import clock, left
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from poise.learn import RunResult
+    from poise.eval import ScoreCard
+    from poise.jobs.warm_start import TrainingCallbacks
+    from poise.learn import CloneStats, PolicyBundle, RunResult, WarmStart
     from poise.learn.parallel import Comm
     from poise.motion import ClipLibrary
+    from poise.plan import TrajOptStats
     from poise.recipes import ResidualForce
     from poise.recipes.imitation import Imitation
 
@@ -56,12 +60,12 @@ class Job:
 
     def begin(self) -> Imitation:
         """Reads the clips, tries the folder, builds the task; nothing stays if that fails."""
-        from poise.jobs.runs import RUN_FILE, begin
+        from poise.jobs.run_file import RUN_FILE
+        from poise.jobs.runs import begin
 
         held = (self.run / RUN_FILE).exists()
         if held and not self.training.resume:
-            hint = "Go on with --resume, or choose another folder"
-            raise PoiseError("already holds a run", self.out, hint)
+            raise held_already(self.out)
         library = self.read()
         say(f"{', '.join(library.names[:6])}: {library.seconds:.1f} s")
         notes([n for clip in library for n in clip.skeleton.source.notes])
@@ -105,6 +109,11 @@ class Job:
             return RunResult(None, True, None)
 
 
+def held_already(out: Path) -> PoiseError:
+    """What is said of a run that is there and was not asked to go on."""
+    return PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
+
+
 def stopped(run: Path, again: str, where: str = "") -> Answer:
     """Says what Ctrl-C left in the run folder, and the command line that goes on with it."""
     from poise.learn import LATEST
@@ -126,3 +135,54 @@ def command_line(verb: str, argv: Sequence[str]) -> str:
         nodes = () if here == all_ else ("--nnodes", str(int(all_) // int(here)))
         program = ("torchrun", *nodes, "--nproc-per-node", here, "-m", "poise")
     return shlex.join((*program, verb, *argv, *more))
+
+
+First = Callable[["PolicyBundle", "WarmStart"], None]
+
+
+def beginning(first: First | None = None) -> TrainingCallbacks:
+    """Callbacks that tell the steps before PPO begins; `first` gets the clone."""
+    from poise.jobs.warm_start import TrainingCallbacks
+
+    def expert(card: ScoreCard) -> None:
+        tell(f"expert, without learning: {summary(card)}")
+
+    def cloned_round(s: CloneStats) -> None:
+        tell(f"{clock(s.seconds)}  cloning, round {s.round}: {s.samples:,} samples, error {s.loss:.3f}")
+
+    def failed(why: str) -> None:
+        tell(f"Training starts from nothing, since the expert failed: {why}")
+
+    def path(s: TrajOptStats, of: int) -> None:
+        figures = f"root off by {1000 * s.error_m:.0f} mm, help {s.help_n:.0f} N"
+        share = f"{100 * s.unhelped:.0f} % without, {left(s.seconds, s.iteration / of)}"
+        tell(f"{clock(s.seconds)}  path {s.iteration} of {of}: {figures}, {share}")
+
+    return TrainingCallbacks(expert, cloned_round, first, failed, path)
+
+
+def first_delivery(
+    imitation: Imitation, out: Path, motion: Path | None = None, hold: bool = True
+) -> First:
+    """Writes the clone's motion, score and report, see `deliver`; training then betters them."""
+
+    def deliver_first(policy: PolicyBundle, start: WarmStart) -> None:
+        from poise.jobs.deliver import deliver
+        from poise.jobs.runs import evaluate
+        from poise.jobs.warm_start import FIRST_STARTS
+
+        meta = {"seconds": start.seconds, "samples": start.samples}
+        evaluation = evaluate(imitation, policy, meta, most=FIRST_STARTS)
+        paths = deliver(imitation, evaluation, out, {}, motion, hold).paths
+        tell(f"first result: {summary(evaluation.card)}; see {paths['report']}")
+
+    return deliver_first
+
+
+def summary(card: ScoreCard) -> str:
+    """A score card in half a line: "succ 97 %, 19 mm, help 69 N and 28 N m"."""
+    aid = card.help
+    return (
+        f"succ {100 * card.succ:.0f} %, {card.mpjpe_mm:.0f} mm, "
+        f"help {aid.force_mean_n:.0f} N and {aid.torque_mean_nm:.0f} N m"
+    )

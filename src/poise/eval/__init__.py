@@ -1,21 +1,19 @@
 """Evaluation: padded rollouts in, a score card with stable keys out."""
 
-from poise.eval.clip_figures import clip_figures
+from poise.eval.card import THRESHOLDS, Help, Row, ScoreCard, Threshold, read_score, table, write_score
 from poise.eval.clip_results import ClipJudge, ClipResults
 from poise.eval.episodes import (
     Observer,
     Recorder,
     Recording,
-    record,
     run_episodes,
     run_in_batches,
     simulate,
     start_frames,
 )
-from poise.eval.recovery import RecoveryCard, recovery_card, trial_task, write_recovery
+from poise.eval.recovery import RecoveryCard, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
-from poise.eval.scorecard import Help, ScoreCard, read_score, score_rollouts, write_score
-from poise.eval.verdicts import THRESHOLDS, Row, Threshold, table
+from poise.eval.scorecard import clip_figures, score_rollouts
 
 __all__ = [
     "THRESHOLDS",
@@ -32,7 +30,6 @@ __all__ = [
     "Threshold",
     "clip_figures",
     "read_score",
-    "record",
     "recovery_card",
     "run_episodes",
     "run_in_batches",
@@ -41,6 +38,5 @@ __all__ = [
     "start_frames",
     "table",
     "trial_task",
-    "write_recovery",
     "write_score",
 ]

@@ -1,16 +1,19 @@
-"""The score card as a value and as a file: `score.json` with stable keys (docs/metrics.md)."""
+"""The score card as a value, as a file, `score.json` with stable keys (docs/metrics.md), and in words:
+labelled rows, each judged good, fair or poor by stated thresholds."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 from poise.errors import PoiseError
+from poise.learn.checkpoint import write_atomic
+from poise.settings import plain
 from poise.version import __version__
 
 NAN = float("nan")
@@ -68,29 +71,13 @@ class ScoreCard:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values with the keys in field order; what is not finite becomes None."""
-        return {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Help):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return plain(self)
 
 
 def write_score(card: ScoreCard, path: str | Path) -> Path:
-    """Write `score.json` whole or not at all: a file beside it is filled, then takes its name."""
+    """Writes `score.json` whole or not at all."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        draft.write_text(json.dumps(card.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_atomic(path, (json.dumps(card.to_dict(), indent=2, allow_nan=False) + "\n").encode())
     return path
 
 
@@ -140,3 +127,96 @@ def _require(raw: dict[str, Any], names: list[str], path: Path) -> None:
             path,
             "Score the run again with this version.",
         )
+
+
+Verdict = Literal["good", "fair", "poor", ""]
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """Up to `good` is good, up to `fair` is fair, beyond is poor; at least instead when `more`."""
+
+    good: float
+    fair: float
+    more: bool = False
+
+    def verdict(self, value: float) -> Verdict:
+        """ "" for a value that was not measured."""
+        if not math.isfinite(value):
+            return ""
+        sign = -1.0 if self.more else 1.0
+        if sign * value <= sign * self.good:
+            return "good"
+        return "fair" if sign * value <= sign * self.fair else "poor"
+
+
+THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
+    {
+        "succ": Threshold(0.95, 0.80, more=True),
+        "mpjpe_mm": Threshold(40.0, 80.0),
+        "mpjpe_global_mm": Threshold(60.0, 120.0),
+        "vel_mm_per_frame": Threshold(10.0, 20.0),
+        "acc_mm_per_frame2": Threshold(7.0, 15.0),
+        "foot_slide_mm_per_s": Threshold(100.0, 250.0),
+        "penetration_mm": Threshold(5.0, 15.0),
+        "float_mm": Threshold(10.0, 30.0),
+        "jerk_ratio": Threshold(1.5, 3.0),
+        "share_of_body_weight": Threshold(0.02, 0.10),
+        "torque_mean_nm": Threshold(5.0, 25.0),
+    }
+)
+"""By key of the score card, in its units; reasons in docs/metrics.md. `jerk_ratio` is jerk over the
+reference's jerk."""
+
+
+class Row(NamedTuple):
+    """One line of the table; `value` is NaN where nothing was measured."""
+
+    label: str
+    value: float
+    unit: str
+    verdict: Verdict
+
+
+_ROWS = (
+    ("mpjpe_mm", "Joint error, root-relative", "mm"),
+    ("mpjpe_global_mm", "Joint error, global", "mm"),
+    ("vel_mm_per_frame", "Velocity error", "mm/frame"),
+    ("acc_mm_per_frame2", "Acceleration error", "mm/frame²"),
+    ("foot_slide_mm_per_s", "Foot slide", "mm/s"),
+    ("penetration_mm", "Penetration", "mm"),
+    ("float_mm", "Floating", "mm"),
+    ("jerk", "Jerk", "m/s³"),
+)
+
+
+def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
+    """Rows (label, value, unit, verdict) for the command line and the report, most important first.
+
+    Each plausibility row is followed by the reference's own figure, which gets no verdict.
+    """
+    t = THRESHOLDS
+    rows: list[tuple[str, float, str, Verdict]] = [
+        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ))
+    ]
+    for key, label, unit in _ROWS:
+        value = getattr(card, key)
+        reference = card.reference.get(key, math.nan)
+        if key == "jerk":
+            ratio = value / reference if reference > 0 else math.nan
+            rows.append(Row(label, value, unit, t["jerk_ratio"].verdict(ratio)))
+        else:
+            rows.append(Row(label, value, unit, t[key].verdict(value)))
+        if math.isfinite(reference):
+            rows.append(Row(f"{label}, reference", reference, unit, ""))
+    aid = card.help
+    share = t["share_of_body_weight"].verdict(aid.share_of_body_weight)
+    torque = t["torque_mean_nm"].verdict(aid.torque_mean_nm)
+    rows += [
+        Row("Help, share of body weight", 100.0 * aid.share_of_body_weight, "%", share),
+        Row("Help, mean force", aid.force_mean_n, "N", ""),
+        Row("Help, mean torque", aid.torque_mean_nm, "N m", torque),
+        Row("Help, mean power", aid.work_j_per_s, "J/s", ""),
+        Row("Reward per step", card.reward.get("total", math.nan), "", ""),
+    ]
+    return rows

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -94,44 +94,31 @@ def run_episodes(
     policy: Acts,
     clip: Tensor,
     start: Tensor,
-    limit_n: float = 0.0,
-    limit_nm: float = 0.0,
+    limit: float = 0.0,
     cycles: int = 2,
 ) -> tuple[RolloutSet, list[Recording]]:
     """Every episode simulated to the end of its clip (cyclic clips: `cycles` rounds), failed or not.
 
     Args:
-        make_env: gives an environment of N worlds without automatic reset.
+        make_env: gives an environment of N worlds without automatic reset, which is closed in the end.
         policy: acts on raw observations, deterministically.
-        clip, start: `(E,)` clip index and first frame. limit_n, limit_nm: the help budget.
+        clip, start: `(E,)` clip index and first frame. limit: the help budget, N and N m.
 
     Returns:
         the padded rollouts (frame 0 is the start itself, before any action) and, for each clip's
         earliest start, the generalized coordinates.
     """
-    _check_starts(clip, start)
+    if clip.shape != start.shape or clip.ndim != 1 or not len(clip):
+        shapes = f"{tuple(clip.shape)} and {tuple(start.shape)}"
+        raise PoiseError(f"an evaluation needs clip and start of one length, got {shapes}")
     env = make_env(len(clip))
     try:
-        return record(env, policy, clip, start, limit_n, limit_nm, cycles)
+        obs = env.reset_to(clip, start)
+        recorder = Recorder(env, clip, start, cycles)
+        simulate(env, policy, obs, recorder.total - 1, recorder)
     finally:
         env.close()
-
-
-def record(
-    env: ImitationEnv,
-    policy: Acts,
-    clip: Tensor,
-    start: Tensor,
-    limit_n: float = 0.0,
-    limit_nm: float = 0.0,
-    cycles: int = 2,
-) -> tuple[RolloutSet, list[Recording]]:
-    """`run_episodes` in an environment of as many worlds as there are episodes, which stays open."""
-    _check_starts(clip, start)
-    obs = env.reset_to(clip, start)
-    recorder = Recorder(env, clip, start, cycles)
-    simulate(env, policy, obs, recorder.total - 1, recorder)
-    return recorder.rollouts(limit_n, limit_nm), recorder.recordings()
+    return recorder.rollouts(limit), recorder.recordings()
 
 
 def run_in_batches(
@@ -140,9 +127,7 @@ def run_in_batches(
     reference: Reference,
     clip: Tensor,
     start: Tensor,
-    limit_n: float = 0.0,
-    limit_nm: float = 0.0,
-    cycles: int = 2,
+    limit: float = 0.0,
     most: int = PADDED,
 ) -> Iterator[RolloutSet]:
     """The rollouts of `run_episodes` in parts, each of episodes of like length.
@@ -154,7 +139,7 @@ def run_in_batches(
         reference: the clips, as the environments have them.
         most: frames of a part, with the padding.
     """
-    length = frames_from(reference, clip, start, cycles)
+    length = frames_from(reference, clip, start)
     order = torch.arange(len(clip))
     if len(clip) * int(length.max()) > most:
         order = length.argsort(stable=True)
@@ -162,7 +147,7 @@ def run_in_batches(
         # Episodes are sorted, so that a part is as long as its last one.
         fits = (torch.arange(1, len(order) + 1) * length[order].cummax(0).values <= most).sum()
         rows, order = order[: max(1, int(fits))], order[max(1, int(fits)) :]
-        yield run_episodes(make_env, policy, clip[rows], start[rows], limit_n, limit_nm, cycles)[0]
+        yield run_episodes(make_env, policy, clip[rows], start[rows], limit)[0]
 
 
 class Recorder:
@@ -220,18 +205,12 @@ class Recorder:
             out["ang_vel"][:, t] = ang
         return t + 1 >= self.total
 
-    def rollouts(self, limit_n: float = 0.0, limit_nm: float = 0.0) -> RolloutSet:
-        """All episodes, padded. limit_n, limit_nm: the help budget that they had."""
-        ref, humanoid, kept = self.reference, self.reference.humanoid, self.tensors
+    def rollouts(self, limit: float = 0.0) -> RolloutSet:
+        """All episodes, padded. limit: the help budget that they had, N and N m."""
+        ref, humanoid = self.reference, self.reference.humanoid
+        kept: dict[str, Any] = self.tensors
         return RolloutSet(
-            pos=kept["pos"],
-            quat=kept["quat"],
-            ref_pos=kept["ref_pos"],
-            ref_quat=kept["ref_quat"],
-            force=kept["force"],
-            torque=kept["torque"],
-            point_vel=kept["point_vel"],
-            ang_vel=kept["ang_vel"],
+            **kept,
             alive=torch.arange(self.total) < self.lengths[:, None],
             lengths=self.lengths,
             reached_end=torch.ones(len(self.clip), dtype=torch.bool),
@@ -243,8 +222,8 @@ class Recorder:
             mass=humanoid.mass,
             feet=humanoid.feet,
             shapes=shapes_of(humanoid.table, torch.float32),
-            limit_n=limit_n,
-            limit_nm=limit_nm,
+            limit_n=limit,
+            limit_nm=limit,
             ref_min_height=ref.min_height[self.clip],
         )
 
@@ -255,11 +234,3 @@ class Recorder:
             Recording(c, int(self.start[row]), qpos[k, : int(self.lengths[row])], row)
             for k, (c, row) in enumerate(self._first.items())
         ]
-
-
-def _check_starts(clip: Tensor, start: Tensor) -> None:
-    if clip.shape != start.shape or clip.ndim != 1 or not len(clip):
-        raise PoiseError(
-            f"an evaluation needs clip and start of one length, got {tuple(clip.shape)} and "
-            f"{tuple(start.shape)}"
-        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -173,15 +173,6 @@ def slide(test: TestSet, pos: Tensor, length: int) -> float:
     return float(1000 * (moved * held).sum() / held.sum().clamp_min(1))
 
 
-def truth_rows(test: TestSet) -> list[Row]:
-    """The recorded motion's own figures: zero errors, and its FP, FQ, JQ and SM."""
-    rows = []
-    for n in test.protocol.lengths:
-        pos = test.truth(n)[0]
-        rows.append(Row(n, 0.0, 0.0, 0.0, *physics(pos, test.feet, test.fps), 0.0, slide(test, pos, n)))
-    return rows
-
-
 @torch.no_grad()
 def predict(net: TransitionNet, test: TestSet, length: int, batch: int = 256) -> tuple[Filled, float]:
     """Transitions of all windows in float32 where the network has weights, and seconds a sequence."""
@@ -208,25 +199,3 @@ def evaluate(
         filled, seconds = predict(own, test, n)
         rows.append(score(test, filled, n, seconds))
     return rows
-
-
-def markdown(name: str, methods: Mapping[str, Sequence[Row]]) -> str:
-    """One table per figure, methods down and lengths across, under the name of the data."""
-    figures = {
-        "L2P": ("l2p", "{:.3f}"), "L2Q": ("l2q", "{:.3f}"), "NPSS": ("npss", "{:.4f}"),
-        "FP, mm": ("fp_mm", "{:.3f}"), "FQ": ("fq", "{:.2%}"), "JQ": ("jq", "{:.2%}"),
-        "SM, mm/frame": ("sm_mm", "{:.1f}"),
-        "slide, mm/frame": ("slide_mm", "{:.2f}"),
-    }  # fmt: skip
-    lengths = [row.length for row in next(iter(methods.values()))]
-    lines = []
-    for title, (key, form) in figures.items():
-        lines += [f"**{name}, {title}**", ""]
-        lines += ["| method | " + " | ".join(map(str, lengths)) + " |"]
-        lines += ["|---" * (len(lengths) + 1) + "|"]
-        for method, rows in methods.items():
-            lines.append(
-                f"| {method} | " + " | ".join(form.format(getattr(r, key)) for r in rows) + " |"
-            )
-        lines.append("")
-    return "\n".join(lines)

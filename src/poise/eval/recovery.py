@@ -8,11 +8,10 @@ simulated longer than the times asked for.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +23,7 @@ from poise.env.recovery.clock import RecoveryClock
 from poise.env.recovery.config import FALLEN, FAR
 from poise.errors import PoiseError
 from poise.eval.episodes import simulate
+from poise.settings import plain
 
 #: The fail-states by name.
 KINDS: Mapping[str, int] = {"fallen": FALLEN, "far": FAR, "fallen and far": FALLEN | FAR}
@@ -65,12 +65,9 @@ class RecoveryCard:
     seed: int
     rows: tuple[Recovered, ...]
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, Any]:
         """JSON data; what is not a number is null."""
-        data = asdict(self)
-        for row in data["rows"]:
-            row.update({k: None for k in ("median", "slowest") if math.isnan(row[k])})
-        return data
+        return plain(self)
 
 
 def trial_task(
@@ -149,12 +146,6 @@ def recovery_card(
         env.close()
     times = tuple(float(s) for s in seconds)
     return RecoveryCard(method, name, frame, times, near, held, distance, seed, tuple(rows))
-
-
-def write_recovery(card: RecoveryCard, path: Path) -> None:
-    """Writes the card as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(card.to_dict(), indent=2) + "\n", encoding="utf-8")
 
 
 def back_after(near: Tensor, stay: int) -> Tensor:

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.eval.card import NAN, Help, ScoreCard, Weighting, read_score, write_score
-from poise.eval.judged import Sums, judge
-from poise.eval.rolloutset import RolloutSet
-from poise.eval.verdicts import table
+from poise.eval.card import NAN, Help, ScoreCard, Weighting
+from poise.eval.rolloutset import RolloutSet, Sums, judge
 from poise.metrics import (
     HelpAudit,
     Shapes,
@@ -23,25 +21,18 @@ from poise.metrics import (
     float_gaps,
     foot_contacts,
     foot_points,
+    foot_slide,
     help_audit,
     jerk,
     lowest_points,
     mpjpe_global,
     mpjpe_root,
+    penetration,
     span_mask,
     success_rule,
     velocity_error,
 )
-
-__all__ = [
-    "Help",
-    "RolloutSet",
-    "ScoreCard",
-    "read_score",
-    "score_rollouts",
-    "table",
-    "write_score",
-]
+from poise.motion import Clip
 
 TRACKING = ("mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame2")
 PLAUSIBILITY = ("foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk")
@@ -220,3 +211,20 @@ def score_rollouts(
         weighting=weighting,
         variants=variants,
     )
+
+
+def clip_figures(
+    clip: Clip, joints: Sequence[int], shapes: Shapes, feet: Sequence[int], ground: float = 0.0
+) -> dict[str, float]:
+    """`foot_slide_mm_per_s` and `penetration_mm` of a clip with a character's shapes (docs/metrics.md).
+
+    Args:
+        joints: the clip's joint that each body of `shapes` is fixed to. feet: the bodies that are feet.
+        ground: height (m) of the floor under the soles, for the slide; penetration is below z = 0.
+    """
+    pos, quat = (torch.tensor(x)[:, list(joints)] for x in clip.world())
+    slide = foot_slide(foot_points(pos, quat, shapes, feet), clip.fps, ground=ground)
+    return {
+        "foot_slide_mm_per_s": float(slide),
+        "penetration_mm": float(penetration(lowest_points(pos, quat, shapes)).mean_mm),
+    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,19 +47,23 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
-    """What an evaluation gives a user, before anything is written.
+class Delivery:
+    """What an evaluation gives a user.
 
-    clips: the simulated motions by the names of their files, on the skeletons that came in. card: the
-    score card with what holding the feet did. notes: the same in sentences.
+    Attributes:
+        clips: the simulated motions by the names of their files, on the skeletons that came in.
+        card: the score card with what holding the feet did.
+        notes: what was done to the motions beyond simulating them, in sentences.
+        paths: of what was written, by name; empty before anything is.
     """
 
     clips: dict[str, Clip]
     card: ScoreCard
     notes: tuple[str, ...]
+    paths: dict[str, Path] = field(default_factory=dict)
 
 
-def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) -> Finished:
+def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) -> Delivery:
     """The simulated motion of every clip, its standing feet held to the spot; see `deliver`."""
     clips: dict[str, Clip] = {}
     figures, notes = [], []
@@ -72,17 +76,7 @@ def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) ->
             figures.append(found)
             notes += _sentences(found)
         clips[name] = clip
-    return Finished(clips, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
-
-
-@dataclass(frozen=True, eq=False)
-class Delivery:
-    """paths: of what was written, by name. card: the score card as it was written. notes: what was done
-    to the motions beyond simulating them, in sentences."""
-
-    paths: dict[str, Path]
-    card: ScoreCard
-    notes: tuple[str, ...]
+    return Delivery(clips, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
 
 
 def deliver(
@@ -120,7 +114,7 @@ def deliver(
     paths["report"] = out / "report.html"
     report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
     write_report(replace(report, notes=(*said, *report.notes, *done.notes)), paths["report"])
-    return Delivery(paths, done.card, done.notes)
+    return replace(done, paths=paths)
 
 
 def _held(

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from poise.errors import PoiseError
-from poise.jobs.workers import Ended, Workers, describe
+from poise.jobs.workers import Ended, Workers
 from poise.learn.checkpoint import write_atomic
 from poise.version import __version__
 
@@ -169,15 +169,15 @@ class _Fleet:
         record.pid, record.error = None, ended.said
         if ended.code == 0:
             record.score, record.error = _score(job.result)
+        event: Event = "failed"
         if not record.error and ended.code == 0:
-            record.state = "done"
+            event = "done"
         elif record.attempts <= self.retries:
-            record.state = "waiting"
+            event = "again"
             self.waiting.append(record)
-        else:
-            record.state = "failed"
+        record.state = "waiting" if event == "again" else event
         self.write()
-        self.tell("again" if record.state == "waiting" else _ending(record), record)
+        self.tell(event, record)
 
     def stop(self) -> None:
         try:
@@ -192,13 +192,11 @@ class _Fleet:
 
     def write(self) -> None:
         jobs = [dataclasses.asdict(r) for r in self.records.values()]
-        table = {"format": FORMAT, "poise": __version__, **describe(self.workers), "jobs": jobs}
+        w = self.workers
+        run = {"workers": w.kind, "jobs_at_once": w.slots, "threads": w.threads}
+        table = {"format": FORMAT, "poise": __version__, **run, "jobs": jobs}
         text = json.dumps(table, indent=2, allow_nan=False)
         write_atomic(self.folder / FLEET_FILE, text.encode())
-
-
-def _ending(record: Record) -> Event:
-    return "done" if record.state == "done" else "failed"
 
 
 def read_table(folder: Path) -> dict[str, Record]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from poise.eval import ScoreCard
-from poise.jobs.deliver import Finished, deliver, finished
+from poise.jobs.deliver import Delivery, deliver, finished
 from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
@@ -50,7 +50,7 @@ class Imitated(Result):
     interrupted: bool = False
 
     @cached_property
-    def _finished(self) -> Finished:
+    def _finished(self) -> Delivery:
         return finished(self.task, self.evaluation)
 
     @property

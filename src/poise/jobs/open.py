@@ -13,6 +13,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from poise.errors import PoiseError, did_you_mean
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import (
@@ -23,14 +25,14 @@ from poise.jobs.run_file import (
     learning_curve,
     run_folder,
 )
-from poise.jobs.runs import Evaluation, episode, evaluate, reopen, score, trained_policy
-from poise.jobs.track.policy import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
+from poise.jobs.runs import Evaluation, evaluate, score, trained_policy
+from poise.jobs.tracker import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
 from poise.learn import PolicyBundle, load_checkpoint
 from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.recipes.perpetual.config import config_of as perpetual_config
 from poise.recipes.perpetual.task import RECIPE as PERPETUAL
 from poise.recipes.residual_force import RECIPE as RESIDUAL_FORCE
-from poise.recipes.residual_force import config_of
+from poise.recipes.residual_force import build, config_of
 from poise.settings import check_data, from_data
 
 if TYPE_CHECKING:
@@ -69,7 +71,9 @@ class Run:
         """
         if self.file is None or self.recipe == INBETWEEN:
             raise PoiseError("it holds no clips to simulate", self.path, "Give the folder of a run")
-        return (perpetual_run.reopen if self.recipe == PERPETUAL["name"] else reopen)(self.file)
+        if self.recipe == PERPETUAL["name"]:
+            return perpetual_run.reopen(self.file)
+        return build(self.file.library(), self.config)
 
     @property
     def policy(self) -> PolicyBundle:
@@ -136,7 +140,8 @@ class Run:
             raise PoiseError(f"the run has clips 0 to {len(names) - 1}, got {clip}", self.path)
         if not 0 <= frame < int(self.task.reference.length[clip]) - 1:
             raise PoiseError(f"'{names[clip]}' has no step after its frame {frame}", self.path)
-        return episode(self.task, *self.trained, clip, frame)
+        starts = torch.tensor([clip]), torch.tensor([frame])
+        return evaluate(self.task, *self.trained, starts=starts)
 
     def clip(self, clip: int | str = 0) -> Clip:
         """The simulated motion of one of the run's clips on the skeleton that it came on."""

@@ -11,7 +11,8 @@ OUT/run/                    the run folder itself
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -25,6 +26,7 @@ from poise.errors import PoiseError
 from poise.learn import LATEST, load_checkpoint, save_checkpoint
 from poise.motion import ClipLibrary, Skeleton
 from poise.motion.pack import pack_clips, unpack_clips
+from poise.settings import to_data
 
 #: The file that says what a run is.
 RUN_FILE = "run.safetensors"
@@ -141,6 +143,9 @@ def run_folder(path: Path) -> Path:
             return folder
     if not path.exists():
         raise PoiseError("there is no such folder", path, "Give the folder of a result or a run")
+    if (path / "score.json").exists():
+        hint = "Its score is score.json and its page report.html; or give the run of the policy"
+        raise PoiseError("is a result of poise track, which has no run of its own", path, hint)
     what = f"is no run folder: there is no {RUN_FILE} in it"
     raise PoiseError(what, path, "Give the folder of a result, or the 'run' folder in it")
 
@@ -156,6 +161,45 @@ def read_run(folder: Path) -> RunFile:
         path = run_folder(folder) / RUN_FILE
     tensors, meta = load_checkpoint(path, RunMeta)
     return RunFile(path, meta, tensors)
+
+
+def held_run(
+    folder: Path,
+    recipe: str,
+    config: Any,
+    read: Callable[[Mapping[str, Any], Path], Any],
+    library: ClipLibrary | None = None,
+    source: str | None = None,
+) -> RunFile:
+    """The run file of the run in a folder, unless it is that of another run.
+
+    Args:
+        recipe, config: its name and its settings.
+        read: makes the settings of what the file says, also of one of an earlier version.
+        library: its clips, where they are at hand. source: where they are from, where that is known.
+
+    Raises:
+        PoiseError: another recipe, other settings, another source, or other clips.
+    """
+    file = read_run(folder)
+    if file.recipe != recipe:
+        raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
+    # As this version reads it, so that a run of an older one is compared in what it knew, too.
+    here, there = to_data(config), to_data(read(file.meta["config"], file.path))
+    # How long the expert was cloned is over and done; a run keeps its own.
+    names = sorted(k for k in here if k != "clone" and here[k] != there[k])
+    if names:
+        what = f"the folder holds a run with other settings ({', '.join(names)})"
+        raise PoiseError(what, folder, "Resume it as it is or choose another folder")
+    if source is not None and file.meta.get("source", "") != source:
+        what = f"the folder holds a run on the library {file.meta.get('source') or 'of a program'}"
+        raise PoiseError(what, folder, "Give that library, or choose another folder")
+    clips = file.meta["clips"]
+    if library is not None and clips != json.loads(json.dumps(pack_clips(library.clips)[1])):
+        more = f" and {len(clips) - 6} more" if len(clips) > 6 else ""
+        what = f"the folder holds a run of other clips ({', '.join(c['name'] for c in clips[:6])}{more})"
+        raise PoiseError(what, folder, "Give those clips, or choose another folder")
+    return file
 
 
 def write_run(

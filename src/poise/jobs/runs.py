@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch import Tensor
 
 from poise.body import Humanoid
+from poise.env import ImitationEnv
 from poise.env.help import scale_in
 from poise.errors import PoiseError
 from poise.eval import (
@@ -26,11 +26,9 @@ from poise.eval import (
 from poise.jobs.run_file import (
     FINAL,
     RUN_FILE,
-    RunFile,
     body_facts,
+    held_run,
     latest_policy,
-    learning_curve,
-    read_run,
     write_run,
 )
 from poise.jobs.warm_start import TrainingCallbacks, some_starts, start_training
@@ -46,25 +44,9 @@ from poise.learn import (
 )
 from poise.learn.parallel import ALONE, Comm
 from poise.motion import ClipLibrary
-from poise.motion.pack import pack_clips
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
 from poise.settings import to_data
-
-__all__ = [
-    "FINAL",
-    "RUN_FILE",
-    "Evaluation",
-    "begin",
-    "episode",
-    "evaluate",
-    "help_left",
-    "learning_curve",
-    "reopen",
-    "score",
-    "train",
-    "trained_policy",
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,34 +61,16 @@ class Evaluation:
 def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str = "cpu") -> Imitation:
     """Builds the task and writes the run file; a folder that holds another run is refused, and so are
     more characters than fit into the memory of the `device` that will train it."""
+    held = (folder / RUN_FILE).exists()
+    file = held_run(folder, RECIPE["name"], config, config_of, library) if held else None
     imitation = build(library, config)
     imitation.check_memory(config.num_envs, device)
-    if not (folder / RUN_FILE).exists():
+    if file is None:
         meta = {"recipe": RECIPE["name"], "config": to_data(config)}
         write_run(folder, library, meta | body_facts(imitation.humanoid, imitation.library.names))
-        return imitation
-    found = read_run(folder)
-    # As this version reads it, so that a run of an older one is compared in what it knew, too.
-    if found.recipe != RECIPE["name"] or config_of(found.meta["config"], found.path) != config:
-        raise PoiseError(
-            "the folder holds a run with other settings",
-            folder,
-            "Resume it as it is or choose another folder",
-        )
-    notes = json.loads(json.dumps(pack_clips(library.clips)[1]))
-    if found.meta.get("character") != imitation.humanoid.identity or found.meta["clips"] != notes:
-        names = ", ".join(c["name"] for c in found.meta["clips"])
-        raise PoiseError(
-            f"the folder holds a run of other clips ({names})",
-            folder,
-            "Choose another folder",
-        )
+    elif file.meta.get("character") != imitation.humanoid.identity:
+        raise PoiseError("the folder holds a run of another body", folder, "Choose another folder")
     return imitation
-
-
-def reopen(file: RunFile) -> Imitation:
-    """The task of an existing run, rebuilt from its file alone."""
-    return build(file.library(), config_of(file.meta["config"], file.path))
 
 
 def train(
@@ -173,6 +137,7 @@ def evaluate(
     help_limit: float | None = None,
     most: int | None = None,
     device: str = "cpu",
+    starts: tuple[Tensor, Tensor] | None = None,
 ) -> Evaluation:
     """Start frames simulated to the end with the deterministic policy, and the score card.
 
@@ -180,33 +145,13 @@ def evaluate(
         help_limit: N and N m; by default what training has left of it (`meta["help_limit"]`).
         most: no more than so many start frames, evenly spread; None takes all.
         device: "cpu" or "cuda".
+        starts: clips and start frames `(E,)`, in place of `most` of all.
     """
-    if isinstance(policy, PolicyBundle):
-        policy = policy.copy().to(device)
-    limit, scale = help_left(imitation, meta, help_limit)
-    clip, start = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
-    rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device),
-        policy,
-        clip,
-        start,
-        limit,
-        limit,
-    )
-    card = _score(rollouts, imitation, meta, rule)
-    return Evaluation(card, rollouts, recordings)
-
-
-def episode(
-    imitation: Imitation, policy: Policy, meta: Mapping[str, Any], clip: int = 0, frame: int = 0
-) -> Evaluation:
-    """One episode of a clip from one of its control frames as an evaluation of its own."""
-    limit, scale = help_left(imitation, meta)
-    rollouts, recordings = run_episodes(
-        lambda n: imitation.env(n, auto_reset=False, help_scale=scale),
-        policy, torch.tensor([clip]), torch.tensor([frame]), limit, limit,
-    )  # fmt: skip
-    return Evaluation(_score(rollouts, imitation, meta, "phc"), rollouts, recordings)
+    make, limit = _worlds(imitation, meta, help_limit, device)
+    if starts is None:
+        starts = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
+    rollouts, recordings = run_episodes(make, _on(policy, device), *starts, limit)
+    return Evaluation(scored(rollouts, imitation, meta, rule), rollouts, recordings)
 
 
 def score(
@@ -218,24 +163,37 @@ def score(
     device: str = "cpu",
 ) -> ScoreCard:
     """The score card of `evaluate`, without all frames of a large library in memory at once."""
-    if isinstance(policy, PolicyBundle):
-        policy = policy.copy().to(device)
-    limit, scale = help_left(imitation, meta, help_limit)
-    clip, start = start_frames(imitation.reference)
-    parts = run_in_batches(
-        lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device),
-        policy, imitation.reference, clip, start, limit, limit,
-    )  # fmt: skip
-    return _score(parts, imitation, meta, rule)
+    make, limit = _worlds(imitation, meta, help_limit, device)
+    starts = start_frames(imitation.reference)
+    parts = run_in_batches(make, _on(policy, device), imitation.reference, *starts, limit)
+    return scored(parts, imitation, meta, rule)
 
 
-def _score(
-    rollouts: RolloutSet | Iterable[RolloutSet], imitation: Imitation, meta: Mapping[str, Any], rule: str
+def _worlds(
+    imitation: Imitation, meta: Mapping[str, Any], asked: float | None, device: str
+) -> tuple[Callable[[int], ImitationEnv], float]:
+    """How environments of N worlds are made, and the limit of their help, N and N m."""
+    limit, scale = help_left(imitation, meta, asked)
+    return lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device), limit
+
+
+def _on(policy: Policy, device: str) -> Policy:
+    return policy.copy().to(device) if isinstance(policy, PolicyBundle) else policy
+
+
+def scored(
+    rollouts: RolloutSet | Iterable[RolloutSet],
+    imitation: Imitation,
+    meta: Mapping[str, Any],
+    rule: str,
+    method: str = "",
 ) -> ScoreCard:
+    """The score card of episodes of a task. meta: what the training of the policy took. method: what was
+    tried, by default the recipe's."""
     return score_rollouts(
         rollouts,
         rule=rule,
-        method=imitation.config.method,
+        method=method or imitation.config.method,
         seconds=float(meta.get("seconds", 0.0)),
         samples=int(meta.get("samples", 0)),
         seed=imitation.config.seed,

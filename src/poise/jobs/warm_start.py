@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from poise.eval import ScoreCard, record, score_rollouts, start_frames
+from poise.eval import ScoreCard, run_episodes, score_rollouts, start_frames
 from poise.learn import (
     LATEST,
     CloneConfig,
@@ -72,7 +71,13 @@ def start_training(
     the CPU, whatever the `device` that PPO then uses.
     """
     tell = tell or TrainingCallbacks()
-    make = partial(_trainer, imitation, threads, folder / "dumps", comm, device)
+
+    def make(start: WarmStart | None, warm: bool) -> Trainer:
+        ppo = finetuning(imitation.ppo()) if warm else None
+        how: dict[str, Any] = {"start": "expert"} if warm else {}
+        with together(comm):
+            return imitation.trainer(threads, folder / "dumps", comm, start, ppo, device, **how)
+
     if (folder / LATEST).exists():
         warm = (
             load_checkpoint(folder / LATEST, PolicyMeta)[1].get("metadata", {}).get("start") == "expert"
@@ -140,10 +145,7 @@ def score_expert(imitation: Imitation, plan: Plan | None = None) -> ScoreCard:
     clip, frame = some_starts(imitation)
     limit = imitation.task.residual.limit_n if imitation.task.residual else 0.0
     env = imitation.env(len(clip), auto_reset=False)
-    try:
-        rollouts, _ = record(env, Expert(env, plan=plan), clip, frame, limit, limit)
-    finally:
-        env.close()
+    rollouts, _ = run_episodes(lambda _: env, Expert(env, plan=plan), clip, frame, limit)
     return score_rollouts(rollouts, method="expert", seed=imitation.config.seed)
 
 
@@ -157,18 +159,3 @@ def some_starts(imitation: Imitation, most: int = FIRST_STARTS) -> tuple[Tensor,
 def finetuning(ppo: PPOConfig) -> PPOConfig:
     """The same settings for a policy that is good already: small steps, the critic first."""
     return replace(ppo, policy_lr=min(ppo.policy_lr, 1e-4), critic_warmup=max(ppo.critic_warmup, 2))
-
-
-def _trainer(
-    imitation: Imitation,
-    threads: int,
-    dumps: Path,
-    comm: Comm,
-    device: str,
-    start: WarmStart | None,
-    warm: bool,
-) -> Trainer:
-    ppo = finetuning(imitation.ppo()) if warm else None
-    how: dict[str, Any] = {"start": "expert"} if warm else {}
-    with together(comm):
-        return imitation.trainer(threads, dumps, comm, start, ppo, device, **how)

@@ -12,10 +12,10 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from poise.errors import PoiseError
 
@@ -36,27 +36,6 @@ class Ended(NamedTuple):
     """Its exit code; below 0 the signal that killed it."""
     said: str
     """Its error in one sentence, or an empty text."""
-
-
-class Workers(Protocol):
-    """What a fleet asks of the workers that run its jobs."""
-
-    slots: int
-    """Jobs at the same time."""
-    threads: int
-    """Cores of each job."""
-
-    def start(self, name: str, command: Sequence[str], log: Path) -> int | None:
-        """Runs Python with the arguments `command`; gives the process id if it is on this machine."""
-        ...
-
-    def ended(self) -> list[Ended]:
-        """The jobs that ended since the last call; waits a moment if there are none."""
-        ...
-
-    def stop(self) -> None:
-        """Asks the running jobs to save and end, and waits until they have."""
-        ...
 
 
 def prepare_child() -> Callable[[], None] | None:
@@ -124,18 +103,28 @@ def error_in(log: Path, code: int) -> str:
 
 
 class LocalWorkers:
-    """Processes on this machine, which share its cores."""
+    """Processes on this machine, which share its cores.
+
+    Attributes:
+        kind: what the table of results says of them.
+        slots: jobs at the same time.
+        threads: cores of each job.
+    """
+
+    kind = "this machine"
 
     def __init__(self, slots: int, threads: int):
         self.slots, self.threads = slots, threads
         self._running: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
 
     def start(self, name: str, command: Sequence[str], log: Path) -> int | None:
+        """Runs Python with the arguments `command`; gives the process id if it is on this machine."""
         process = launch(command, log)
         self._running[name] = (process, log)
         return process.pid
 
     def ended(self) -> list[Ended]:
+        """The jobs that ended since the last call; waits a moment if there are none."""
         over = [(n, p, log) for n, (p, log) in self._running.items() if p.poll() is not None]
         for name, _, _ in over:
             del self._running[name]
@@ -144,6 +133,7 @@ class LocalWorkers:
         return [Ended(n, p.returncode, error_in(log, p.returncode)) for n, p, log in over]
 
     def stop(self) -> None:
+        """Asks the running jobs to save and end, and waits until they have."""
         running, self._running = [p for p, _ in self._running.values()], {}
         ask_to_stop(running)
 
@@ -160,7 +150,7 @@ def run_in_ray(command: Sequence[str], log: str) -> tuple[int, str]:
 
 
 class RayWorkers:
-    """The workers of a Ray cluster, which must see the same folders as this machine.
+    """The workers of a Ray cluster, which must see the same folders as this machine; see `LocalWorkers`.
 
     Args:
         address: HOST:PORT or ray://HOST:PORT of a cluster, `auto` for the one that this machine
@@ -168,6 +158,8 @@ class RayWorkers:
         slots: jobs at the same time; 0 for one on each core.
         most: no more slots than jobs are needed.
     """
+
+    kind = "ray"
 
     def __init__(self, address: str, slots: int, most: int):
         self._ray = ray = _import_ray()
@@ -208,6 +200,9 @@ class RayWorkers:
         finally:
             self._running = {}
             self._ray.shutdown()
+
+
+Workers = LocalWorkers | RayWorkers
 
 
 def make_workers(address: str | None, slots: int, jobs: int, cores: int) -> Workers:
@@ -264,9 +259,3 @@ def _no_answer(address: str, reason: str) -> PoiseError:
         "--address out to use this machine alone"
     )
     return PoiseError(f"does not answer ({reason.rstrip('.')})", where, hint)
-
-
-def describe(workers: Workers) -> Mapping[str, Any]:
-    """What the table of results says about the workers."""
-    kind = "this machine" if isinstance(workers, LocalWorkers) else "ray"
-    return {"workers": kind, "jobs_at_once": workers.slots, "threads": workers.threads}

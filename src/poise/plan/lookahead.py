@@ -9,9 +9,9 @@ the policy plus an offset of its own, is simulated some steps ahead, and costs
 
     c = - sum_h gamma^h r_h - gamma^H V(o_H) + prices,
 
-with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`). What the
-best of them began with is done. Nothing is trained, nothing helps, and the goal is seen no farther than it
-tells: a clip its frames, a stream or a generator what it knows.
+with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`). What
+the best of them began with is done. Nothing is trained, nothing helps, and the goal is seen no farther
+than it tells: a clip its frames, a stream or a generator what it knows.
 """
 
 from __future__ import annotations

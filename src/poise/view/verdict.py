@@ -67,7 +67,7 @@ THRESHOLDS: dict[str, tuple[float, float]] = {
     "share_of_body_weight": (0.02, 0.10),
     "torque_mean_nm": (5.0, 25.0),
 }
-"""(good, fair) bounds; the score card's own (`eval.verdicts`) are the same, and a test says so."""
+"""(good, fair) bounds; the score card's own (`eval.card`) are the same, and a test says so."""
 
 
 def tracking(score: dict[str, Any]) -> Grade:

@@ -12,7 +12,8 @@ from typing import Any
 import torch
 
 from poise.errors import PoiseError
-from poise.jobs.library import LibraryConfig, library_of
+from poise.jobs.library.clips import LibraryConfig
+from poise.jobs.library.folder import library_of
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip
 from poise.motion.io import read_clip

@@ -26,7 +26,7 @@ import torch
 from poise.errors import PoiseError
 from poise.eval.inbetween import LAFAN1, Protocol, TestSet, deviation, evaluate, test_set
 from poise.jobs.inbetween.data import library_bank
-from poise.jobs.library import LibraryConfig
+from poise.jobs.library.clips import LibraryConfig
 from poise.kin.feet.contact import standing_labels
 from poise.learn.between import BetweenObjective, BetweenTraining
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint

@@ -14,8 +14,18 @@ from typing import NamedTuple
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.jobs.library.clips import LibraryConfig, Target, place, read_all, shape_of, target_of
+from poise.jobs.library.clips import (
+    LibraryConfig,
+    Target,
+    place,
+    read_all,
+    set_down,
+    shape_of,
+    target_of,
+)
 from poise.jobs.library.files import (
+    BACKWARDS,
+    MIRRORED,
     MotionFile,
     check_patterns,
     content_key,
@@ -23,13 +33,12 @@ from poise.jobs.library.files import (
     motion_files_of,
     subject_of,
 )
-from poise.jobs.library.images import images
-from poise.jobs.library.report import ClipNote, LibraryReport
+from poise.jobs.library.report import LibraryReport
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip, ClipLibrary, Skeleton
+from poise.motion.edits import backwards
+from poise.motion.mirror import mirrored_clip
 from poise.motion.pack import pack_clips, unpack_clips
-
-__all__ = ["ClipNote", "LibraryConfig", "LibraryReport", "Split", "library_of", "split"]
 
 #: Grows whenever the same files and settings would give other clips.
 VERSION = 3
@@ -159,3 +168,27 @@ def _key(
         skeleton = onto if isinstance(onto, Skeleton) else onto.skeleton
         settings.append([skeleton.names, skeleton.parents, skeleton.offsets.tolist(), skeleton.ends])
     return content_key(whole, settings)
+
+
+def images(clip: Clip, target: Target, config: LibraryConfig) -> list[Clip]:
+    """A placed clip, and as what else the library takes it.
+
+    Raises:
+        PoiseError: no joint's name tells a side.
+    """
+    both = [clip, mirror_image(clip, target, config)] if config.mirror else [clip]
+    if matches(config.backwards, clip.name, subject_of(clip.name)):
+        both += [backwards(c).replaced(name=c.name + BACKWARDS) for c in both]
+    return both
+
+
+def mirror_image(clip: Clip, target: Target, config: LibraryConfig) -> Clip:
+    """A placed clip in a mirror, on the target again: its sides differ a little in bones and soles.
+
+    Raises:
+        PoiseError: no joint's name tells a side.
+    """
+    seen = mirrored_clip(clip)
+    example = None if target.example is None else mirrored_clip(target.example)
+    seen, _ = set_down(seen, example, target, config)
+    return seen.replaced(skeleton=clip.skeleton, name=clip.name + MIRRORED, cyclic=clip.cyclic)

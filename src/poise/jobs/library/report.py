@@ -81,8 +81,8 @@ class LibraryReport:
         """The performers of the library, in order."""
         return tuple(sorted({c.subject for c in self.clips if c.state != "left out"}))
 
-    def sentences(self, every: bool = False) -> list[str]:
-        """The report in words; with `every` also a line for each clip that was taken whole."""
+    def sentences(self) -> list[str]:
+        """The report in words, with a line for each clip that was not taken whole."""
         kept = [c for c in self.clips if c.state != "left out"]
         seconds = sum(c.kept_s[1] - c.kept_s[0] for c in kept)
         out = [
@@ -100,7 +100,7 @@ class LibraryReport:
         repaired = sum(bool(c.repairs) for c in kept)
         if repaired:
             out.append(f"{repaired} had impossible speeds or flipped joints, which were repaired.")
-        return out + [c.sentence() for c in self.clips if every or c.state != "kept"]
+        return out + [c.sentence() for c in self.clips if c.state != "kept"]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""

@@ -6,10 +6,9 @@ import json
 from dataclasses import dataclass
 
 from poise.eval import ClipResults, RecoveryCard
-from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips
-from poise.jobs.perpetual.progress import Progress
-from poise.jobs.perpetual.recovery import try_recovery
+from poise.jobs.perpetual.evaluation import FINAL_STAGE, evaluate_clips, try_recovery
 from poise.jobs.perpetual.stage_initialisation import staged
+from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL
 from poise.learn.checkpoint import write_atomic

@@ -11,45 +11,37 @@ run/
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.jobs.library.clips import Target
-from poise.jobs.library.folder import LibraryConfig, library_of, split
-from poise.jobs.perpetual.progress import Progress, Stage
+from poise.jobs.library.clips import LibraryConfig, Target
+from poise.jobs.library.folder import library_of, split
 from poise.jobs.perpetual.result import RESULT, PerpetualResult, finish
+from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, read_run, write_run
+from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, write_run
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
 from poise.learn.run import interruptible
 from poise.learn.schema import PolicyMeta
 from poise.learn.state import prefixed
 from poise.motion import ClipLibrary
-from poise.motion.pack import pack_clips
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import WIDE, config_of
 from poise.recipes.perpetual.task import RECIPE, Perpetual, build, task
 from poise.settings import to_data
 
+if TYPE_CHECKING:
+    from poise.jobs.tracker import Tracker
+
 #: Where a run file holds what its library knows of coming back.
 WAYS = "ways"
 #: Least step size where a policy that is done learns to come back.
 ANEW = 1e-4
-
-
-@dataclass(frozen=True)
-class Earlier:
-    """What a policy has cost that a run goes on from, and the body it moves (`Tracker.target`)."""
-
-    samples: int
-    seconds: float
-    target: Target
 
 
 def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
@@ -120,13 +112,13 @@ def begin(
     config: Perpetual,
     source: str = "",
     device: str = "cpu",
-    earlier: Earlier | None = None,
+    earlier: Tracker | None = None,
 ) -> Imitation:
     """Builds the task and writes the run file; a folder that holds another run is refused.
 
     Args:
         source: where the clips are from, by which `resume` knows them.
-        earlier: the training that the run goes on from; a single clip will do for that.
+        earlier: the policy that the run goes on from; a single clip will do for that.
 
     Raises:
         PoiseError: a single clip, another run in the folder, a library on another skeleton than the
@@ -137,16 +129,9 @@ def begin(
             f"a library needs at least 2 clips, and there is only '{library.names[0]}'",
             hint="Use poise imitate for a single clip",
         )
-    said, held = to_data(config), (folder / RUN_FILE).exists()
+    held = (folder / RUN_FILE).exists()
     if held:
-        found = _checked(folder, said, source).meta["clips"]
-        notes = json.loads(json.dumps(pack_clips(library.clips)[1]))
-        if found != notes:
-            raise PoiseError(
-                f"the folder holds a run of other clips ({len(found)}, here {len(notes)})",
-                folder,
-                "Give the library it was begun with, or choose another folder",
-            )
+        held_run(folder, RECIPE["name"], config, config_of, library, source)
     table = None
     if earlier is not None:
         table = earlier.target.table
@@ -158,10 +143,10 @@ def begin(
     imitation = build(library, config, table)
     imitation.check_memory(config.num_envs, device)
     if not held:
-        meta = {"recipe": RECIPE["name"], "config": said, "source": source}
+        meta = {"recipe": RECIPE["name"], "config": to_data(config), "source": source}
         meta |= body_facts(imitation.humanoid, imitation.library.names)
         if earlier is not None:
-            meta["earlier"] = {"samples": earlier.samples, "seconds": earlier.seconds}
+            meta["earlier"] = {name: earlier.about[name] for name in ("samples", "seconds")}
             meta["table"] = earlier.target.table.to_dict()
         known = imitation.recovery_clips
         write_run(folder, library, meta, {} if known is None else prefixed(WAYS, known.state()))
@@ -174,33 +159,9 @@ def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu
     Raises:
         PoiseError: other settings, another source of clips, or another recipe.
     """
-    imitation = _rebuilt(_checked(folder, to_data(config), source))
+    imitation = _rebuilt(held_run(folder, RECIPE["name"], config, config_of, source=source))
     imitation.check_memory(config.num_envs, device)
     return imitation
-
-
-def _checked(folder: Path, config: dict[str, Any], source: str) -> RunFile:
-    """The run file, unless it is that of another run."""
-    file = read_run(folder)
-    if file.recipe != RECIPE["name"]:
-        raise PoiseError("the folder holds a run of another recipe", folder, "Choose another folder")
-    # As this version reads it, so that a run of an older one is compared in what it knew, too.
-    found = to_data(config_of(file.meta["config"], file.path))
-    # How long the expert was cloned is over and done; a run keeps its own.
-    names = sorted(k for k in config if k != "clone" and config[k] != found[k])
-    if names:
-        raise PoiseError(
-            f"the folder holds a run with other settings ({', '.join(names)})",
-            folder,
-            "Resume it as it is or choose another folder",
-        )
-    if file.meta.get("source", "") != source:
-        raise PoiseError(
-            f"the folder holds a run on the library {file.meta.get('source') or 'of a program'}",
-            folder,
-            "Give that library, or choose another folder",
-        )
-    return file
 
 
 def reopen(file: RunFile) -> Imitation:

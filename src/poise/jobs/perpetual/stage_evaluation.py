@@ -8,10 +8,9 @@ from torch import Tensor
 
 from poise.eval import ClipResults, RecoveryCard
 from poise.eval.recovery import KINDS
-from poise.jobs.perpetual.evaluation import History, evaluate_clips
-from poise.jobs.perpetual.progress import Stage
-from poise.jobs.perpetual.recovery import back, try_recovery
+from poise.jobs.perpetual.evaluation import History, back, evaluate_clips, try_recovery
 from poise.jobs.perpetual.stage_initialisation import staged
+from poise.jobs.perpetual.stage_order import Stage
 from poise.jobs.perpetual.stage_record import StageRecord, mean_help
 from poise.learn import Decision, PolicyBundle
 from poise.recipes.imitation import Imitation

@@ -11,11 +11,8 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.env.recovery.clock import RecoveryClock
-from poise.jobs.perpetual.cloning import clone_for
-from poise.jobs.perpetual.demonstrations import odds, practised
-from poise.jobs.perpetual.progress import Stage
-from poise.jobs.perpetual.stage_order import first_recovers, first_stage, own_recovery
-from poise.jobs.perpetual.trajectories import find_paths
+from poise.jobs.perpetual.demonstrations import clone_for, find_paths, odds, practised
+from poise.jobs.perpetual.stage_order import Stage, first_recovers, first_stage, following, own_recovery
 from poise.jobs.warm_start import CLONE_WORLDS, TrainingCallbacks, clone_expert, finetuning
 from poise.learn import (
     CloneConfig,
@@ -39,8 +36,6 @@ from poise.sim import UnstableError
 
 #: The folder in a run folder with worlds that went bad.
 DUMPS = "dumps"
-#: What follows a policy that training goes on from, where recovery is learned by primitives or not.
-SECOND = {"primitive": Stage("recovery", 2), "single": Stage("single", 2, mixed=True)}
 
 
 def begin_first(
@@ -66,13 +61,15 @@ def begin_first(
         start = WarmStart(trained.first_actions(env.num_actions).clipped(own.ppo().obs_clip))
         if not config.recovery:
             return stage, start
+        second = following(config, stage, fails=False)
+        assert second is not None
         if stage.kind == "single":
-            return SECOND[stage.kind], start
+            return second, start
         # What is trained already is the first primitive.
         known = replace(start, policy=columns_of(start.policy, config.lateral))
         if first_recovers(config):
             return stage, known
-        return SECOND[stage.kind], begin_recovery(known, imitation, 2)
+        return second, begin_primitive(known, imitation, second)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None
     start = None
@@ -125,10 +122,8 @@ def begin_stage(
     """
     if stage.kind == "composer":
         return begin_composer(before, imitation, stage, owner, threads, dumps, tell)
-    if stage.kind == "recovery":
-        return begin_recovery(before, imitation, stage.number)
-    if stage.kind == "primitive":
-        return begin_primitive(before, imitation.config, stage.number)
+    if stage.kind in ("primitive", "recovery"):
+        return begin_primitive(before, imitation, stage)
     return before
 
 
@@ -139,18 +134,14 @@ def members_of(stage: Stage, hard: Tensor, imitation: Imitation) -> Tensor:
     return hard if stage.kind == "primitive" else torch.ones_like(hard)
 
 
-def begin_primitive(before: WarmStart, config: Perpetual, number: int) -> WarmStart:
-    """One primitive more; the critic goes on, as in the paper."""
-    rng = make_generator(config.seed, f"primitive {number}")
-    return replace(before, policy=next_column(before.policy, config.start, generator=rng))
-
-
-def begin_recovery(before: WarmStart, imitation: Imitation, number: int) -> WarmStart:
-    """The recovery primitive: a copy of the one before it where it tracks recovery motions, else as any
-    primitive."""
+def begin_primitive(before: WarmStart, imitation: Imitation, stage: Stage) -> WarmStart:
+    """One primitive more; the critic goes on, as in the paper. One that recovers is a copy of the one
+    before it where that tracks recovery motions."""
     config: Perpetual = imitation.config
-    config = config if imitation.recovery_clips is None else replace(config, start="copy")
-    return begin_primitive(before, config, number)
+    copied = stage.kind == "recovery" and imitation.recovery_clips is not None
+    rng = make_generator(config.seed, f"primitive {stage.number}")
+    start = "copy" if copied else config.start
+    return replace(before, policy=next_column(before.policy, start, generator=rng))
 
 
 def begin_composer(
@@ -207,11 +198,9 @@ class Owners:
     def __init__(self, env: ImitationEnv, policy: PolicyBundle, owner: Tensor, own: bool = True):
         assert isinstance(policy.policy, Composer)
         self.env, self.norm, self.primitives = env, policy.norm, policy.policy.primitives
-        recovery_clips, self.recovers = (
-            len(env.reference.length) - len(owner),
-            own * (len(self.primitives) - 1),
-        )
-        self.owner = torch.cat((owner, owner.new_full((recovery_clips,), self.recovers))).to(env.device)
+        self.recovers = own * (len(self.primitives) - 1)
+        motions = owner.new_full((len(env.reference.length) - len(owner),), self.recovers)
+        self.owner = torch.cat((owner, motions)).to(env.device)
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -248,7 +237,8 @@ def staged(imitation: Imitation, stage: Stage) -> Imitation:
         imitation.config, imitation.humanoid, None if imitation.recovery_clips else stage.recovers
     )
     own = replace(imitation, task=task)
-    return unhelped(own) if stage.kind == "composer" or stage.recovers else own
+    helped = stage.kind != "composer" and not stage.recovers
+    return own if helped else replace(own, task=replace(task, help=None))
 
 
 def clone_config(imitation: Imitation) -> CloneConfig:
@@ -258,11 +248,6 @@ def clone_config(imitation: Imitation) -> CloneConfig:
     return config.clone or clone_for(
         int(imitation.reference.length.sum()), worlds, config.trajopt is not None
     )
-
-
-def unhelped(imitation: Imitation) -> Imitation:
-    """The same task, where no success or failure changes the help."""
-    return replace(imitation, task=replace(imitation.task, help=None))
 
 
 def critic_of(trainer: Trainer) -> State:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.eval import ClipResults, RecoveryCard
-from poise.jobs.perpetual.recovery import back
+from poise.jobs.perpetual.evaluation import back
 from poise.learn import Convergence, Decision, HardNegatives, PolicyBundle
 from poise.learn.state import State, prefixed, take, under
 from poise.recipes.perpetual.config import Perpetual

@@ -1,9 +1,9 @@
 """The stage machine: a library's training goes from stage to stage all by itself.
 
-Which stage follows which is said by `plan`, when one ends by `judge`, how one begins
-by `next`. A checkpoint is the whole machine between two iterations; a new stage replaces the
-checkpoint of the last one in one step, so that a run that was killed anywhere goes on as if nothing had
-happened.
+Which stage follows which is said by `stage_order`, when one ends by `stage_evaluation`, how one begins
+by `stage_initialisation`. A checkpoint is the whole machine between two iterations; a new stage
+replaces the checkpoint of the last one in one step, so that a run that was killed anywhere goes on as if
+nothing had happened.
 """
 
 from __future__ import annotations
@@ -18,10 +18,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv
 from poise.jobs.perpetual.demonstrations import odds
-from poise.jobs.perpetual.divergence import DivergenceRetry
-from poise.jobs.perpetual.evaluation import History
-from poise.jobs.perpetual.progress import Progress, Stage, share_of
-from poise.jobs.perpetual.recovery import check_falls
+from poise.jobs.perpetual.evaluation import History, check_falls
 from poise.jobs.perpetual.stage_evaluation import Judge, Judged
 from poise.jobs.perpetual.stage_initialisation import (
     DUMPS,
@@ -32,6 +29,8 @@ from poise.jobs.perpetual.stage_initialisation import (
     members_of,
 )
 from poise.jobs.perpetual.stage_order import (
+    Progress,
+    Stage,
     ends,
     first_recovers,
     following,
@@ -39,12 +38,14 @@ from poise.jobs.perpetual.stage_order import (
     lasts,
     most_help,
     primitives,
+    share_of,
 )
 from poise.jobs.perpetual.stage_record import StageRecord
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import (
     LATEST,
     Amp,
+    IterationStats,
     Log,
     PolicyBundle,
     Trainer,
@@ -57,9 +58,12 @@ from poise.learn.checkpoint import remove_partial
 from poise.learn.state import make_generator, prefixed, under
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.task import Perpetual
+from poise.sim import UnstableError
 
 #: What is left of the policy's step size at the end of a stage that cools.
 COLD = 0.1
+#: Simulations that may go bad between two evaluations.
+MOST_TROUBLES = 5
 
 
 class StageTrainer:
@@ -89,7 +93,8 @@ class StageTrainer:
         self.dumps, self.tell = folder / DUMPS, tell or TrainingCallbacks()
         self.stage_record = StageRecord(self.config, imitation.reference.length)
         self.finished, self.before, self.begun = False, 0, (0, 0.0)
-        self.troubles = DivergenceRetry()
+        # How often a simulation went bad in all, and since the last evaluation.
+        self.troubles = [0, 0]
         if (folder / LATEST).exists():
             self._load()
             remove_partial(folder)
@@ -173,7 +178,7 @@ class StageTrainer:
         stage, judged, follows = self.stage, None, None
         self._limit_help()
         self._cool()
-        stats, trouble = self.troubles.iterate(self.trainer, self._go_back)
+        stats, trouble = self._iterated()
         self._limit_help()
         iteration, share, help_n = self.iteration, self.share, self.help * self.config.help_start
         row = stats.row() | {"iteration": iteration, "stage": stage.number}
@@ -182,7 +187,7 @@ class StageTrainer:
         over = share >= ends(self.config, stage, self.began)
         if over or self.trainer.iteration % every == 0:
             judged = self._judge(over)
-            self.troubles.lately = 0
+            self.troubles[1] = 0
             seen = self.stage_record.seen
             row |= judged.row()
             if is_over(self.config, stage, judged.decision, share):
@@ -194,8 +199,26 @@ class StageTrainer:
         shown = (help_n, results, card, follows, trouble)
         return Progress(stage, iteration, stats, share, *seen, *shown)
 
+    def _iterated(self) -> tuple[IterationStats, str]:
+        """One iteration, and what went wrong before it: training goes on where a simulation goes bad, as
+        one world in millions of steps may do.
+
+        Raises:
+            UnstableError: it happens again and again.
+        """
+        trouble = ""
+        while True:
+            try:
+                return self.trainer.iterate(), trouble
+            except UnstableError as problem:
+                if self.troubles[1] >= MOST_TROUBLES:
+                    raise
+                trouble = str(problem)
+                self.troubles = [n + 1 for n in self.troubles]
+                self._go_back(self.troubles[0])
+
     def _go_back(self, trouble: int) -> None:
-        """To the last checkpoint, and on with other draws."""
+        """To the last checkpoint, and on with other draws, since the same ones would end there again."""
         self.trainer.load(self.folder / LATEST)
         self.log.close()
         self.log = Log(self.folder, self.iteration, self.tensorboard)
@@ -278,7 +301,7 @@ class StageTrainer:
         self.log.flush()
         self.trainer.metadata["course"] = {
             "stage": asdict(self.stage), "warm": self.warm, "before": self.before,
-            "begun": list(self.begun), "troubles": [self.troubles.total, self.troubles.lately],
+            "begun": list(self.begun), "troubles": self.troubles,
             "finished": self.finished, "ledger": self.stage_record.facts(),
         }  # fmt: skip
         self.trainer.save(self.folder / LATEST, prefixed("ledger", self.stage_record.state()))
@@ -291,7 +314,7 @@ class StageTrainer:
         self.stage_record.load(under("ledger", tensors), said["ledger"])
         samples, seconds = said["begun"]
         self.before, self.begun, self.finished = said["before"], (samples, seconds), said["finished"]
-        self.troubles = DivergenceRetry(*said["troubles"])
+        self.troubles = list(said["troubles"])
         # A trainer takes the sizes and the action noise from the policy it starts with.
         start = WarmStart(load_policy(path))
         self._enter(Stage(**said["stage"]), start, said["warm"], 1.0)

@@ -4,7 +4,6 @@ from poise.jobs.track.tracked import Clean, Tracked, write
 from poise.jobs.track.tracking import (
     Keeper,
     TrackConfig,
-    check_fits,
     imitation_of,
     side_by_side,
     track,
@@ -15,7 +14,6 @@ __all__ = [
     "Keeper",
     "TrackConfig",
     "Tracked",
-    "check_fits",
     "imitation_of",
     "side_by_side",
     "track",

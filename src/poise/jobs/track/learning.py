@@ -1,6 +1,6 @@
 """A policy goes on to learn the one motion that it loses.
 
-    tracked = track(tracker, clip)
+    tracked = track(clip, tracker)
     if tracked.failures:
         tracker = learn(tracker, tracked.placed, Path("out/learned"), minutes=10)
 
@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from poise.env import Reference
-from poise.jobs.perpetual.progress import Progress
 from poise.jobs.perpetual.result import PerpetualResult
-from poise.jobs.perpetual.run import Earlier, begin, going_on, train
+from poise.jobs.perpetual.run import begin, going_on, train
+from poise.jobs.perpetual.stage_order import Progress
+from poise.jobs.run_file import read_run
 from poise.jobs.track.placement import Placed, place
-from poise.jobs.track.policy import Tracker, tracker_of
+from poise.jobs.tracker import Tracker, policy_of_run
 from poise.kin.doctor.clean import clean_clip
 from poise.learn import Until
 from poise.motion import ClipLibrary
@@ -67,9 +68,8 @@ def learn(
         PoiseError: a policy of primitives, which cannot go on, or a folder with another run.
     """
     clip = placed.level.onto(clean_clip(placed.clip)[0]).replaced(cyclic=False)
-    earlier = Earlier(tracker.about["samples"], tracker.about["seconds"], tracker.target)
     config = settings(tracker.config, seed)
-    imitation = begin(folder, ClipLibrary.of(clip), config, clip.name, earlier=earlier)
+    imitation = begin(folder, ClipLibrary.of(clip), config, clip.name, earlier=tracker)
     # Exactly what `track` will ask of the policy, on the same body.
     body, rate = imitation.humanoid, config.sim.control_hz
     qpos = place(placed.source, replace(tracker, humanoid=body)).qpos
@@ -78,4 +78,5 @@ def learn(
         imitation, folder, Until(minutes=minutes), on_iteration, threads, False, trained=tracker.policy
     )
     # It tracks its recovery motions as before, or nearly.
-    return Learned(replace(tracker_of(folder, imitation), recovery_clips=tracker.recovery_clips), result)
+    learned = replace(policy_of_run(read_run(folder)), recovery_clips=tracker.recovery_clips)
+    return Learned(learned, result)

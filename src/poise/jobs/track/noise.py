@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.track.policy import Tracker
 from poise.jobs.track.tracking import TrackConfig, track
+from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
@@ -33,6 +33,7 @@ from poise.motion.noise import (
     robustness_levels,
     scaled,
 )
+from poise.settings import plain
 from poise.view.svg import line_plot
 
 #: What noise may be called; "video" and "triangulated" are everything that goes wrong with one camera,
@@ -114,12 +115,8 @@ class Robustness:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; what was not measured is None."""
-        rungs = [
-            {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(r).items()}
-            for r in self.rungs
-        ]
         refused = [dict(zip(("level", "motion", "why"), r, strict=True)) for r in self.refused]
-        return {"rungs": rungs, "refused": refused}
+        return {"rungs": plain(self.rungs), "refused": refused}
 
 
 def robustness(
@@ -127,7 +124,6 @@ def robustness(
     motions: Sequence[Clip | Keypoints],
     levels: Sequence[Level] | None = None,
     seed: int = 0,
-    threads: int = 1,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Robustness:
     """Every motion tracked at every level of noise, once; the noise of a motion is that of its name.
@@ -147,7 +143,7 @@ def robustness(
         rows: list[tuple[float, ...]] = []
         for motion in motions:
             try:
-                rows.append(_row(tracker, motion, TrackConfig(level.noise, seed, threads=threads)))
+                rows.append(_row(tracker, motion, TrackConfig(level.noise, seed)))
             except PoiseError as problem:
                 if level.strength == 0:
                     raise
@@ -178,7 +174,7 @@ def write_robustness(result: Robustness, folder: Path) -> dict[str, Path]:
 
 def _row(tracker: Tracker, motion: Clip | Keypoints, config: TrackConfig) -> tuple[float, ...]:
     """Success, success without noise, errors and share of one motion, in the order of `Rung`."""
-    done = track(tracker, motion, config)
+    done = track(motion, tracker, config)
     card, clean = done.evaluation.card, done.clean
     seconds = (int(done.imitation.reference.length[0]) - 1) / done.imitation.reference.rate_hz
     tracked = done.failed_s[0] / seconds if done.failed_s else 1.0

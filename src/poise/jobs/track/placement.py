@@ -16,7 +16,7 @@ from poise.kin.ground import clip_flights
 from poise.motion import Clip
 
 if TYPE_CHECKING:
-    from poise.jobs.track.policy import Tracker
+    from poise.jobs.tracker import Tracker
 
 #: Angles (rad) beyond a joint's range that are worth a sentence.
 BEYOND = math.radians(1.0)

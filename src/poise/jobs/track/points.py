@@ -14,7 +14,7 @@ from torch import Tensor
 from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.track.placement import Placed
-from poise.jobs.track.policy import Tracker
+from poise.jobs.tracker import Tracker
 from poise.kin.retarget.keypoint_body import PointBody
 from poise.kin.retarget.keypoint_stream import KeypointStream, StreamConfig
 from poise.motion import Clip

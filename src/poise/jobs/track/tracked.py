@@ -12,8 +12,8 @@ from poise.jobs.deliver import Delivery, deliver, finished, simulated_clip
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
 from poise.jobs.track.placement import Placed, home
-from poise.jobs.track.policy import Tracker
 from poise.jobs.track.recovering import Losses
+from poise.jobs.tracker import Tracker
 from poise.kin import hold_feet
 from poise.motion import Clip
 from poise.motion.io import home_suffix, write_clip

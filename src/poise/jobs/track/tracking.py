@@ -1,9 +1,15 @@
-"""A trained controller tracks any motion: no training, no help, one episode from its first frame."""
+"""A trained controller tracks any motion: no training, no help, one episode from its first frame.
+
+tracked = track("kick.bvh", search=True)
+tracked.card, tracked.clip, tracked.save("out")
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,25 +18,27 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
-from poise.eval import record, score_rollouts
-from poise.eval.judged import judge
+from poise.eval import run_episodes
+from poise.eval.rolloutset import judge
+from poise.jobs.open import Run, open_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.runs import Evaluation
+from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track.crowd import Crowd, places
 from poise.jobs.track.placement import Placed, place
-from poise.jobs.track.points import fitted, follow
-from poise.jobs.track.policy import Tracker
-from poise.jobs.track.recovering import with_returns
-from poise.jobs.track.searching import replay, search, sentence
+from poise.jobs.track.points import fitted, follow, points_of
+from poise.jobs.track.recovering import look_for, replay, sentence, with_returns
 from poise.jobs.track.tracked import Clean, Tracked
+from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
 from poise.metrics import mpjpe_global, success_rule
-from poise.motion import Clip, ClipLibrary
+from poise.motion import Clip, ClipLibrary, read_clip
+from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Noise, perturb_clip, perturb_points
 from poise.plan import SamplingConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
+from poise.settings import changed
 
 #: Characters in one world.
 MOST = 64
@@ -50,8 +58,7 @@ class TrackConfig:
         smooth_hz: cut-off of a low-pass on keypoints.
         count: characters that do the motion side by side in one world, see `track.crowd`.
         search: a motion that the policy loses is looked for, see `plan.sampling`; for one character.
-        search_threads: of it, 0 is all cores.
-        threads: of the physics.
+        threads: cores of the search, 0 is all of them.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -61,8 +68,7 @@ class TrackConfig:
     smooth_hz: float | None = None
     count: int = 1
     search: SamplingConfig | None = None
-    search_threads: int = 0
-    threads: int = 1
+    threads: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST:
@@ -76,24 +82,42 @@ class TrackConfig:
 
 
 def track(
-    tracker: Tracker,
-    motion: Clip | Keypoints,
+    clip: Clip | Keypoints | str | Path,
+    policy: Tracker | Run | str | Path | None = None,
     config: TrackConfig | None = None,
-    show: Callable[[int, int], None] | None = None,
+    *,
+    search: bool | SamplingConfig = False,
+    on_search: Callable[[int, int], None] | None = None,
+    **settings: Any,
 ) -> Tracked:
-    """Tracks a motion from its first frame to its last with the deterministic policy, without help.
+    """Lets a trained policy do a motion that it need not know, without help and without training.
 
-    show: is told how many control steps of how many are searched.
+    The motion is tracked from its first frame to its last. Keypoints reach a policy with goals of
+    keypoints frame by frame (`kin.retarget`); any other policy gets the clip that is fitted to them.
 
-    Keypoints reach a policy with goals of keypoints frame by frame (`kin.retarget`); any other
-    policy gets the clip that is fitted to them.
+    Args:
+        clip: a clip, keypoints, or a file; keypoints in a file stay keypoints.
+        policy: a policy file, the folder of a run of poise train perpetual, or one that is open; by
+            default the policy that comes with Poise.
+        config: how it is tracked; `settings` are those that differ, such as recover=True or count=4.
+        search: a motion that the policy loses is looked for by many characters at once.
+        on_search: is told how many control steps of how many are searched.
 
     Raises:
-        PoiseError: a motion that no human makes or that is too short, see `place`.
+        PoiseError: a motion that cannot be read, that no human makes or that is too short, or no such
+            policy.
     """
-    config = config or TrackConfig()
-    clip, points = _input(motion, config)
-    placed = place(clip, tracker)
+    config = changed(config or TrackConfig(), settings)
+    if search:
+        how = search if isinstance(search, SamplingConfig) else SamplingConfig(seed=config.seed)
+        config = replace(config, search=how)
+    if isinstance(policy, Tracker):
+        tracker = policy
+    else:
+        tracker = (policy if isinstance(policy, Run) else open_run(policy)).tracker
+    motion = read_motion(clip)
+    given, points = _input(motion, config)
+    placed = place(given, tracker)
     imitation = imitation_of(tracker, [placed])
     notes = list(placed.notes)
     if points is not None:
@@ -104,35 +128,25 @@ def track(
         imitation = side_by_side(imitation, config.count)
     acts, losses, found = tracker.policy, None, None
     if config.search and loses(tracker, imitation):
-        found = search(tracker, imitation, config.search, 0, config.search_threads, show)
+        found = look_for(tracker, imitation, config.search, 0, config.threads, on_search)
         acts = replay(found, acts)
         notes.append(sentence(found, config.search, imitation.reference.rate_hz))
-    if config.recover and (back := with_returns(tracker, placed, imitation, config.threads)):
+    if config.recover and (back := with_returns(tracker, placed, imitation)):
         placed, imitation, acts, losses = back
     all_of_them = torch.arange(config.count)
     starts, sim = torch.zeros_like(all_of_them), imitation.config.sim
     crowd = Crowd(imitation.humanoid, sim, config.count) if config.count > 1 else None
-    env = imitation.env(
-        1, None, False, config.threads, help_scale=0.0, guard=crowd is None, backend=crowd
-    )
-    try:
-        check_fits(tracker, env)
-        keeper = Keeper(env, acts, config.reset_on_fail)
-        rollouts, recordings = record(env, keeper, all_of_them, starts, cycles=1)
-    finally:
-        env.close()
+    env = imitation.env(1, None, False, 1, help_scale=0.0, guard=crowd is None, backend=crowd)
+    if config.reset_on_fail:
+        acts = Keeper(env, acts)
+    rollouts, recordings = run_episodes(lambda _: env, acts, all_of_them, starts, cycles=1)
     about, rate = tracker.about, imitation.reference.rate_hz
-    card = score_rollouts(
-        rollouts,
-        rule=RULE,
-        method=tracker.config.method + (", searched" if found else ""),
-        seconds=float(about.get("seconds", 0.0)),
-        samples=int(about.get("samples", 0)),
-        seed=tracker.config.seed,
-    )
+    method = tracker.config.method + (", searched" if found else "")
+    card = scored(rollouts, imitation, about, RULE, method)
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
-    frames = sorted({*keeper.fallen, *failed}, key=lambda x: (x[1], x[0]))
+    mended = acts.fallen if isinstance(acts, Keeper) else ()
+    frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
     clean = None
     if config.noise:
         seen = rollouts.pos[0], goals
@@ -201,43 +215,26 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     return replace(imitation, library=clips, reference=made, report=report)
 
 
-def check_fits(tracker: Tracker, env: ImitationEnv) -> None:
-    """Refuses a policy if its observations or actions are not those of its body here.
-
-    Raises:
-        PoiseError: it was trained for another body, or by another version of Poise.
-    """
-    have = (tracker.policy.num_obs, tracker.policy.num_actions)
-    need = (env.num_obs, env.num_actions)
-    if have != need:
-        raise PoiseError(
-            f"the policy takes {have[0]} observations and gives {have[1]} actions, and its body here "
-            f"has {need[0]} and {need[1]}",
-            hint="It was trained for another body or by another version of Poise; export it anew",
-        )
-
-
 class Keeper:
     """A policy that puts characters back onto the reference before it acts, where they failed.
 
-    Args:
-        resets: off, it only acts.
+    Attributes:
         fallen: (world, frame) of every failure that it mended.
     """
 
-    def __init__(self, env: ImitationEnv, policy: Acts, resets: bool):
-        self.env, self.policy, self.resets = env, policy, resets
+    def __init__(self, env: ImitationEnv, policy: Acts):
+        self.env, self.policy = env, policy
+        sizes = (getattr(policy, name, getattr(env, name)) for name in ("num_obs", "num_actions"))
+        self.num_obs, self.num_actions = sizes
         self.fallen: list[tuple[int, int]] = []
         self._limit_mm = success_rule(RULE).limit_m * 1000.0
 
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
         env = self.env
-        if self.resets:
-            ref = env.goal_pose().pos
-            failed = ~(mpjpe_global(env.pose().pos, ref) <= self._limit_mm)
-            if bool(failed.any()):
-                obs = self._mend(env, failed, obs)
+        failed = ~(mpjpe_global(env.pose().pos, env.goal_pose().pos) <= self._limit_mm)
+        if bool(failed.any()):
+            obs = self._mend(env, failed, obs)
         return self.policy.act(obs)
 
     def _mend(self, env: ImitationEnv, failed: Tensor, obs: Tensor) -> Tensor:
@@ -252,14 +249,24 @@ class Keeper:
         return torch.where(failed[:, None], fresh, obs)
 
 
+def read_motion(clip: Clip | Keypoints | str | Path) -> Clip | Keypoints:
+    """A motion as it is, or that in a file, keypoints where it holds keypoints.
+
+    Raises:
+        PoiseError: the file cannot be read.
+    """
+    if isinstance(clip, Clip | Keypoints):
+        return clip
+    made = read_clip(clip)
+    return points_of(made, ReadOptions()) or made
+
+
 def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoints | None]:
     """The motion with noise as a clip, and as keypoints where it is."""
     if isinstance(motion, Keypoints):
-        if config.noise:
-            motion = perturb_points(motion, config.noise, config.seed)
-        return fitted(motion, config.smooth_hz), motion
-    clip = motion
-    return (perturb_clip(clip, config.noise, config.seed) if config.noise else clip), None
+        points = perturb_points(motion, config.noise, config.seed) if config.noise else motion
+        return fitted(points, config.smooth_hz), points
+    return (perturb_clip(motion, config.noise, config.seed) if config.noise else motion), None
 
 
 def _beside_clean(

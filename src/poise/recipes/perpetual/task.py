@@ -7,14 +7,14 @@ Luo, Cao, Winkler, Kitani and Xu, ICCV 2023.
 | Sec. 3.1 s^p, s^g-rot, s^g-kp, beta               | `env.terms.phc_obs`                         |
 | Sec. 3.1 Eqs. 1, 2, energy; style                 | `env.terms.phc_reward`, `learn.Amp`         |
 | Sec. 3.1 relaxed early termination                | `env.terms.done`, `all_but_feet`            |
-| Sec. 3.2 progressive primitives, hard negatives   | `jobs.perpetual.stage_order` and `.stages`  |
+| Sec. 3.2 progressive primitives, hard negatives   | `jobs.perpetual.stage_order`                |
 | Alg. 1, line 3: until success no longer improves  | `learn.converge`, `learn.mining`            |
 | lateral connections, weight sharing               | `learn.progressive`, `nets.ProgressiveNet`  |
 | fail-states, Eq. 3 point goal, Eq. 4              | `env.recovery`, `env.terms.phc_recovery`    |
-| P^(F) on Q^loco; interleaved recovery             | `jobs.perpetual.recovery`                |
+| P^(F) on Q^loco; interleaved recovery             | `jobs.perpetual.evaluation`                 |
 | in place of them, by default: recovery clips      | `jobs.perpetual.demonstrations`             |
 | Eqs. 5, 6 multiplicative composer                 | `learn.compose`, `nets.Composer`            |
-| Sec. 4, success: mean distance within 0.5 m       | `jobs.perpetual.evaluation`                    |
+| Sec. 4, success: mean distance within 0.5 m       | `jobs.perpetual.evaluation`                 |
 | the authors' later single network                 | `Perpetual.single`                          |
 
 What is ours: the first primitive begins as a clone of a scripted expert, a residual force helps at first

@@ -9,7 +9,7 @@ it was trained; the body stands in it with every number, so that no clip of the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
@@ -23,7 +23,7 @@ from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.jobs.library.clips import Target
 from poise.jobs.perpetual import run as perpetual_run
-from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, read_run
+from poise.jobs.run_file import FINAL, RUN_FILE, RunFile
 from poise.jobs.runs import policy_for
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
 from poise.learn.policy import policy_in
@@ -31,7 +31,6 @@ from poise.learn.schema import PolicyMeta
 from poise.learn.state import prefixed, under
 from poise.motion import Clip, trim
 from poise.motion.pack import pack_clips, unpack_clips
-from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import RECIPE, Perpetual
 from poise.recipes.perpetual.config import config_of
 from poise.settings import check_data, to_data
@@ -57,7 +56,7 @@ class TrackerMeta(PolicyMeta):
 #: What a policy file calls itself, and the version of what stands in it.
 KIND, VERSION = "tracker", 1
 #: The policy that comes with Poise.
-SHIPPED = Path(__file__).parents[2] / "data/tracker.safetensors"
+SHIPPED = Path(__file__).parents[1] / "data/tracker.safetensors"
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300
 #: The largest number of half precision.
@@ -78,7 +77,7 @@ class Tracker:
             gave), "poise" (the version that wrote it).
         recovery_clips: by which the policy comes back where it has lost a motion; None if it has not
             learned that.
-        value: what its critic tells of a state, by which `track.searching` looks ahead; None where the
+        value: what its critic tells of a state, by which `track.recovering` looks ahead; None where the
             critic was not kept.
     """
 
@@ -114,31 +113,19 @@ def policy_of_run(file: RunFile) -> Tracker:
     config, example = config_of(file.meta["config"], file.path), file.library().clips[0]
     humanoid = None if config.body.mjcf else file.body(example.skeleton)
     if humanoid is None:
-        return tracker_of(folder, perpetual_run.reopen(file))
-    config.sim.apply(humanoid.model)
-    told = under(perpetual_run.WAYS, file.tensors)
-    known = RecoveryClips.of(told) if told else None
-    if known is None:
-        # As in a task that is built, see `recipes.perpetual.build`.
-        config = replace(config, recovering=replace(config.recovering, primitive="own"))
-    if config.recovery and not perpetual_run.knows_recovery(folder):
-        config, known = replace(config, recovery=False), None
-    names = file.meta["body"]["names"]
-    return _tracker(file, humanoid, example, names, config, known)
-
-
-def tracker_of(folder: Path, imitation: Imitation) -> Tracker:
-    """The latest policy of the run in `folder`; `imitation` is its task."""
-    i = imitation
-    example, names = i.library.clips[0], i.library.names
-    return _tracker(read_run(folder), i.humanoid, example, names, i.config, i.recovery_clips)
-
-
-def _tracker(
-    file: RunFile, humanoid: Humanoid, example: Clip, names: Sequence[str], config: Perpetual,
-    known: RecoveryClips | None,
-) -> Tracker:  # fmt: skip
-    folder, earlier = file.path.parent, file.earlier
+        made = perpetual_run.reopen(file)
+        humanoid, example, names = made.humanoid, made.library.clips[0], made.library.names
+        config, known = made.config, made.recovery_clips
+    else:
+        config.sim.apply(humanoid.model)
+        told, names = under(perpetual_run.WAYS, file.tensors), file.meta["body"]["names"]
+        known = RecoveryClips.of(told) if told else None
+        if known is None:
+            # As in a task that is built, see `recipes.perpetual.build`.
+            config = replace(config, recovering=replace(config.recovering, primitive="own"))
+        if config.recovery and not perpetual_run.knows_recovery(folder):
+            config, known = replace(config, recovery=False), None
+    earlier = file.earlier
     policy, said = policy_for(folder, humanoid, config.help_start)
     inner: Mapping[str, Any] = said.get("metadata", {})
     about = {
