@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from paper_humanoid import body_points, count_jumps, paper_humanoid
 
 from poise.body import generate_table, make_humanoid
 from poise.kin import (
@@ -31,11 +32,8 @@ from poise.kin import (
     clip_to_qpos,
     fit_humanoid,
     ik_body,
-    paper_humanoid,
     polish,
 )
-from poise.kin.ik.angles import count_jumps
-from poise.kin.ik.body import body_points
 from poise.motion import Clip, read_clip
 from poise.spatial import quat_to_matrix
 

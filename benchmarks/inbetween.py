@@ -22,8 +22,10 @@ import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
+from inbetween_baselines import Baseline
 
 from poise.errors import PoiseError
 from poise.eval.inbetween import (
@@ -45,7 +47,6 @@ from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.metrics import physics
 from poise.nets.between import BetweenConfig
 from poise.nets.transition import Filled, Known
-from poise.synth.baselines import Baseline
 
 PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}
 #: What is tried on validation, at one length; the iterations (0 to 7) are chosen at each.
@@ -89,7 +90,9 @@ def markdown(name: str, methods: Mapping[str, Sequence[Row]]) -> str:
     return "\n".join(lines)
 
 
-def settings(protocol: Protocol, net: str, seed: int, args: argparse.Namespace) -> Inbetween:
+def settings(
+    protocol: Protocol, net: Literal["transformer", "rtn"], seed: int, args: argparse.Namespace
+) -> Inbetween:
     """One training: RTN transitions of 30 as published, or of all lengths with --rtn-longest."""
     config = Inbetween(
         net=net, name=protocol.name, final=protocol.final, validation=protocol.validation, seed=seed,

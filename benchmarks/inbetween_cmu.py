@@ -22,6 +22,7 @@ from pathlib import Path
 
 import torch
 from inbetween import adapted_rows, cost, truth_rows
+from inbetween_baselines import Baseline
 
 from poise.eval.inbetween import Protocol, evaluate, test_set
 from poise.jobs.inbetween.training import Inbetween, begin, train
@@ -30,7 +31,6 @@ from poise.learn.between import BetweenTraining
 from poise.learn.inbetween import BlockStats
 from poise.learn.model import save_model
 from poise.nets.between import BetweenConfig
-from poise.synth.baselines import Baseline
 
 #: Whole subjects that are not learned from: dances of 05, a kick of 11, uneven ground of 03, boxing and
 #: exercises of 14.

@@ -15,22 +15,22 @@ EXPLAINED = {
         "sim/backend.py:body_linear_velocity_w", "sim/backend.py:body_com_velocity_w",
         "metrics/plausibility.py:uhc_skate", "metrics/plausibility.py:uhc_penetration",
         "metrics/plausibility.py:physdiff_penetrate", "metrics/plausibility.py:physdiff_float",
-        "metrics/tracking.py:mpjpe_pa", "synth/baselines.py:Baseline",
+        "metrics/tracking.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
         
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
     ),
     "analytic inverse kinematics, which keyframes will need": (
-        "kin/ik/analytic.py:clip_ik", "kin/ik/angles.py:count_jumps", "kin/ik/body.py:body_points",
-        "kin/ik/paper.py:paper_humanoid", "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
+        "kin/ik/analytic.py:clip_ik",
+        "kin/ik/polish.py:polish", "kin/limbs.py:two_bone",
     ),
     "for users of the library": (
         "jobs/imitate.py:imitate", "eval/card.py:read_score", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
-        "sim/guard.py:replay_dump", "view/data.py:decode_track",
+        "sim/guard.py:replay_dump",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

@@ -80,7 +80,7 @@ def test_every_real_skeleton_gets_a_sound_body(fitted, name):
     check_sound(humanoid)
     assert len(humanoid.hinges) == CLIPS[name][1] and len(humanoid.bodies) == CLIPS[name][2]
     assert 1.4 < humanoid.table.height_m < 2.0 and 45 < humanoid.mass < 90
-    assert report.joint_error_mm[0] < 1.0 and np.isfinite(qpos).all()
+    assert report.clips[0].joint_error_mm < 1.0 and np.isfinite(qpos).all()
     low = [r.ranges[i][0] for r in humanoid.table.rows for i in range(len(r.order))]
     high = [r.ranges[i][1] for r in humanoid.table.rows for i in range(len(r.order))]
     assert (qpos[:, 7:] >= low).all() and (qpos[:, 7:] <= high).all()

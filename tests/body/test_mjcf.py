@@ -131,7 +131,7 @@ def test_it_stands_and_takes_a_clip_of_another_skeleton(tmp_path):
     humanoid, motions, report = fit_humanoid(clip, BodyConfig(mjcf=str(path)))
     assert humanoid.bodies == tuple(r.name for r in own.table.rows)
     # Fewer hinges than the source has cannot follow everything.
-    assert report.joint_error_mm[0] < 60 and np.isfinite(motions[0]).all()
+    assert report.clips[0].joint_error_mm < 60 and np.isfinite(motions[0]).all()
     imitation = build(clip, ResidualForce(body=BodyConfig(mjcf=str(path)), num_envs=2))
     assert imitation.library.clips[0].skeleton.names == own.skeleton.names
     env = imitation.env(2, threads=1)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from inbetween import truth_rows
+from inbetween_baselines import Baseline
 
 from poise.eval.inbetween import (
     BANDAI,
@@ -27,7 +28,6 @@ from poise.eval.inbetween import TestSet as InbetweenTestSet
 from poise.motion import read_clip
 from poise.motion.windows import LAFAN1_FACING, pack_frames, without_still_root
 from poise.nets.transition import Layout
-from poise.synth.baselines import Baseline
 
 # pytest would take the function for a test.
 make_test_set = test_set

@@ -90,9 +90,9 @@ def test_all_stand_on_the_floor_and_a_humanoid_takes_them(folder: Path) -> None:
     _, motions, report = fit_humanoid(library)
     assert len(motions) == len(library)
     # Told that the floor is known, the fit moves no clip as a whole.
-    assert [g.lift_m for g in report.ground] == [0.0] * len(library)
-    assert max(g.clear_m.max() + g.settle_m.max() for g in report.ground) < 0.03
-    assert max(report.joint_error_mm) < 1.0
+    assert [c.ground.lift_m for c in report.clips] == [0.0] * len(library)
+    assert max(c.ground.clear_m.max() + c.ground.settle_m.max() for c in report.clips) < 0.03
+    assert max(c.joint_error_mm for c in report.clips) < 1.0
 
 
 def test_rules_can_be_overruled_and_patterns_left_out(folder: Path) -> None:

@@ -111,7 +111,7 @@ def test_velocities_reach_across_the_seam(whole):
 def test_the_fit_closes_cycles_and_says_so():
     cyclic, plain = swing(1.0, speed=1.0, cyclic=True, name="walk"), swing(0.5, name="once")
     _, motions, report = fit_humanoid(ClipLibrary((cyclic, plain)))
-    assert report.cyclic == (True, False) and report.cycles[1] is None
+    assert report.cyclic == (True, False) and report.clips[1].cycle is None
     assert missed_end(motions[0]) < 1e-6
     said = [s for s in report.sentences() if "cycle" in s]
     assert len(said) == 1 and said[0].startswith("walk: The cycle did not close by 0.0 degrees")
@@ -122,8 +122,9 @@ def test_real_cycles_run_on_without_a_jump(data_dir, name, gap):
     clip = read_clip(data_dir / f"deepmimic_txt/humanoid3d_{name}.txt")
     humanoid, motions, report = fit_humanoid(clip)
     assert report.cyclic == (True,) and missed_end(motions[0]) < 1e-6
-    assert report.cycles[0] is not None and report.cycles[0].gap_deg == pytest.approx(gap, abs=1)
-    ref = Reference(humanoid, motions, 30.0, report.names, report.cyclic)
+    found = report.clips[0].cycle
+    assert found is not None and found.gap_deg == pytest.approx(gap, abs=1)
+    ref = Reference(humanoid, motions, 30.0, [c.name for c in report.clips], report.cyclic)
     cycle = int(ref.length[0]) - 1
     frames = torch.arange(3 * cycle)
     pose = ref.gather(torch.zeros_like(frames), frames)

@@ -12,12 +12,7 @@ import torch
 
 from poise.body import generate_table, make_humanoid
 from poise.kin import Kinematics, clip_to_qpos, fit_ground, fit_humanoid
-from poise.kin.flight import (
-    Flight,
-    find_flights,
-    likely_rate,
-    rate_sentence,
-)
+from poise.kin.flight import Flight, find_flights, likely_rate, rate_sentence
 from poise.kin.ground import clip_flights
 from poise.kin.solids import centre_of_mass
 from poise.motion import Clip, read_clip
@@ -126,7 +121,7 @@ def test_a_clip_8_cm_under_the_floor_comes_up():
     _, (right,), _ = fit_humanoid(clip, None, 60.0)
     _, (lifted,), report = fit_humanoid(raised(clip, np.full(clip.frames, -0.08)), None, 60.0)
     np.testing.assert_allclose(lifted, right, atol=1e-9)
-    assert report.ground[0].to_dict()["lowest_after_m"] > -0.0201
+    assert report.clips[0].ground.to_dict()["lowest_after_m"] > -0.0201
 
 
 def test_an_impossible_range_is_widened_and_said():
@@ -153,9 +148,9 @@ def test_the_report_is_plain_numbers():
 def test_a_cycle_whose_closing_bends_it_into_the_floor_is_played_once(data_dir):
     clip = read_clip(data_dir / "deepmimic_txt/humanoid3d_crawl.txt")
     _, _, report = fit_humanoid(clip)
-    assert report.cyclic == (False,) and report.cycles[0] is not None
-    assert report.cycles[0].sunk_m > 0.1 and "cm into the floor" in report.cycles[0].sentence()
-    assert abs(report.ground[0].lift_m) < 0.05
+    assert report.cyclic == (False,) and report.clips[0].cycle is not None
+    assert report.clips[0].cycle.sunk_m > 0.1 and "cm into the floor" in report.clips[0].cycle.sentence()
+    assert abs(report.clips[0].ground.lift_m) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -165,7 +160,7 @@ def test_gravity_tells_the_rate_of_real_clips(data_dir, name, rate):
     folder = data_dir / "cmu_amc/rfc"
     clip = read_clip(folder / f"{name}.amc", skeleton=folder / "08.asf")
     *_, report = fit_humanoid(clip)
-    assert likely_rate(report.flights[0], clip.fps) == rate
+    assert likely_rate(report.clips[0].flights, clip.fps) == rate
     assert any("times gravity" in s for s in report.sentences()) == (rate is not None)
 
 

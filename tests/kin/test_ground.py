@@ -164,7 +164,7 @@ def test_fitted_motions_sink_no_deeper_than_the_limit():
     humanoid, motions, report = fit_humanoid(swing(speed=1.0))
     # An excess of less than a tenth of a millimetre stays.
     assert lowest(motions[0], humanoid.table).min() > -SINK_M - 1e-4
-    assert report.ground[0].after_m > -SINK_M - 1e-4
+    assert report.clips[0].ground.after_m > -SINK_M - 1e-4
     sentences = report.sentences()
     assert any("mm to stand on the floor" in s for s in sentences)
     assert any("0.0 mm from the clip's" in s for s in sentences)

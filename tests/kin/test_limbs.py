@@ -150,7 +150,7 @@ def test_feet_and_hands_meet_their_targets_and_the_rest_is_kept():
     assert float(steps.max()) < 0.3
 
 
-def test_free_frames_and_weights():
+def test_free_frames_stay():
     clip = toy_human.swing()
     skeleton, rot, root = clip.skeleton, torch.tensor(clip.rot), torch.tensor(clip.root_pos)
     foot = skeleton.index("LeftFoot")
@@ -158,12 +158,9 @@ def test_free_frames_and_weights():
     goal = pos[:, foot] + vec(0.0, 0.0, 0.1)
     free = goal.clone()
     free[:10] = float("nan")
-    half = torch.full((clip.frames,), 0.5, dtype=torch.float64)
     a, _ = joints(clip, match_positions(skeleton, rot, root, {foot: free}))
     torch.testing.assert_close(a[:10, foot], pos[:10, foot])
     torch.testing.assert_close(a[10:, foot], goal[10:])
-    b, _ = joints(clip, match_positions(skeleton, rot, root, {foot: goal}, weights={foot: half}))
-    torch.testing.assert_close(b[:, foot, 2], pos[:, foot, 2] + 0.05)
 
 
 def test_a_straight_knee_bends_to_its_usual_side():

@@ -54,7 +54,7 @@ def test_another_skeleton_is_retargeted_and_steps_can_be_left_out():
 def test_a_cycle_is_joined_where_that_is_asked_for():
     clip = walk().replaced(cyclic=True)
     humanoid, motions, report = fit_humanoid(clip)
-    assert report.cycles[0] is not None
+    assert report.clips[0].cycle is not None
     on = place_on_body(clip, humanoid.table, clean=False, level=False, join=True)
     assert on.cycle is not None and on.cycle.closed == report.cyclic[0]
     once = place_on_body(clip, humanoid.table, clean=False, level=False)

@@ -43,7 +43,7 @@ def test_short_numbers():
 def test_line_plot_is_well_formed_and_written(tmp_path: Path):
     x = np.arange(5.0)
     path = tmp_path / "plot.svg"
-    series = [("a <b>", x, x**2), ("band", x, x, (x - 1, x + 1)), ("flat", x, x, x - 1, x + 1)]
+    series = [("a <b>", x, x**2), ("band", x, x, (x - 1, x + 1)), ("other", x, x, (x, x + 1))]
     axes = {"right": ("%", 2.0), "top": ("min", lambda v: v / 60)}
     text = line_plot(series, "T & co", "time (s)", "error (mm)", path, **axes)
     root = ElementTree.fromstring(text)

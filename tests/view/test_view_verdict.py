@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from fake_report import score
+from fake_report import make_report, score
 
-from poise.view.table import amount, score_table
+from poise.view.report import render
+from poise.view.table import amount, score_rows
 from poise.view.verdict import THRESHOLDS, grades, help_given, overall, percent, sentence
 
 
@@ -84,16 +85,20 @@ def test_amounts():
         "3.14 mm",
         "41.3 N",
         "\u2013",
-        "&lt;b&gt;",
+        "<b>",
     ]
 
 
 def test_table_shows_the_clip_beside_and_keeps_unknown_keys():
-    table = score_table({**score(), "jerk": 900.0, "new_figure": 7.25})
-    assert 'class="n better">14.2 mm/s</td><td class="n">41 mm/s' in table
-    assert 'class="n worse">900 m/s³' in table
-    assert "new_figure" in table and "7.25" in table
-    assert "Help: force limit" in table and score_table({})
+    rows = score_rows({**score(), "jerk": 900.0, "new_figure": 7.25})
+    table = {row.name: row for row in rows}
+    assert (*table["Foot slide"][1:3], table["Foot slide"].mark) == ("14.2 mm/s", "41 mm/s", "better")
+    assert (table["Jerk"].value, table["Jerk"].mark) == ("900 m/s³", "worse")
+    assert rows[-1].name == "new_figure" and rows[-1].value == "7.25"
+    assert "Help: force limit" in table and score_rows({})
+    page = render(make_report(40, score={**score(), "jerk": 900.0}))
+    assert 'class="n better">14.2 mm/s</td><td class="n">41 mm/s' in page
+    assert 'class="n worse">900 m/s³' in page
 
 
 def test_the_written_motion_is_told_beside_the_simulation():

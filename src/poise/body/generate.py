@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from poise.body import presets
 from poise.body.parts import Anatomy, Part, find_anatomy
-from poise.body.presets import PARTS
-from poise.body.scaling import Strength, default_mass, length_factor
+from poise.body.presets import PARTS, Strength, default_mass, length_factor
 from poise.body.shapes import Ruler, geoms_of
-from poise.body.table import BodyRow, BodyTable
+from poise.body.table import BodyRow, BodyTable, floats
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
 from poise.spatial import euler_to_quat, quat_mul, quat_rotate
@@ -76,7 +75,8 @@ def generate_table(
     anatomy = find_anatomy(skeleton, clips)
     cmu = config.preset == "cmu-rfc" or (config.preset == "auto" and is_cmu(skeleton))
     if cmu:
-        anatomy = anatomy.without(skeleton.names.index(n) for n in presets.CMU_MERGED)
+        kept = (p for p in anatomy.parts if skeleton.names[p.joint] not in presets.CMU_MERGED)
+        anatomy = replace(anatomy, parts=tuple(kept))
     neutral = neutral_rotations(skeleton, clips)
     kept = [p.joint for p in anatomy.parts]
     links = {j: _link(skeleton, kept, neutral, j) for j in kept}
@@ -96,8 +96,8 @@ def generate_table(
                 kind=part.kind,
                 side=part.side,
                 parent=kept.index(anchor) if part.kind != "pelvis" else -1,
-                pos=_floats(pos) if part.kind != "pelvis" else (0.0, 0.0, 0.0),
-                quat=_floats(quat) if part.kind != "pelvis" else _IDENTITY,
+                pos=floats(pos) if part.kind != "pelvis" else (0.0, 0.0, 0.0),
+                quat=floats(quat) if part.kind != "pelvis" else _IDENTITY,
                 order=order,
                 frame=frame,
                 ranges=_ranges(skeleton, part, order),
@@ -135,10 +135,6 @@ def neutral_rotations(skeleton: Skeleton, clips: Sequence[Clip]) -> np.ndarray:
     return np.where(out[:, :1] < 0, -out, out)
 
 
-def _floats(values: np.ndarray | torch.Tensor) -> tuple:
-    return tuple(float(v) for v in values)
-
-
 def _link(
     skeleton: Skeleton, kept: list[int], neutral: np.ndarray, joint: int
 ) -> tuple[int, np.ndarray, np.ndarray]:
@@ -166,7 +162,7 @@ def _hinges(skeleton: Skeleton, part: Part, cmu: bool) -> tuple[str, tuple]:
         frame = _IDENTITY
         if channel.axis is not None:
             up = skeleton.source.up_axis
-            frame = _floats(asf_axis_quat(channel.axis, channel.axis_order, up))
+            frame = floats(asf_axis_quat(channel.axis, channel.axis_order, up))
         # ASF lists the first-applied turn first; MuJoCo lists the outermost hinge first.
         letters = [d[1] for d in channel.order if d[0] == "r"]
         return "".join(reversed(letters)).upper(), frame

@@ -9,31 +9,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from poise.body import presets
 from poise.body.parts import find_anatomy
-from poise.body.presets import PARTS, PartNumbers
-from poise.body.scaling import Strength
-from poise.body.table import BodyRow, BodyTable, Geom
+from poise.body.presets import PARTS, PartNumbers, Strength
+from poise.body.table import BodyRow, BodyTable, Geom, floats
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 from poise.motion.roles import find_roles
 
-_FREE, _HINGE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_HINGE)
-_KINDS = {int(mujoco.mjtJoint.mjJNT_BALL): "ball", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
-_SHAPES = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
-    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-}
-_BOXED = {
-    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
-}
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+#: Shapes that are kept, and those that become the box around them.
+_SHAPES, _BOXED = ("sphere", "capsule", "box"), ("mesh", "cylinder", "ellipsoid")
 #: How far (m) the hinges of one body may lie apart, and how far (degrees) from right angles, to be set
 #: right with a note.
 APART_M, SKEW_DEG = 0.06, 35.0
@@ -113,8 +104,8 @@ class _Reader:
     def _check_joints(self, body: int) -> None:
         name, hinges = self._name(body), self._joints(body)
         for j in hinges:
-            kind = _KINDS.get(int(self.model.jnt_type[j]))
-            if kind:
+            kind = _kind(mujoco.mjtJoint(self.model.jnt_type[j]))
+            if kind != "hinge":
                 raise PoiseError(
                     f"joint '{self.model.joint(j).name}' of body '{name}' is a {kind} joint",
                     self.path,
@@ -199,8 +190,9 @@ class _Reader:
                 )
             order, frame = _axes(self.data.xaxis[hinges])
             kp, torque = self._gains(hinges, numbers, strength)
-            own_damping = max((float(self.model.dof_damping[self._dof(j)]) for j in hinges), default=0.0)
-            armature = max((float(self.model.dof_armature[self._dof(j)]) for j in hinges), default=0.0)
+            dofs = self.model.jnt_dofadr[hinges]
+            own_damping = float(self.model.dof_damping[dofs].max(initial=0.0))
+            armature = float(self.model.dof_armature[dofs].max(initial=0.0))
             rows.append(
                 BodyRow(
                     name=skeleton.names[i],
@@ -208,7 +200,7 @@ class _Reader:
                     kind=part.kind if part else "pelvis" if not i else "other",
                     side=part.side if part else "",
                     parent=skeleton.parents[i],
-                    pos=_three(skeleton.offsets[i]),
+                    pos=floats(skeleton.offsets[i]),
                     quat=(1.0, 0.0, 0.0, 0.0),
                     order=order,
                     frame=frame,
@@ -230,9 +222,6 @@ class _Reader:
         return BodyTable(tuple(rows), height, contact_exclusions=self._exclusions())
 
     _added = 0
-
-    def _dof(self, joint: int) -> int:
-        return int(self.model.jnt_dofadr[joint])
 
     def _range(self, joint: int) -> tuple[float, float]:
         if not self.model.jnt_limited[joint]:
@@ -270,21 +259,19 @@ class _Reader:
         colliding = [g for g in every if model.geom_contype[g] or model.geom_conaffinity[g]]
         out = []
         for g in colliding or every:
-            kind, size = _SHAPES.get(int(model.geom_type[g])), model.geom_size[g].copy()
+            kind, size = _kind(mujoco.mjtGeom(model.geom_type[g])), model.geom_size[g].copy()
             turn, quat = data.geom_xmat[g].reshape(3, 3), np.zeros(4)
             pos = data.geom_xpos[g] - origin
-            if kind is None:
-                what = _BOXED.get(int(model.geom_type[g]))
-                if what is None:
-                    continue
-                # The box around it, in its own axes.
+            if kind in _BOXED:
+                self.notes.append(f"The {kind} of body '{self._name(body)}' became the box around it.")
                 kind, size = "box", np.maximum(model.geom_aabb[g, 3:], 1e-3)
                 pos = pos + turn @ model.geom_aabb[g, :3]
-                self.notes.append(f"The {what} of body '{self._name(body)}' became the box around it.")
+            if kind not in _SHAPES:
+                continue
             mujoco.mju_mat2Quat(quat, turn.reshape(-1))
-            out.append(Geom(kind, _three(size), _three(pos), _four(quat)))
+            out.append(Geom(kind, floats(size), floats(pos), floats(quat)))
         if not out:
-            out.append(Geom("sphere", (0.01 * height, 0.0, 0.0), _three(data.xipos[body] - origin)))
+            out.append(Geom("sphere", (0.01 * height, 0.0, 0.0), floats(data.xipos[body] - origin)))
             self.notes.append(f"Body '{self._name(body)}' has no shape; it got a small sphere.")
         return tuple(out)
 
@@ -295,12 +282,9 @@ class _Reader:
         )
 
 
-def _three(v: np.ndarray) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
-
-
-def _four(q: np.ndarray) -> tuple[float, float, float, float]:
-    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+def _kind(kind: Any) -> str:
+    """What MuJoCo calls a kind of joint or geom: "hinge", "mesh"."""
+    return kind.name.split("_")[1].lower()
 
 
 def _axes(axes: np.ndarray) -> tuple[str, tuple[float, float, float, float]]:
@@ -321,4 +305,4 @@ def _axes(axes: np.ndarray) -> tuple[str, tuple[float, float, float, float]]:
         matrix, letters = np.stack((first, -third, second), 1), "XZY"
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, matrix.reshape(-1))
-    return letters, _four(quat)
+    return letters, floats(quat)

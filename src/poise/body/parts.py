@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from poise.body.topology import find_limbs, head_line
+from poise.body.topology import find_limbs, head_line, subtree
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
 from poise.motion.role_words import name_words
@@ -46,11 +46,6 @@ class Anatomy:
     toes: tuple[tuple[str, int], ...]
     evidence: tuple[str, ...] = ()
 
-    def without(self, joints: Iterable[int]) -> Anatomy:
-        """The anatomy with some joints riding rigidly on their ancestors."""
-        gone = set(joints)
-        return replace(self, parts=tuple(p for p in self.parts if p.joint not in gone))
-
     def of(self, kind: str, side: str = "") -> tuple[int, ...]:
         """Joint indices of one kind (and side)."""
         return tuple(p.joint for p in self.parts if p.kind == kind and (not side or p.side == side))
@@ -60,41 +55,23 @@ class Anatomy:
 
         Joints above the pelvis ride on the pelvis.
         """
-        own = {p.joint for p in self.parts}
-        out: dict[int, int] = {}
-        for j in range(len(skeleton)):
-            line = [a for a in _ancestors(skeleton, j) if a in own]
-            if j not in own:
-                out[j] = line[0] if line else self.parts[0].joint
-        return out
+        own, pelvis = {p.joint for p in self.parts}, self.parts[0].joint
+        return {
+            j: next((a for a in skeleton.ancestors(j) if a in own), pelvis)
+            for j in range(len(skeleton))
+            if j not in own
+        }
 
 
 def _path(skeleton: Skeleton, top: int, bottom: int) -> list[int]:
     """Joints from just below `top` down to `bottom`, inclusive."""
-    out: list[int] = []
-    j = bottom
-    while j not in (top, -1):
-        out.append(j)
-        j = skeleton.parents[j]
-    return out[::-1]
-
-
-def _depth_first(skeleton: Skeleton) -> list[int]:
-    """All joints, each one's whole subtree before its next sibling."""
-    out, stack = [], [0]
-    while stack:
-        out.append(stack.pop())
-        stack += reversed(skeleton.children(out[-1]))
-    return out
-
-
-def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
-    return [*_path(skeleton, -1, joint)][::-1]
+    line = [bottom, *skeleton.ancestors(bottom)]
+    return line[: line.index(top)][::-1]
 
 
 def _common(skeleton: Skeleton, a: int, b: int) -> int:
-    line = set(_ancestors(skeleton, a))
-    return next(j for j in _ancestors(skeleton, b) if j in line)
+    line = {a, *skeleton.ancestors(a)}
+    return next(j for j in (b, *skeleton.ancestors(b)) if j in line)
 
 
 def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
@@ -138,7 +115,7 @@ def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
             named = [c for c in below if any(w in skeleton.names[c].lower() for w in ("toe", "ball"))]
             toes.append((side, (named or below)[0]))
     kinds |= _neck_and_head(roles, chest, kinds, pose)
-    parts = tuple(Part(j, *kinds[j]) for j in _depth_first(skeleton) if j in kinds)
+    parts = tuple(Part(j, *kinds[j]) for j in subtree(skeleton, 0) if j in kinds)
     return Anatomy(parts, tuple(toes), evidence)
 
 
@@ -208,9 +185,9 @@ def _neck_and_head(
 ) -> dict[int, tuple[str, str]]:
     """Necks and head above the chest: by name, else (told by shape) the highest central branch."""
     skeleton = roles.skeleton
-    necks = [j for j in roles.chain("neck") if j not in kinds and chest in _ancestors(skeleton, j)]
+    necks = [j for j in roles.chain("neck") if j not in kinds and chest in skeleton.ancestors(j)]
     head = roles.joint("head")
-    heads = [head] if head is not None and chest in _ancestors(skeleton, head) else []
+    heads = [head] if head is not None and chest in skeleton.ancestors(head) else []
     if pose is not None and not necks and not heads:
         limbs = [j for j, (kind, _) in kinds.items() if kind in _ARM]
         line = head_line(skeleton, chest, limbs, pose)

@@ -14,7 +14,7 @@ from poise.body.presets import PARTS
 from poise.body.table import Geom
 from poise.errors import PoiseError
 from poise.motion import Clip, Skeleton
-from poise.spatial import matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
+from poise.spatial import matrix_to_quat, quat_mul, quat_rotate_inv
 
 Links = Mapping[int, tuple[int, np.ndarray, np.ndarray]]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -88,10 +88,6 @@ def geoms_of(part: Part, ruler: Ruler) -> tuple[Geom, ...]:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / max(float(np.linalg.norm(v)), 1e-9)
-
-
-def _rot(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return quat_rotate(torch.tensor(q), torch.tensor(v)).numpy()
 
 
 def _rot_inv(q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -170,3 +170,8 @@ class BodyTable:
 def _tuples(value: Any) -> Any:
     """Lists to tuples, all the way down, since JSON knows only lists."""
     return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+def floats(values: Any) -> Any:
+    """A vector or quaternion as a plain tuple."""
+    return tuple(float(v) for v in values)

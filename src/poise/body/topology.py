@@ -51,17 +51,22 @@ def find_limbs(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Limbs | None:
             if len(one) == len(two) >= 2 and np.abs(one - two).max() <= UNEQUAL * one.sum():
                 pairs.append((float(one.sum()), a, b))
     pairs.sort(reverse=True)
-    outer = [p for p in pairs if not any(_inside(skeleton, p[1], q[1:]) for q in pairs if q is not p)]
+    tops = {j for _, *both in pairs for j in both}
+    # Pairs that do not lie in one another.
+    outer = [p for p in pairs if tops.isdisjoint(skeleton.ancestors(p[1]))]
     if len(outer) < 2:
         return None
-    # The mean height of each pair's ends.
-    low, high = sorted(outer[:2], key=lambda p: pose[[lines[p[1]][-1], lines[p[2]][-1]], 2].mean())
-    ends = [float(pose[[lines[p[1]][-1], lines[p[2]][-1]], 2].mean()) for p in (low, high)]
+
+    def end(pair: tuple[float, int, int]) -> float:
+        """The mean height of a pair's ends."""
+        return float(pose[[lines[j][-1] for j in pair[1:]], 2].mean())
+
+    low, high = sorted(outer[:2], key=end)
     size = float(np.ptp(pose[:, 2]))
     names = skeleton.names
-    if ends[1] - ends[0] < 0.05 * max(size, low[0]):
+    if end(high) - end(low) < 0.05 * max(size, low[0]):
         # A pose that does not stand: the legs hang nearer to the root.
-        low, high = sorted(outer[:2], key=lambda p: _depth(skeleton, p[1]))
+        low, high = sorted(outer[:2], key=lambda p: len(skeleton.ancestors(p[1])))
         why = "they hang nearest to the root"
     else:
         why = "their ends are the lowest"
@@ -95,35 +100,19 @@ def head_line(skeleton: Skeleton, chest: int, limbs: Sequence[int], pose: np.nda
     best: list[int] = []
     for child in skeleton.children(chest):
         line = _line(skeleton, child)
-        if taken.isdisjoint(_subtree(skeleton, child)):
+        if taken.isdisjoint(subtree(skeleton, child)):
             top = [j for j in line if pose[j, 2] > pose[chest, 2]]
             if top and (not best or pose[top[-1], 2] > pose[best[-1], 2]):
                 best = top
     return best
 
 
-def _subtree(skeleton: Skeleton, joint: int) -> list[int]:
+def subtree(skeleton: Skeleton, joint: int) -> list[int]:
+    """`joint` and all that hangs on it, each joint's whole subtree before its next sibling."""
     out, stack = [], [joint]
     while stack:
         out.append(stack.pop())
-        stack += skeleton.children(out[-1])
-    return out
-
-
-def _inside(skeleton: Skeleton, joint: int, tops: Sequence[int]) -> bool:
-    """Whether a joint lies properly below one of `tops`."""
-    j = skeleton.parents[joint]
-    while j >= 0:
-        if j in tops:
-            return True
-        j = skeleton.parents[j]
-    return False
-
-
-def _depth(skeleton: Skeleton, joint: int) -> int:
-    out = 0
-    while skeleton.parents[joint] >= 0:
-        joint, out = skeleton.parents[joint], out + 1
+        stack += reversed(skeleton.children(out[-1]))
     return out
 
 

@@ -131,7 +131,7 @@ def _held(
     found: dict[str, Any] = {"clip": source.name}
     found |= {"held_mean_mm": moved.mean_mm, "held_max_mm": moved.max_mm}
     if r.shapes is not None and r.feet:
-        ground = -imitation.report.ground[index].lift_m
+        ground = -imitation.report.clips[index].ground.lift_m
         of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
         found |= {name: clip_figures(c, joints, r.shapes, r.feet, floor) for name, c, floor in of}
     return held, found

@@ -1,13 +1,13 @@
 """Kinematics of a humanoid: clips cleaned and healed, to generalized coordinates and back, ground."""
 
-from poise.kin.coords import clip_to_qpos, qpos_to_clip
+from poise.kin.coords import clip_to_qpos, qpos_to_clip, qpos_velocity
 from poise.kin.cycle import close_cycle, cycle_step, cycle_velocity
 from poise.kin.doctor.clean import clean_clip, find_faults
 from poise.kin.doctor.doctor import Examination, examine, heal
 from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.guesses import find_guesses, grounded
 from poise.kin.doctor.sides import swap_sides
-from poise.kin.doctor.support import Support, anatomy_of, support_of
+from poise.kin.doctor.support import anatomy_of, support_of
 from poise.kin.feet.contact import contact_labels
 from poise.kin.feet.hold import hold_feet
 from poise.kin.feet.level import level_feet
@@ -17,15 +17,13 @@ from poise.kin.ground import fit_ground
 from poise.kin.hinges import chain_angles, chain_quat
 from poise.kin.ik.analytic import analytic_ik, clip_ik
 from poise.kin.ik.body import IkBody, ik_body
-from poise.kin.ik.config import CORRECTIONS, IkConfig
-from poise.kin.ik.paper import paper_humanoid
-from poise.kin.ik.polish import PolishConfig, polish
+from poise.kin.ik.frames import CORRECTIONS, IkConfig
+from poise.kin.ik.polish import polish
 from poise.kin.limbs import limb_of, match_positions, two_bone
 from poise.kin.place import place_on_body
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
-from poise.kin.velocity import qpos_velocity
 
 __all__ = [
     "CORRECTIONS",
@@ -35,10 +33,8 @@ __all__ = [
     "IkBody",
     "IkConfig",
     "Kinematics",
-    "PolishConfig",
     "RetargetConfig",
     "RetargetReport",
-    "Support",
     "analytic_ik",
     "anatomy_of",
     "by_kind",
@@ -64,7 +60,6 @@ __all__ = [
     "limb_of",
     "lowest_height",
     "match_positions",
-    "paper_humanoid",
     "place_on_body",
     "polish",
     "qpos_to_clip",

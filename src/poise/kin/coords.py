@@ -1,6 +1,8 @@
-"""A clip in one humanoid's generalized coordinates, and back onto the skeleton it came on."""
+"""A clip in one humanoid's generalized coordinates, their velocities, and back onto its skeleton."""
 
 from __future__ import annotations
+
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -12,9 +14,10 @@ from poise.motion import Clip, Skeleton
 from poise.spatial import (
     forward_kinematics,
     normalize,
-    quat_conj,
+    quat_between,
     quat_mul,
     quat_rotate,
+    quat_to_rotvec,
     unwrap_quats,
 )
 
@@ -39,9 +42,9 @@ def clip_to_qpos(clip: Clip, table: BodyTable) -> np.ndarray:
     columns = [pos[:, pelvis], unwrap_quats(quat[:, pelvis])]
     for row in rows[1:]:
         anchor = rows[row.parent].joint
-        rel = quat_mul(quat_conj(quat[:, anchor]), quat[:, row.joint])
+        rel = quat_between(quat[:, anchor], quat[:, row.joint])
         rest = torch.tensor(row.quat, dtype=torch.float64)
-        rot = quat_mul(quat_conj(rest).expand_as(rel), rel)
+        rot = quat_between(rest, rel)
         columns.append(chain_angles(rot, row.order, torch.tensor(row.frame, dtype=torch.float64)))
     return torch.cat(columns, -1).numpy()
 
@@ -71,7 +74,7 @@ def qpos_to_clip(
         rot = template.tensors()[1]
     pelvis = rows[0].joint
     # Joints above the pelvis keep their rotation; the pelvis' own takes up the difference.
-    above = _above(skeleton, pelvis)
+    above = skeleton.ancestors(pelvis)[::-1]
     world: dict[int, torch.Tensor] = {}
     lead = torch.zeros(frames, 4, dtype=torch.float64)
     lead[:, 0] = 1.0
@@ -84,9 +87,10 @@ def qpos_to_clip(
         shift = shift + quat_rotate(lead, torch.tensor(skeleton.offsets[pelvis]).expand(frames, 3))
     root_pos = q[:, :3] - shift
     world[pelvis] = normalize(q[:, 3:7])
-    rot[:, pelvis] = quat_mul(quat_conj(lead), world[pelvis])
+    rot[:, pelvis] = quat_between(lead, world[pelvis])
     by_joint = {r.joint: (i, r) for i, r in enumerate(rows)}
-    start = _starts(table)
+    # First column of each row's hinges.
+    start = list(accumulate((len(r.order) for r in rows), initial=7))
     for j in range(len(skeleton)):
         parent = skeleton.parents[j]
         if j == pelvis or j in above:
@@ -100,25 +104,24 @@ def qpos_to_clip(
                 turn = chain_quat(angles, row.order, frame.expand(frames, 4))
                 anchor = world[rows[row.parent].joint]
                 full = quat_mul(anchor, quat_mul(rest, turn))
-                rot[:, j] = quat_mul(quat_conj(world[parent]), full)
+                rot[:, j] = quat_between(world[parent], full)
         world[j] = quat_mul(world.get(parent, lead), rot[:, j])
     return Clip(skeleton, root_pos.numpy(), normalize(rot).numpy(), fps, name)
 
 
-def _above(skeleton: Skeleton, pelvis: int) -> list[int]:
-    """Joints from the root down to the pelvis' parent."""
-    out: list[int] = []
-    j = skeleton.parents[pelvis]
-    while j >= 0:
-        out.insert(0, j)
-        j = skeleton.parents[j]
-    return out
+def qpos_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
+    """`(T, nv)` velocity of `qpos (T, 7 + n)` in MuJoCo's convention.
 
-
-def _starts(table: BodyTable) -> list[int]:
-    """First column of each row's hinges in qpos."""
-    out, at = [], 7
-    for row in table.rows:
-        out.append(at)
-        at += len(row.order)
-    return out
+    Root linear velocity in the world frame (m/s), root angular velocity in the root's own frame
+    (rad/s), hinge speeds (rad/s). Central differences; one-sided at both ends.
+    """
+    q = torch.tensor(qpos, dtype=torch.float64)
+    frames = len(q)
+    ahead = torch.arange(frames).add(1).clamp(max=frames - 1)
+    behind = torch.arange(frames).sub(1).clamp(min=0)
+    dt = (ahead - behind).to(q.dtype).unsqueeze(-1) / fps
+    linear = (q[ahead, :3] - q[behind, :3]) / dt
+    # w_b = log(q_behind^-1 q_ahead) / dt, in the root's frame
+    turn = quat_to_rotvec(quat_between(q[behind, 3:7], q[ahead, 3:7])) / dt
+    hinges = (q[ahead, 7:] - q[behind, 7:]) / dt
+    return torch.cat((linear, turn, hinges), -1).numpy()

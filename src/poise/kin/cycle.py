@@ -10,8 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.velocity import qpos_velocity
-from poise.spatial import heading_quat, quat_conj, quat_mul, quat_rotate, quat_to_rotvec, rotvec_to_quat
+from poise.kin.coords import qpos_velocity
+from poise.spatial import (
+    heading_quat,
+    quat_between,
+    quat_conj,
+    quat_mul,
+    quat_rotate,
+    quat_to_rotvec,
+    rotvec_to_quat,
+)
 
 #: Angle (rad) between a hinge's first and last frame beyond which a clip is no cycle: a whole turn that
 #: joint targets cannot carry on, or a gap so wide that closing it would be another motion.
@@ -81,9 +89,9 @@ def close_cycle(qpos: np.ndarray) -> tuple[np.ndarray, float]:
     out[:, 7:] -= share * gap
     root = torch.tensor(out[:, 3:7])
     ends = root[[0, -1]]
-    first, last = quat_mul(quat_conj(heading_quat(ends)), ends)
+    first, last = quat_between(heading_quat(ends), ends)
     # R_i' = R_i exp(s log(tilt_last^-1 tilt_first)) ends on heading_last tilt_first.
-    lean = quat_to_rotvec(quat_mul(quat_conj(last), first))
+    lean = quat_to_rotvec(quat_between(last, first))
     out[:, 3:7] = quat_mul(root, rotvec_to_quat(torch.tensor(share) * lean)).numpy()
     widest = max(float(np.abs(gap).max(initial=0.0)), float(lean.norm()))
     return out, math.degrees(widest)
@@ -105,5 +113,5 @@ def cycle_velocity(qpos: np.ndarray, fps: float) -> np.ndarray:
     ahead[:3] = quat_rotate(turn, ahead[:3]) + travel
     ahead[3:7] = quat_mul(turn, ahead[3:7])
     behind[:3] = quat_rotate(quat_conj(turn), behind[:3] - travel)
-    behind[3:7] = quat_mul(quat_conj(turn), behind[3:7])
+    behind[3:7] = quat_between(turn, behind[3:7])
     return qpos_velocity(np.vstack((behind.numpy(), qpos, ahead.numpy())), fps)[1:-1]

@@ -19,7 +19,7 @@ from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
 from poise.kin.ground import GroundFit, clip_flights
 from poise.kin.place import on_own_body, place_on_body
 from poise.motion import Clip, ClipLibrary, resample
-from poise.spatial import quat_conj, quat_mul, quat_to_euler
+from poise.spatial import quat_between, quat_mul, quat_to_euler
 
 #: Shapes that overlap deeper than this (m) in a reference frame must not push each other apart.
 OVERLAP_M = 0.01
@@ -28,60 +28,72 @@ GIMBAL = 1.2
 
 
 @dataclass(frozen=True)
+class ClipFit:
+    """What was measured and changed of one clip.
+
+    fps: its own frame rate. flights: where it falls freely, in its own frames. clean: flips and
+    impossible speeds that were repaired. cycle: how the ends of a cyclic clip met, None for others.
+    ground: how it was set on the floor. joint_error_mm: mean distance between its joints and the
+    humanoid's after conversion (turns that a chain cannot make), before a cycle was closed.
+    """
+
+    name: str
+    fps: float
+    flights: tuple[Flight, ...]
+    clean: CleanReport
+    cycle: Cycle | None
+    ground: GroundFit
+    joint_error_mm: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fit as plain numbers and lists, ready for JSON."""
+        return {
+            **self.clean.to_dict(),
+            "ground": self.ground.to_dict(),
+            "cycle": None if self.cycle is None else asdict(self.cycle),
+            "fall": clear_fall(self.flights),
+            "likely_fps": likely_rate(self.flights, self.fps),
+        }
+
+    def sentences(self) -> list[str]:
+        """The fit in words, one line each."""
+        out = [f"{self.name}: {sentence}" for sentence in self.clean.sentences()]
+        if self.cycle is not None:
+            out.append(f"{self.name}: {self.cycle.sentence()}")
+        out.append(f"{self.name}: {self.ground.sentence()}")
+        error = f"the humanoid's joints lie {self.joint_error_mm:.1f} mm from the clip's on average"
+        return [*out, f"{self.name}: {error}."]
+
+
+@dataclass(frozen=True)
 class FitReport:
     """What was measured and changed so that one body can do the motion.
 
-    names: the clips. fps: their own frame rates. flights: where they fall freely, in their own frames.
-    clean: flips and impossible speeds that were repaired, per clip. cycles: how the
-    ends of cyclic clips met, None for others. ground: one fit per clip. joint_error_mm: mean distance
-    per clip between its joints and the humanoid's after conversion (turns that a chain cannot make),
-    before a cycle was closed. widened: hinges with a range that had to grow, and the growth in degrees.
-    excluded: body pairs that overlap in the reference.
+    clips: of each. widened: hinges with a range that had to grow, and the growth in degrees. excluded:
+    body pairs that overlap in the reference.
     """
 
-    names: tuple[str, ...]
-    fps: tuple[float, ...]
-    flights: tuple[tuple[Flight, ...], ...]
-    clean: tuple[CleanReport, ...]
-    cycles: tuple[Cycle | None, ...]
-    ground: tuple[GroundFit, ...]
-    joint_error_mm: tuple[float, ...]
-    widened: tuple[tuple[str, float], ...]
-    excluded: tuple[tuple[str, str], ...]
+    clips: tuple[ClipFit, ...]
+    widened: tuple[tuple[str, float], ...] = ()
+    excluded: tuple[tuple[str, str], ...] = ()
 
     @property
     def cyclic(self) -> tuple[bool, ...]:
         """Which clips can go on from their end to their start, closed to do so."""
-        return tuple(c is not None and c.closed for c in self.cycles)
+        return tuple(c.cycle is not None and c.cycle.closed for c in self.clips)
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain numbers and lists, ready for JSON."""
-        columns = (self.names, self.clean, self.ground, self.cycles, self.flights, self.fps)
-        clips = {
-            name: {
-                **clean.to_dict(),
-                "ground": ground.to_dict(),
-                "cycle": None if cycle is None else asdict(cycle),
-                "fall": clear_fall(flights),
-                "likely_fps": likely_rate(flights, fps),
-            }
-            for name, clean, ground, cycle, flights, fps in zip(*columns, strict=True)
-        }
+        clips = {c.name: c.to_dict() for c in self.clips}
         return {"clips": clips, "widened_deg": dict(self.widened), "excluded": list(self.excluded)}
 
     def sentences(self) -> list[str]:
         """The report in words, one line each."""
         out = []
-        for name, flights, fps in zip(self.names, self.flights, self.fps, strict=True):
-            doubt = rate_sentence(flights, fps)
-            out += [f"{name}: {doubt}"] if doubt else []
-        columns = (self.names, self.clean, self.cycles, self.ground, self.joint_error_mm)
-        for name, clean, cycle, ground, error in zip(*columns, strict=True):
-            out += [f"{name}: {sentence}" for sentence in clean.sentences()]
-            if cycle is not None:
-                out.append(f"{name}: {cycle.sentence()}")
-            out.append(f"{name}: {ground.sentence()}")
-            out.append(f"{name}: the humanoid's joints lie {error:.1f} mm from the clip's on average.")
+        for c in self.clips:
+            doubt = rate_sentence(c.flights, c.fps)
+            out += [f"{c.name}: {doubt}"] if doubt else []
+        out += [sentence for c in self.clips for sentence in c.sentences()]
         if self.widened:
             worst = max(self.widened, key=lambda w: w[1])
             out.append(
@@ -133,18 +145,11 @@ def fit_humanoid(
     if overlaps:
         table = replace(table, contact_exclusions=table.contact_exclusions + overlaps)
         humanoid = make_humanoid(clips[0].skeleton, table)
-    report = FitReport(
-        library.names,
-        tuple(c.fps for c in library),
-        tuple(clip_flights(c, table) for c, _ in repaired),
-        tuple(found for _, found in repaired),
-        tuple(p.cycle for p in placed),
-        tuple(p.ground for p in placed),
-        tuple(p.joint_error_mm for p in placed),
-        widened,
-        overlaps,
+    fits = (
+        ClipFit(c.name, c.fps, clip_flights(mended, table), found, p.cycle, p.ground, p.joint_error_mm)
+        for c, (mended, found), p in zip(library, repaired, placed, strict=True)
     )
-    return humanoid, motions, report
+    return humanoid, motions, FitReport(tuple(fits), widened, overlaps)
 
 
 def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
@@ -160,8 +165,8 @@ def _choose_orders(table: BodyTable, clips: list[Clip]) -> BodyTable:
         anchor = rows[row.parent].joint
         rest = torch.tensor(row.quat, dtype=torch.float64)
         frame = torch.tensor(row.frame, dtype=torch.float64)
-        rel = torch.cat([quat_mul(quat_conj(w[:, anchor]), w[:, row.joint]) for w in worlds])
-        turns = quat_mul(quat_mul(quat_conj(quat_mul(rest, frame)).expand_as(rel), rel), frame)
+        rel = torch.cat([quat_between(w[:, anchor], w[:, row.joint]) for w in worlds])
+        turns = quat_mul(quat_between(quat_mul(rest, frame), rel), frame)
         orders = [row.order, *("".join(p) for p in itertools.permutations("XYZ"))]
         reach = [float(quat_to_euler(turns, o)[:, 1].abs().max()) for o in orders]
         if reach[0] > GIMBAL:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -121,3 +123,8 @@ def _chain(order: str, cos: Tensor, sin: Tensor) -> Tensor:
         turn[w], turn[u] = turn[w] * c - turn[u] * s, turn[u] * c + turn[w] * s
         turn[v], turn[t] = turn[v] * c + turn[t] * s, turn[t] * c - turn[v] * s
     return torch.stack(turn)
+
+
+def carried(pos: Tensor, quat: Tensor, point: Tensor | np.ndarray | Sequence[float]) -> Tensor:
+    """World places `(T, 3)` m of `point (3)` m, fixed to a body at `pos (T, 3)` m and `quat (T, 4)`."""
+    return pos + quat_rotate(quat, torch.as_tensor(point, dtype=pos.dtype).expand_as(pos))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.spatial import GRAVITY
 
 #: A body may be in flight where its lowest point is this far (m) above where it mostly touches down, for

@@ -12,8 +12,8 @@ from poise.body import BodyTable
 from poise.kin.feet.contact import stance_heights
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, find_flights
-from poise.kin.runs import find_runs
-from poise.kin.solids import centre_of_mass, lowest_height
+from poise.kin.series import find_runs, smooth_hull, smooth_lift
+from poise.kin.solids import heights, poses_of
 from poise.motion import Clip
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
@@ -72,10 +72,7 @@ class GroundFit:
 
 def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
     """The flights of a clip at its own frame rate."""
-    joints = [r.joint for r in table.rows]
-    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
-    low = lowest_height(table, pos, quat).min(-1).values.numpy()
-    return find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), clip.fps)
+    return find_flights(*heights(table, *poses_of(clip, table)), clip.fps)
 
 
 def fit_ground(
@@ -119,8 +116,8 @@ def fit_heights(
 
     See `fit_ground`, which does it.
     """
-    low = lowest_height(table, pos, quat).min(-1).values.numpy()
-    flights = find_flights(low, centre_of_mass(table, pos, quat)[:, 2].numpy(), fps)
+    low, height = heights(table, pos, quat)
+    flights = find_flights(low, height, fps)
     stance = stance_heights(table, pos, quat, fps)
     lift = -float(np.quantile(low, 0.1))
     if len(stance) >= 3:
@@ -150,21 +147,3 @@ def _hover(height: np.ndarray, flights: tuple[Flight, ...]) -> np.ndarray:
         return np.zeros_like(height)
     at = np.arange(len(height))
     return np.minimum(np.interp(at, at[~air], excess[~air]), excess)
-
-
-def smooth_lift(depth: np.ndarray, fps: float, seconds: float, cyclic: bool = False) -> np.ndarray:
-    """The smooth lift `(T,)` that covers `depth (T,)`, both in m, spread over +-`seconds`."""
-    return np.maximum(smooth_hull(depth, max(1, round(seconds * fps)), cyclic), 0.0)
-
-
-def smooth_hull(values: np.ndarray, reach: int, cyclic: bool) -> np.ndarray:
-    """The running maximum of `values (T,)` over +-reach frames, averaged over as many."""
-    if cyclic:
-        # The last frame is the first one again, so it counts once.
-        values = np.maximum(values[:-1], np.append(values[-1], values[1:-1]))
-    mode = "wrap" if cyclic else "edge"
-    padded = np.pad(values, reach, mode=mode)
-    hull = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(-1)
-    window = np.hanning(2 * reach + 3)[1:-1]
-    smooth = np.convolve(np.pad(hull, reach, mode=mode), window / window.sum(), "valid")
-    return np.append(smooth, smooth[0]) if cyclic else smooth

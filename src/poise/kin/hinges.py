@@ -1,4 +1,8 @@
-"""Rotations as chains of hinges, with angles that never jump from one frame to the next."""
+"""Rotations as chains of hinges, with angles that never jump from one frame to the next.
+
+Where a frame has two candidates, as Euler angles do, the smoothest path through all frames is found, for
+many joints at once and without a loop (`best_path`).
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.kin.branches import euler_path
-from poise.spatial import euler_to_quat, quat_conj, quat_mul, quat_to_euler
+from poise.spatial import euler_to_quat, quat_between, quat_conj, quat_mul, quat_to_euler
 
 
 def chain_quat(angles: Tensor, order: str, frame: Tensor) -> Tensor:
@@ -30,7 +33,7 @@ def chain_angles(rot: Tensor, order: str, frame: Tensor, prefer: Tensor | None =
     third angle and one hinge takes the twist about its axis: both exact for rotations that lie in
     the chain. The whole sequence is shifted by full turns to lie nearest `prefer (n)` (default 0).
     """
-    local = quat_mul(quat_mul(quat_conj(frame), rot), frame)
+    local = quat_mul(quat_between(frame, rot), frame)
     if not order:
         return local.new_zeros(*local.shape[:-1], 0)
     if len(order) == 1:
@@ -79,3 +82,60 @@ def within_turns(qpos: np.ndarray, humanoid: Humanoid) -> np.ndarray:
     out = qpos.copy()
     out[:, 7:] -= 2 * np.pi * turns
     return out
+
+
+def best_path(price: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """The cheaper of two candidates in every frame `(T, R)`, over the whole sequence.
+
+    Args:
+        price: `(T - 1, R, 2, 2)`, what the step from candidate i to candidate j costs.
+        pull: `(T, R, 2)`, what a candidate costs by itself.
+
+    The sequence of least sum is the shortest path of Viterbi's algorithm. Its costs are products of
+    2 x 2 matrices in the algebra of minimum and sum, which is associative, so prefixes and suffixes of
+    all frames come in log2(T) passes; a frame takes the candidate through which the best path leads.
+    """
+    if len(pull) == 1:
+        return pull.argmin(-1)
+    steps = price + pull[1:, :, None, :]
+    first = pull[:1, :, :, None] + np.array([[0.0, np.inf], [np.inf, 0.0]])
+    come = _prefix(np.concatenate((first, steps))).min(-2)
+    # Suffixes are prefixes of the reversed, transposed steps.
+    back = np.swapaxes(steps[::-1], -1, -2)
+    go = np.concatenate((_prefix(back).min(-2)[::-1], np.zeros_like(pull[:1])))
+    return (come + go).argmin(-1)
+
+
+def _prefix(m: np.ndarray) -> np.ndarray:
+    """All prefix products `(T, R, 2, 2)` in the algebra of minimum and sum (Hillis and Steele 1986)."""
+    out, reach = m.copy(), 1
+    while reach < len(out):
+        a, b = out[:-reach], out[reach:]
+        # (a b)_ij = min_k a_ik + b_kj
+        joined = np.minimum(
+            a[..., :, :1] + b[..., :1, :],
+            a[..., :, 1:] + b[..., 1:, :],
+        )
+        out = np.concatenate((out[:reach], joined))
+        reach *= 2
+    return out
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles (rad) brought into [-pi, pi)."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+
+
+def euler_path(first: np.ndarray, prefer: np.ndarray | None = None) -> np.ndarray:
+    """Euler angles `(T, R, 3)` on the smoothest sequence through their two branches, not unwrapped.
+
+    The branches (a, b, c) and (a + pi, pi - b, c + pi) are the same rotation. A slight pull toward
+    `prefer (R, 3)` (default 0) breaks ties and chooses the branch of a still clip.
+    """
+    shift = np.array([np.pi, 0.0, np.pi])
+    second = first * np.array([1.0, -1.0, 1.0]) + shift + np.array([0.0, np.pi, 0.0])
+    both = np.stack((first, second), -2)  # (T, R, 2, 3)
+    step = wrapped(both[1:, :, None, :, :] - both[:-1, :, :, None, :])
+    home = wrapped(both - (0.0 if prefer is None else prefer[:, None, :]))
+    pick = best_path((step**2).sum(-1), 1e-4 * (home**2).sum(-1))
+    return np.take_along_axis(both, pick[..., None, None], -2)[..., 0, :]

@@ -18,7 +18,7 @@ from poise.spatial import (
     axis_angle_to_quat,
     forward_kinematics,
     normalize,
-    quat_conj,
+    quat_between,
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
@@ -128,7 +128,6 @@ def match_positions(
     root_pos: Tensor,
     targets: Mapping[int | str, Tensor],
     limbs: Mapping[int | str, Limb] | None = None,
-    weights: Mapping[int | str, Tensor] | None = None,
     soft: float = SOFT,
 ) -> Tensor:
     """The motion with hands and feet on their targets and all else kept: new `rot (T, J, 4)` wxyz.
@@ -141,7 +140,6 @@ def match_positions(
         rot: `(T, J, 4)` wxyz local. root_pos: `(T, 3)` m.
         targets: `(T, 3)` m world of each joint, by index or name; a NaN row leaves its frame free.
         limbs: which joints move a target, `limb_of` by default.
-        weights: `(T)` in [0, 1] of each joint, how far it goes towards its target; 1 by default.
         soft: see `soft_reach`; a limb that the motion itself holds straighter may stay so.
     """
     out = rot.clone()
@@ -151,9 +149,6 @@ def match_positions(
         pos, quat = forward_kinematics(skeleton.parents, offsets, root_pos, out)
         goal = torch.as_tensor(goal, dtype=rot.dtype)
         now = pos[:, limb.end]
-        weight = None if weights is None else weights.get(joint)
-        if weight is not None:
-            goal = now + torch.as_tensor(weight, dtype=rot.dtype).unsqueeze(-1) * (goal - now)
         goal = torch.where(goal.isfinite().all(-1, keepdim=True), goal, now)
         hip, knee = pos[:, limb.root], pos[:, limb.mid]
         bend, swing = _reach(hip, knee, now, goal, quat[:, limb.root], soft)
@@ -224,9 +219,9 @@ def _turn(
         one[:, 0] = 1.0
         return quat[:, parents[j]] if parents[j] >= 0 else one
 
-    rot[:, limb.root] = quat_mul(quat_conj(above(limb.root)), quat_mul(swing, quat[:, limb.root]))
-    rot[:, limb.mid] = quat_mul(quat_conj(above(limb.mid)), quat_mul(bend, quat[:, limb.mid]))
-    rot[:, limb.end] = quat_mul(quat_conj(quat_mul(both, above(limb.end))), quat[:, limb.end])
+    rot[:, limb.root] = quat_between(above(limb.root), quat_mul(swing, quat[:, limb.root]))
+    rot[:, limb.mid] = quat_between(above(limb.mid), quat_mul(bend, quat[:, limb.mid]))
+    rot[:, limb.end] = quat_between(quat_mul(both, above(limb.end)), quat[:, limb.end])
 
 
 def _direction(v: Tensor) -> Tensor:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
 from poise.metrics import KINDS, Shapes, geom_heights
 from poise.metrics import centre_of_mass as geoms_centre
+from poise.motion import Clip
 
 
 def shapes_of(table: BodyTable, dtype: torch.dtype = torch.float64) -> Shapes:
@@ -21,6 +23,19 @@ def shapes_of(table: BodyTable, dtype: torch.dtype = torch.float64) -> Shapes:
         body=torch.tensor([i for i, _, _ in geoms]),
         mass=torch.tensor([m for _, _, m in geoms], dtype=dtype),
     )
+
+
+def poses_of(clip: Clip, table: BodyTable) -> tuple[Tensor, Tensor]:
+    """World places `(T, B, 3)` m and rotations `(T, B, 4)` wxyz of a table's bodies in a clip."""
+    joints = [r.joint for r in table.rows]
+    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
+    return pos, quat
+
+
+def heights(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """`(T)` m, of the lowest point and of the centre of mass, from world body poses."""
+    low = lowest_height(table, pos, quat).min(-1).values.numpy()
+    return low, centre_of_mass(table, pos, quat)[:, 2].numpy()
 
 
 def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:

@@ -1,10 +1,9 @@
 """Pure functions that score motion: tracking, plausibility, help; definitions in docs/metrics.md."""
 
 from poise.metrics.help import HelpAudit, help_audit
-from poise.metrics.inbetween import Physics, l2p, l2q, npss, physics
+from poise.metrics.inbetween import l2p, l2q, npss, physics
 from poise.metrics.masking import masked_mean, masked_quantile, span_mask
 from poise.metrics.plausibility import (
-    Penetration,
     ballistic,
     float_gaps,
     floating,
@@ -22,7 +21,6 @@ from poise.metrics.plausibility import (
 from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
 from poise.metrics.tracking import (
     RULES,
-    Outcome,
     SuccessRule,
     acceleration_error,
     mpjpe_global,
@@ -37,9 +35,6 @@ __all__ = [
     "KINDS",
     "RULES",
     "HelpAudit",
-    "Outcome",
-    "Penetration",
-    "Physics",
     "Shapes",
     "SuccessRule",
     "acceleration_error",

@@ -50,7 +50,6 @@ def help_audit(
     mass: float,
     *,
     mask: Tensor | None = None,
-    gravity: float = GRAVITY,
 ) -> HelpAudit:
     """Audit the residual wrench of one body `(T, 3)` or of M bodies `(..., T, M, 3)`.
 
@@ -86,7 +85,7 @@ def help_audit(
         torque_mean_nm=float(masked_mean(torque_nm, mask)),
         torque_p95_nm=float(masked_quantile(torque_nm, 0.95, mask)),
         work_j_per_s=float(masked_mean(power_w, mask)),
-        share_of_body_weight=force_mean / (mass * gravity),
+        share_of_body_weight=force_mean / (mass * GRAVITY),
         force_n=force_n,
         torque_nm=torque_nm,
         power_w=power_w,

@@ -22,6 +22,8 @@ CONTACT_RISE = 0.2
 """m/s; a foot point that rises or falls faster is landing or leaving, not in contact."""
 SWING_SPEED = 1.0
 """m/s; a foot point that is faster while another one is planted belongs to a swinging foot."""
+PHYSDIFF_M = 0.005
+"""m; PhysDiff's tolerance of a lowest point that touches."""
 BALLISTIC_TOLERANCE = 0.4
 """Share of g by which the vertical acceleration may differ from -g in flight."""
 BALLISTIC_WINDOW = 0.1
@@ -51,27 +53,25 @@ def foot_contacts(
     fps: float,
     *,
     height: float = CONTACT_HEIGHT,
-    rise: float = CONTACT_RISE,
-    swing: float = SWING_SPEED,
     ground: float = 0.0,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Horizontal speed in mm/s and contact of each foot point between frames, both `(..., T - 1, F)`.
 
     A point `(..., T, F, 3)` is in contact from t to t+1 when it is within `height` m of the ground in
-    both frames (deeper counts as in contact) and its vertical speed is at most `rise` m/s. A point
-    faster than `swing` m/s is left out while another point in contact is slower: it skims the
+    both frames (deeper counts as in contact) and its vertical speed is at most `CONTACT_RISE`. A point
+    faster than `SWING_SPEED` is left out while another point in contact is slower: it skims the
     ground in mid-swing. Where all points in contact are fast, the character skates and all count.
     """
     if foot_points.ndim < 3 or foot_points.shape[-1] != 3:
         raise PoiseError(f"foot points must be (..., T, F, 3), got {tuple(foot_points.shape)}")
     step = torch.diff(foot_points, dim=-3) * fps
     low = foot_points[..., 2] - ground <= height
-    contact = low[..., 1:, :] & low[..., :-1, :] & (step[..., 2].abs() <= rise)
+    contact = low[..., 1:, :] & low[..., :-1, :] & (step[..., 2].abs() <= CONTACT_RISE)
     if mask is not None:
         contact = contact & span_mask(mask, 1).unsqueeze(-1)
     speed = step[..., :2].norm(dim=-1)
-    planted = contact & (speed <= swing)
+    planted = contact & (speed <= SWING_SPEED)
     contact = torch.where(planted.any(-1, keepdim=True), planted, contact)
     return speed * MM, contact
 
@@ -81,8 +81,6 @@ def foot_slide(
     fps: float,
     *,
     height: float = CONTACT_HEIGHT,
-    rise: float = CONTACT_RISE,
-    swing: float = SWING_SPEED,
     ground: float = 0.0,
     mask: Tensor | None = None,
 ) -> Tensor:
@@ -91,62 +89,54 @@ def foot_slide(
     Contact as in `foot_contacts`; the mean runs over all (frame, point) pairs in contact. NaN
     without any contact. Hand in the points of all feet together.
     """
-    speed, contact = foot_contacts(
-        foot_points, fps, height=height, rise=rise, swing=swing, ground=ground, mask=mask
-    )
+    speed, contact = foot_contacts(foot_points, fps, height=height, ground=ground, mask=mask)
     return masked_mean(speed, contact, (-2, -1))
 
 
-def uhc_skate(foot_points: Tensor, ground: float = 0.0, mask: Tensor | None = None) -> Tensor:
+def uhc_skate(foot_points: Tensor) -> Tensor:
     """UHC's skate, mm per frame: per-frame mean XY displacement of points at z <= 0 in both frames.
 
     A frame without such points counts zero; the mean runs over the T - 1 steps. No rate is applied
     (UHC's data are at 30 Hz).
     """
-    low = foot_points[..., 2] <= ground
+    low = foot_points[..., 2] <= 0.0
     contact = low[..., 1:, :] & low[..., :-1, :]
     moved = torch.diff(foot_points[..., :2], dim=-3).norm(dim=-1) * MM
-    per_frame = torch.nan_to_num(masked_mean(moved, contact, -1), nan=0.0)
-    return masked_mean(per_frame, None if mask is None else span_mask(mask, 1), -1)
+    return torch.nan_to_num(masked_mean(moved, contact, -1), nan=0.0).mean(-1)
 
 
-def uhc_penetration(points: Tensor, ground: float = 0.0, mask: Tensor | None = None) -> Tensor:
+def uhc_penetration(points: Tensor) -> Tensor:
     """UHC's penetration, mm: mean depth of the points with z < 0 (zero without any), mean of frames."""
-    depth = (ground - points[..., 2]) * MM
-    per_frame = torch.nan_to_num(masked_mean(depth, depth > 0, -1), nan=0.0)
-    return masked_mean(per_frame, mask, -1)
+    depth = -points[..., 2] * MM
+    return torch.nan_to_num(masked_mean(depth, depth > 0, -1), nan=0.0).mean(-1)
 
 
-def physdiff_penetrate(lowest: Tensor, tolerance: float = 0.005, mask: Tensor | None = None) -> Tensor:
-    """PhysDiff's penetrate, mm: depth of the lowest point, zero within `tolerance` m, mean of frames."""
-    depth = torch.where(lowest < -tolerance, -lowest, torch.zeros_like(lowest))
-    return masked_mean(depth, mask, -1) * MM
+def physdiff_penetrate(lowest: Tensor) -> Tensor:
+    """PhysDiff's penetrate, mm: depth of the lowest point, zero within 5 mm, mean of frames."""
+    return torch.where(lowest < -PHYSDIFF_M, -lowest, torch.zeros_like(lowest)).mean(-1) * MM
 
 
-def physdiff_float(lowest: Tensor, tolerance: float = 0.005, mask: Tensor | None = None) -> Tensor:
-    """PhysDiff's float, mm: height of the lowest point, zero within `tolerance` m; flight counts too."""
-    gap = torch.where(lowest > tolerance, lowest, torch.zeros_like(lowest))
-    return masked_mean(gap, mask, -1) * MM
+def physdiff_float(lowest: Tensor) -> Tensor:
+    """PhysDiff's float, mm: height of the lowest point, zero within 5 mm; flight counts too."""
+    return torch.where(lowest > PHYSDIFF_M, lowest, torch.zeros_like(lowest)).mean(-1) * MM
 
 
-def s2h_foot_penetration(height: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def s2h_foot_penetration(height: Tensor) -> tuple[Tensor, Tensor]:
     """Skeleton2Humanoid's FP (mm, negative) and FQ (share) of joint heights `(..., T, J)` in m.
 
     The paper gives no formula; read as the means of `min(0, h)` and `[h < 0]` over all frames and
     the joints handed in (feet for FP and FQ, all joints for JQ).
     """
-    valid = _full(None if mask is None else mask.unsqueeze(-1), height)
-    fp = masked_mean(height.clamp(max=0), valid, (-2, -1)) * MM
-    return fp, masked_mean((height < 0).to(height.dtype), valid, (-2, -1))
+    return height.clamp(max=0).mean((-2, -1)) * MM, (height < 0).to(height.dtype).mean((-2, -1))
 
 
-def penetration(lowest: Tensor, mask: Tensor | None = None, ground: float = 0.0) -> Penetration:
+def penetration(lowest: Tensor, mask: Tensor | None = None) -> Penetration:
     """Depth of the lowest point `(..., T)` m below the ground; results `(...)`.
 
-    mean over all valid frames of `max(0, ground - h)`, frames without penetration counting zero.
+    mean over all valid frames of `max(0, -h)`, frames without penetration counting zero.
     """
     valid = _full(mask, lowest)
-    depth = (ground - lowest).clamp_min(0) * MM
+    depth = (-lowest).clamp_min(0) * MM
     held = torch.where(valid, depth, torch.zeros_like(depth))
     return Penetration(
         masked_mean(depth, valid, -1), held.amax(-1), masked_mean((depth > 0).to(depth.dtype), valid, -1)
@@ -162,22 +152,14 @@ def _window_any(flags: Tensor, half: int) -> Tensor:
     return spread.reshape(flags.shape) > 0.5
 
 
-def ballistic(
-    com_height: Tensor,
-    fps: float,
-    *,
-    tolerance: float = BALLISTIC_TOLERANCE,
-    window: float = BALLISTIC_WINDOW,
-    gravity: float = GRAVITY,
-    mask: Tensor | None = None,
-) -> Tensor:
+def ballistic(com_height: Tensor, fps: float, mask: Tensor | None = None) -> Tensor:
     """Frames `(..., T)` in free flight, told from the centre of mass height `(..., T)` m alone.
 
-    A parabola is fitted to every window of `window` seconds (an odd number of frames, at least 3).
-    Where its acceleration is -g within `tolerance` g, all frames of the window are in flight. The
-    fit tells a jump from a character that hovers with an acceleration near zero.
+    A parabola is fitted to every window of `BALLISTIC_WINDOW` (an odd number of frames, at least 3).
+    Where its acceleration is -g within `BALLISTIC_TOLERANCE`, all frames of the window are in flight.
+    The fit tells a jump from a character that hovers with an acceleration near zero.
     """
-    half = max(1, int(window * fps / 2 + 1e-6))
+    half = max(1, int(BALLISTIC_WINDOW * fps / 2 + 1e-6))
     frames = com_height.shape[-1]
     flags = torch.zeros_like(com_height, dtype=torch.bool)
     if frames < 2 * half + 1:
@@ -189,7 +171,7 @@ def ballistic(
     # Heights are taken relative to the window's middle, which keeps float32 exact enough.
     windows = com_height.unfold(-1, 2 * half + 1, 1)
     acceleration = ((windows - windows[..., half : half + 1]) * c).sum(-1)
-    falling = (acceleration + gravity).abs() <= tolerance * gravity
+    falling = (acceleration + GRAVITY).abs() <= BALLISTIC_TOLERANCE * GRAVITY
     if mask is not None:
         falling = falling & span_mask(mask, 2 * half)
     flags[..., half : frames - half] = falling
@@ -197,38 +179,23 @@ def ballistic(
 
 
 def float_gaps(
-    lowest: Tensor,
-    com_height: Tensor,
-    fps: float,
-    *,
-    mask: Tensor | None = None,
-    ground: float = 0.0,
-    tolerance: float = BALLISTIC_TOLERANCE,
+    lowest: Tensor, com_height: Tensor, fps: float, mask: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Gap in mm between the lowest point and the ground, and where contact is due, both `(..., T)`.
 
     Contact is due in every frame that is not `ballistic`: nothing but the ground can hold a body
     that does not fall freely.
     """
-    due = _full(mask, lowest) & ~ballistic(com_height, fps, tolerance=tolerance, mask=mask)
-    return (lowest - ground).clamp_min(0) * MM, due
+    due = _full(mask, lowest) & ~ballistic(com_height, fps, mask)
+    return lowest.clamp_min(0) * MM, due
 
 
-def floating(
-    lowest: Tensor,
-    com_height: Tensor,
-    fps: float,
-    *,
-    mask: Tensor | None = None,
-    ground: float = 0.0,
-    tolerance: float = BALLISTIC_TOLERANCE,
-) -> Tensor:
+def floating(lowest: Tensor, com_height: Tensor, fps: float) -> Tensor:
     """Mean gap, mm, between the lowest point `(..., T)` m and the ground where contact is due; `(...)`.
 
     See `float_gaps`. Frames that touch count zero; NaN when all frames are in flight.
     """
-    gap, due = float_gaps(lowest, com_height, fps, mask=mask, ground=ground, tolerance=tolerance)
-    return masked_mean(gap, due, -1)
+    return masked_mean(*float_gaps(lowest, com_height, fps), -1)
 
 
 def jerk(pos: Tensor, fps: float) -> Tensor:

@@ -40,28 +40,15 @@ class Shapes:
     mass: Tensor | None = None
 
     def __post_init__(self) -> None:
-        for name in ("kind", "size", "pos", "quat", "body"):
-            object.__setattr__(self, name, torch.as_tensor(getattr(self, name)))
-        object.__setattr__(self, "kind", self.kind.long())
-        object.__setattr__(self, "body", self.body.long())
-        if self.mass is not None:
-            object.__setattr__(self, "mass", torch.as_tensor(self.mass))
         count = len(self.kind)
-        want = {
-            "kind": (count,),
-            "size": (count, 3),
-            "pos": (count, 3),
-            "quat": (count, 4),
-            "body": (count,),
-        }
-        if self.mass is not None:
-            want["mass"] = (count,)
-        for name, shape in want.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise PoiseError(
-                    f"shapes.{name} must be {shape} for {count} geoms, "
-                    f"got {tuple(getattr(self, name).shape)}"
-                )
+        for name, width in dict(kind=(), size=(3,), pos=(3,), quat=(4,), body=(), mass=()).items():
+            if (value := getattr(self, name)) is None:
+                continue
+            value = torch.as_tensor(value)
+            if tuple(value.shape) != (count, *width):
+                want, got = (count, *width), tuple(value.shape)
+                raise PoiseError(f"shapes.{name} must be {want} for {count} geoms, got {got}")
+            object.__setattr__(self, name, value.long() if name in ("kind", "body") else value)
         known = (self.kind >= SPHERE) & (self.kind <= BOX)
         if count == 0 or not bool(known.all()):
             what = "no geom" if count == 0 else f"a geom of kind {int(self.kind[~known][0])}"

@@ -31,12 +31,24 @@ def lock_feet(
         contact: `(T, F)` bool per foot joint. free: `(T)` bool, frames that may change; the others
             (keyframes) say where a foot that stands must be.
     """
-    soles = _soles(skeleton, feet)
+    soles, gap = _soles(skeleton, feet), _gap(free)
     if not soles:
         return rot.clone()
-    gap = _gap(free)
+
+    def ends(rot: Tensor) -> Tensor:
+        """`(T, K, 2, 3)` m, ankles and toes in the gap."""
+        offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
+        pos = forward_kinematics(skeleton.parents, offsets, root[gap], rot[gap])[0]
+        return pos[:, [[s.ankle, s.toe] for s in soles]]
+
+    def stands() -> Tensor:
+        """`(T, K)` bool, on either end, in the gap."""
+        return torch.stack([contact[gap][:, list(s.columns)].any(1) for s in soles], 1)
+
     if gap is not None:
-        contact = _with_steps(skeleton, soles, root, rot, contact, gap, fps)
+        contact = contact.clone()
+        steps = missing_steps(ends(rot), stands(), fps)
+        contact[gap] = stepping(contact[gap], steps, [s.columns for s in soles])
     bears = (contact[1:] & contact[:-1]).to(rot.dtype) * FIRM
 
     def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
@@ -47,7 +59,7 @@ def lock_feet(
         }
 
     rot = hold(skeleton, root, rot, fps, standing, ~free, vertical=True)
-    return rot if gap is None else _cleared(skeleton, soles, root, rot, contact, gap)
+    return rot if gap is None else _raised(skeleton, soles, root, rot, rises(ends(rot), stands()), gap)
 
 
 class _Foot(NamedTuple):
@@ -68,11 +80,6 @@ def _soles(skeleton: Skeleton, feet: Sequence[int]) -> list[_Foot]:
     return out
 
 
-def _positions(skeleton: Skeleton, root: Tensor, rot: Tensor) -> Tensor:
-    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
-    return forward_kinematics(skeleton.parents, offsets, root, rot)[0]
-
-
 def _gap(free: Tensor) -> slice | None:
     """The free frames with the last kept frame before and the first one after them, if there are."""
     inside = free.nonzero().squeeze(-1)
@@ -81,33 +88,10 @@ def _gap(free: Tensor) -> slice | None:
     return slice(int(inside[0]) - 1, int(inside[-1]) + 2)
 
 
-def _ends(skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor) -> Tensor:
-    """`(T, K, 2, 3)` m, ankles and toes."""
-    return _positions(skeleton, root, rot)[:, [[s.ankle, s.toe] for s in soles]]
-
-
-def _stands(contact: Tensor, soles: list[_Foot]) -> Tensor:
-    """`(T, K)` bool, on either end."""
-    return torch.stack([contact[:, list(s.columns)].any(1) for s in soles], 1)
-
-
-def _with_steps(
-    skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor, contact: Tensor, gap: slice,
-    fps: float,
-) -> Tensor:  # fmt: skip
-    """The contacts with the steps that are missing."""
-    ends = _ends(skeleton, soles, root[gap], rot[gap])
-    steps = missing_steps(ends, _stands(contact[gap], soles), fps)
-    contact = contact.clone()
-    contact[gap] = stepping(contact[gap], steps, [s.columns for s in soles])
-    return contact
-
-
-def _cleared(
-    skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor, contact: Tensor, gap: slice
+def _raised(
+    skeleton: Skeleton, soles: list[_Foot], root: Tensor, rot: Tensor, up: Tensor, gap: slice
 ) -> Tensor:
-    """The motion with the feet raised that swing too low."""
-    up = rises(_ends(skeleton, soles, root[gap], rot[gap]), _stands(contact[gap], soles))
+    """The motion with its feet raised by `up (T, K)` m in the gap."""
     nothing = torch.zeros(len(up), dtype=rot.dtype)
     level = torch.tensor([1.0, 0.0, 0.0], dtype=rot.dtype).expand(len(up), 3)
     leads = {

@@ -28,6 +28,8 @@ from poise.synth.seams import meet, sampled
 #: 1e-4 the one with the least slide, against the recorded, in its worst of four CMU clips (03_01, 03_03,
 #: 11_01, 14_14). By the mean of the four 10 iterations at 3e-5 would be as good.
 EACH_GAP = Adaptation(iterations=20, lr=1e-4)
+#: Seconds over which the ends of a gap are brought to the speed of the kept motion.
+BLEND_S = 0.2
 #: Bones with directions that differ by more than this (mean over joints, cosine) are of another rig.
 _SAME_RIG = 0.94
 
@@ -37,13 +39,12 @@ class Filling:
     """How gaps are filled.
 
     samples: clips to make; the first is the network's best guess, the others are variants.
-    foot_lock: hold feet where the network says that they stand. blend_s: seconds over which the ends of
-    a gap are brought to the speed of the kept motion. adaptation: test-time adaptation of each gap.
+    foot_lock: hold feet where the network says that they stand. adaptation: test-time adaptation of each
+    gap.
     """
 
     samples: int = 1
     foot_lock: bool = True
-    blend_s: float = 0.2
     adaptation: Adaptation | None = None
     seed: int = 0
 
@@ -89,25 +90,25 @@ def fill_keyframes(
         t = torch.tensor((k - a) / (b - a), dtype=root.dtype)
         root[k] = root[a] + t * (root[b] - root[a])
         rot[k] = slerp(rot[a], rot[b], t.expand(rot.shape[1]))
-    rig = None
+    rig, feet = None, model.layout.feet
     if other is not None:
         rig = OtherRig.between(interpolated(own, root, rot, gaps), _example(other, clip, model))
+        feet = foot_joints(own.skeleton)
         warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
+    filler = _Filler(own, model, filling, keys, rig, feet)
     clips, made = [], 0
-
-    def count() -> None:
-        nonlocal made
-        made += 1
-        if on_gap is not None:
-            on_gap(made, len(gaps) * filling.samples)
-
     for sample in range(filling.samples):
         noise = None
         if sample:
             noise = torch.Generator().manual_seed(filling.seed * 100_003 + sample)
-        path = _filled(root.clone(), rot.clone(), gaps, keys, own, model, filling, noise, rig, count)
+        path = root.clone(), rot.clone()
+        for gap in gaps:
+            filler.fill(*path, gap, noise)
+            made += 1
+            if on_gap is not None:
+                on_gap(made, len(gaps) * filling.samples)
         name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
-        clips.append(_as_clip(clip, own, *path, name))
+        clips.append(_as_clip(clip, *path, name))
     return Filled(tuple(clips), tuple(warnings))
 
 
@@ -152,22 +153,26 @@ def _between(root: Tensor, rot: Tensor, gap: Gap) -> tuple[Tensor, Tensor]:
     return line, slerp(rot[a].expand(shape), rot[b].expand(shape), t[:, None].expand(shape[:2]))
 
 
-@torch.no_grad()
-def _filled(
-    root: Tensor, rot: Tensor, gaps: list[Gap], keys: tuple[int, ...], own: Clip,
-    model: InbetweenModel, filling: Filling, noise: torch.Generator | None, rig: OtherRig | None,
-    count: Callable[[], None],
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    feet = model.layout.feet if rig is None else foot_joints(own.skeleton)
-    blend = max(1, round(filling.blend_s * own.fps))
-    for gap in gaps:
+@dataclass(frozen=True, eq=False)
+class _Filler:
+    """Fills the gaps of one clip `own`; feet: its joints that may stand."""
+
+    own: Clip
+    model: InbetweenModel
+    filling: Filling
+    keys: tuple[int, ...]
+    rig: OtherRig | None
+    feet: Sequence[int]
+
+    @torch.no_grad()
+    def fill(self, root: Tensor, rot: Tensor, gap: Gap, noise: torch.Generator | None) -> None:
+        """Fills a gap in place."""
         a, b = gap
-        new_root, new_rot, contact = _transition(root, rot, gap, keys, own, model, filling, noise, rig)
-        root[a + 1 : b], rot[a + 1 : b] = new_root, new_rot
+        root[a + 1 : b], rot[a + 1 : b], contact = self._transition(root, rot, gap, noise)
         # Two frames before, and after the gap where they are kept, say how fast it must be met.
         low = max(0, a - 1)
-        high = min(len(root), b + 2) if b >= keys[-1] else b + 1
-        if filling.foot_lock and len(feet) == contact.shape[1]:
+        high = min(len(root), b + 2) if b >= self.keys[-1] else b + 1
+        if self.filling.foot_lock and len(self.feet) == contact.shape[1]:
             free = torch.zeros(high - low, dtype=torch.bool)
             free[a + 1 - low : b - low] = True
             stands = torch.zeros(high - low, contact.shape[1], dtype=torch.bool)
@@ -175,60 +180,50 @@ def _filled(
             # A keyframe next to a standing foot is where that foot stands.
             stands[a - low], stands[b - low] = stands[a + 1 - low], stands[b - 1 - low]
             rot[low:high] = lock_feet(
-                own.skeleton, feet, root[low:high], rot[low:high], stands, free, own.fps
+                self.own.skeleton, self.feet, root[low:high], rot[low:high], stands, free, self.own.fps
             )
+        blend = max(1, round(BLEND_S * self.own.fps))
         met = meet(root[low:high], rot[low:high], a + 1 - low, high - b, blend)
-        root[a + 1 : b], rot[a + 1 : b] = met[0][a + 1 - low : b - low], met[1][a + 1 - low : b - low]
-        count()
-    return root, rot
+        root[a + 1 : b], rot[a + 1 : b] = (x[a + 1 - low : b - low] for x in met)
 
+    def _transition(
+        self, root: Tensor, rot: Tensor, gap: Gap, noise: torch.Generator | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the network makes of one gap, at the clip's own frames."""
+        (a, b), own, model, rig = gap, self.own, self.model, self.rig
+        # The gap is cut into whole steps near the model's rate, so that both its ends lie on the grid.
+        length = max(1, round((b - a) * model.fps / own.fps) - 1)
+        step = (b - a) / (length + 1)
+        past = min(model.past, 1 + int(a / step + 1e-6))
+        before = sampled(root[: a + 1], rot[: a + 1], a - step * torch.arange(past - 1, -1, -1).double())
+        ahead, after = (root[b : b + 1], rot[b : b + 1]), self._after(root, rot, b, step)
+        offsets = torch.tensor(np.array((own if rig is None else rig.example).skeleton.offsets))
+        if rig is not None:
+            before, ahead = rig.to_model(before), rig.to_model(ahead)
+            after = None if after is None else rig.to_model(after)
+        seen = (x.unsqueeze(0).float() for x in (*before, ahead[0][0], ahead[1][0], offsets))
+        known, net = Known(*seen), model.net
+        if self.filling.adaptation is not None:
+            net = adapt(net, known, length, self.filling.adaptation)
+        if isinstance(net, Between) and after is not None:
+            filled = _with_after(net, known, length, after, noise)
+        else:
+            filled = net.fill(known, length, noise)
+        grid_root = torch.cat((before[0], filled.root[0].double(), ahead[0]))
+        grid_rot = torch.cat((before[1], filled.rot[0].double(), ahead[1]))
+        at = torch.arange(a + 1, b).double()
+        new_root, new_rot = sampled(grid_root, grid_rot, past - 1 + (at - a) / step)
+        if rig is not None:
+            new_root, new_rot = rig.changed(_between(root, rot, gap), (new_root, new_rot))
+        nearest = ((at - a) / step).round().long().clamp(1, length) - 1
+        return new_root, new_rot, filled.contact[0][nearest]
 
-def _transition(
-    root: Tensor, rot: Tensor, gap: Gap, keys: tuple[int, ...], own: Clip,
-    model: InbetweenModel, filling: Filling, noise: torch.Generator | None, rig: OtherRig | None,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """What the network makes of one gap, at the clip's own frames."""
-    a, b = gap
-    # The gap is cut into whole steps near the model's rate, so that both its ends lie on the grid.
-    length = max(1, round((b - a) * model.fps / own.fps) - 1)
-    step = (b - a) / (length + 1)
-    past = min(model.past, 1 + int(a / step + 1e-6))
-    before = sampled(root[: a + 1], rot[: a + 1], a - step * torch.arange(past - 1, -1, -1).double())
-    ahead = root[b : b + 1], rot[b : b + 1]
-    offsets = torch.tensor(np.array((own if rig is None else rig.example).skeleton.offsets))
-    if rig is not None:
-        before, ahead = rig.to_model(before), rig.to_model(ahead)
-    seen = [x.unsqueeze(0).float() for x in (*before, ahead[0][0], ahead[1][0], offsets)]
-    known = Known(seen[0], seen[1], seen[2], seen[3], seen[4])
-    net = model.net
-    if filling.adaptation is not None:
-        net = adapt(net, known, length, filling.adaptation)
-    after = _after(root, rot, b, keys, step, model)
-    if rig is not None and after is not None:
-        after = rig.to_model(after)
-    if isinstance(net, Between) and after is not None:
-        filled = _with_after(net, known, length, after, noise)
-    else:
-        filled = net.fill(known, length, noise)
-    grid_root = torch.cat((before[0], filled.root[0].double(), ahead[0]))
-    grid_rot = torch.cat((before[1], filled.rot[0].double(), ahead[1]))
-    at = torch.arange(a + 1, b).double()
-    places = past - 1 + (at - a) / step
-    new_root, new_rot = sampled(grid_root, grid_rot, places)
-    if rig is not None:
-        new_root, new_rot = rig.changed(_between(root, rot, gap), (new_root, new_rot))
-    nearest = ((at - a) / step).round().long().clamp(1, length) - 1
-    return new_root, new_rot, filled.contact[0][nearest]
-
-
-def _after(
-    root: Tensor, rot: Tensor, b: int, keys: tuple[int, ...], step: float, model: InbetweenModel
-) -> tuple[Tensor, Tensor] | None:
-    """Frames after the last keyframe at the model's rate, where the clip has any that are kept."""
-    count = min(model.past - 1, int((len(root) - 1 - b) / step + 1e-6))
-    if b < keys[-1] or count < 1:
-        return None
-    return sampled(root[b:], rot[b:], step * torch.arange(1, count + 1).double())
+    def _after(self, root: Tensor, rot: Tensor, b: int, step: float) -> tuple[Tensor, Tensor] | None:
+        """Frames after the last keyframe at the model's rate, where the clip has any that are kept."""
+        count = min(self.model.past - 1, int((len(root) - 1 - b) / step + 1e-6))
+        if b < self.keys[-1] or count < 1:
+            return None
+        return sampled(root[b:], rot[b:], step * torch.arange(1, count + 1).double())
 
 
 def _with_after(
@@ -247,7 +242,7 @@ def _with_after(
     return Transition(*(v[:, past : past + length] for v in filled))
 
 
-def _as_clip(clip: Clip, own: Clip, root: Tensor, rot: Tensor, name: str) -> Clip:
+def _as_clip(clip: Clip, root: Tensor, rot: Tensor, name: str) -> Clip:
     """The result on the clip's own skeleton, a still root included."""
     turned = rot.numpy()
     if still_root(clip):

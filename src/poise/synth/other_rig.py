@@ -17,13 +17,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from poise.kin.retarget.common_pose import CommonPose
-from poise.kin.retarget.plant import Scale
+from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
-from poise.kin.retarget.transfer import passage, transfer
 from poise.motion.clip import Clip
-from poise.motion.joint_map import JointMap, map_joints
-from poise.spatial import forward_kinematics, normalize, quat_conj, quat_mul, unwrap_quats
+from poise.motion.joint_map import map_joints
+from poise.spatial import forward_kinematics, normalize, quat_between, quat_mul, unwrap_quats
 
 Path = tuple[Tensor, Tensor]
 
@@ -35,9 +33,8 @@ class OtherRig:
 
     clip: Clip
     example: Clip
-    there: tuple[JointMap, JointMap]
-    poses: tuple[CommonPose, CommonPose]
-    scale: Scale
+    there: Passage
+    back: Passage
 
     @staticmethod
     def between(clip: Clip, example: Clip) -> OtherRig:
@@ -46,31 +43,29 @@ class OtherRig:
         Raises:
             PoiseError: a skeleton without pelvis or legs.
         """
-        joints, here, there = passage(clip, example)
-        back = map_joints(example.skeleton, clip.skeleton)
-        scale = Scale.between(World.of(clip), clip.fps, joints, here, there, None)
-        return OtherRig(clip, example, (joints, back), (here, there), scale)
+        there = Passage.between(clip, example)
+        joints = map_joints(example.skeleton, clip.skeleton)
+        back = Passage(joints, there.there, there.here, there.scale.inverse())
+        return OtherRig(clip, example, there, back)
 
     def to_model(self, path: Path) -> Path:
         """A path of the clip's skeleton on the network's."""
-        rot, root = transfer(self._world(self.clip, path), self.there[0], *self.poses, self.scale)
-        return root, unwrap_quats(normalize(rot))
+        return self._passed(self.clip, self.there, path)
 
     def to_clip(self, path: Path) -> Path:
         """A path of the network's skeleton on the clip's."""
-        inverse = Scale(1.0 / self.scale.factor, self.scale.centre, self.scale.ground)
-        here, there = self.poses
-        rot, root = transfer(self._world(self.example, path), self.there[1], there, here, inverse)
-        return root, unwrap_quats(normalize(rot))
+        return self._passed(self.example, self.back, path)
 
     def changed(self, known: Path, filled: Path) -> Path:
         """`known` on the clip's skeleton with what makes `filled`, on the network's, differ from it."""
         before, after = self.to_clip(self.to_model(known)), self.to_clip(filled)
         root = known[0] + after[0] - before[0]
-        turn = quat_mul(quat_conj(before[1]), after[1])
+        turn = quat_between(before[1], after[1])
         return root, unwrap_quats(normalize(quat_mul(known[1], turn)))
 
     @staticmethod
-    def _world(clip: Clip, path: Path) -> World:
+    def _passed(clip: Clip, passage: Passage, path: Path) -> Path:
         skeleton = clip.skeleton
-        return World(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
+        world = World(*forward_kinematics(skeleton.parents, torch.tensor(skeleton.offsets), *path))
+        rot, root = passage.transfer(world)
+        return root, unwrap_quats(normalize(rot))

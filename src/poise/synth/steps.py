@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 
 #: Below this distance (m) of ankle or toes, whichever is less, a foot shuffles, turns or rolls.
 LEAST_M = 0.05
@@ -73,15 +73,15 @@ def stepping(stands: Tensor, steps: Sequence[Step], columns: Sequence[Sequence[i
     return stands
 
 
-def rises(soles: Tensor, stands: Tensor, clear: float = CLEAR_M) -> Tensor:
-    """`(T, K)` m, how much higher feet must be for each to be `clear` of the floor in mid-swing.
+def rises(soles: Tensor, stands: Tensor) -> Tensor:
+    """`(T, K)` m, how much higher feet must be for each to be `CLEAR_M` clear of the floor in mid-swing.
 
     Args:
         soles: `(T, K, 2, 3)` m, of a gap with one kept frame at each end.
         stands: `(T, K)` bool.
 
     The floor is at the lowest place of each end of the foot. Of a swing by more than `LEAST_M` the
-    height h(t) above it is to be at least `clear sin(pi t)`, by A sin^2(pi t) more.
+    height h(t) above it is to be at least `CLEAR_M sin(pi t)`, by A sin^2(pi t) more.
     """
     height = soles[..., 2] - soles[..., 2].amin(0)
     low, up = height.amin(-1), torch.zeros(stands.shape, dtype=soles.dtype)
@@ -95,10 +95,10 @@ def rises(soles: Tensor, stands: Tensor, clear: float = CLEAR_M) -> Tensor:
             count = last - first + 1
             t = torch.arange(1, count + 1, dtype=soles.dtype) / (count + 1)
             arc = torch.sin(torch.pi * t)
-            short = (clear * arc - low[first : last + 1, k]) / arc**2
+            short = (CLEAR_M * arc - low[first : last + 1, k]) / arc**2
             inner = (t - 0.5).abs() <= 0.5 * _MIDDLE
             if bool(inner.any()):
-                up[first : last + 1, k] = short[inner].amax().clamp(0, clear) * arc**2
+                up[first : last + 1, k] = short[inner].amax().clamp(0, CLEAR_M) * arc**2
     return up
 
 

@@ -45,18 +45,15 @@ def pose_rows(
     frames: Sequence[int],
     fps: float,
     keys: Sequence[int] = (),
-    side: float | None = None,
     path: Path | str | None = None,
 ) -> str:
-    """Rows of figures seen from the side, Z up; figures of `keys` are drawn in the ink's colour.
+    """Rows of figures seen from beside a walk, Z up; figures of `keys` are drawn in the ink's colour.
 
     A row's figures stand side by side, each about the ghost's root (or its own), so that what lies apart
     at one moment is seen apart.
 
     Args:
         frames: the moments shown.
-        side: rad, azimuth of the direction that points right; by default the one along which the
-            first row's joints move most about its root, as seen from beside a walk.
         path: also writes the SVG there.
 
     Raises:
@@ -68,8 +65,7 @@ def pose_rows(
                 raise PoiseError(
                     f"'{row.name}' has not the {len(parents)} joints or {max(frames)} frames"
                 )
-    if side is None:
-        side = _busiest(rows[0].pos if rows[0].ghost is None else rows[0].ghost)
+    side = _busiest(rows[0].pos if rows[0].ghost is None else rows[0].ghost)
     right = np.array([np.cos(side), np.sin(side), 0.0])
     width = 2 * _LEFT + _STEP * (len(frames) - 1)
     height = _TOP + len(rows) * (_SIZE + _GAP) + 14

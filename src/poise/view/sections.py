@@ -1,67 +1,51 @@
-"""The HTML of the report's tiles, plots, notes and facts."""
+"""The figures, notes and facts of the report."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from html import escape
+from typing import NamedTuple
 
 import numpy as np
 
 from poise.view.data import Report, body_weight, number
 from poise.view.svg import bar_plot, line_plot
-from poise.view.verdict import grades
 
 _CLOCK = (("hours", 3600.0, 7200.0), ("minutes", 60.0, 300.0), ("seconds", 1.0, -math.inf))
 _SIM, _REF, _HELP, _HELP2 = "var(--sim)", "var(--ref)", "var(--help)", "var(--contact)"
 
 
-def tiles(report: Report) -> str:
-    """The four judged figures, each with its level and the thresholds behind it."""
-    out = []
-    for grade in grades(report.score):
-        detail = f"<small>{escape(grade.detail)}</small>" if grade.detail else ""
-        out.append(
-            f'<div class="tile {grade.level}"><div class="name">{escape(grade.name)}'
-            f'<span class="chip">{grade.level}</span></div>'
-            f'<div class="value">{escape(grade.value)}</div>'
-            f'{detail}<small class="rule">{escape(grade.rule)}</small></div>'
-        )
-    return "\n".join(out)
+class Figure(NamedTuple):
+    """One figure of the page.
+
+    Attributes:
+        title: its heading.
+        text: what it shows, or why there is nothing to show.
+        plot: the SVG, "" where there is nothing to show.
+        legend: names and colours of its lines.
+        unit: of the horizontal axis.
+        time: whether that axis is the replay's time.
+    """
+
+    title: str
+    text: str
+    plot: str = ""
+    legend: tuple[tuple[str, str], ...] = ()
+    unit: str = ""
+    time: bool = False
 
 
-def _figure(
-    title: str,
-    text: str,
-    body: str,
-    legend: tuple[tuple[str, str], ...] = (),
-    unit: str = "",
-    time: bool = False,
-) -> str:
-    keys = "".join(f'<span><i style="background:{c}"></i>{escape(n)}</span>' for n, c in legend)
-    return (
-        f'<figure data-time="{int(time)}" data-unit="{escape(unit, quote=True)}">'
-        f"<figcaption><h2>{escape(title)}</h2><p>{escape(text)}</p></figcaption>"
-        + (f'<div class="legend">{keys}</div>' if keys else "")
-        + f"{body}</figure>"
-    )
-
-
-def _empty(text: str) -> str:
-    return f'<p class="empty">{escape(text)}</p>'
-
-
-def plots(report: Report) -> str:
+def figures(report: Report) -> tuple[Figure, ...]:
     """The four figures: error and help per frame, learning curve, reward terms."""
-    return "\n".join((_error(report), _help(report), _curve(report), _reward(report)))
+    return _error(report), _help(report), _curve(report), _reward(report)
 
 
-def _error(report: Report) -> str:
+def _error(report: Report) -> Figure:
     title = "Error per frame"
     local = np.asarray(report.error_mm, dtype=np.float64)
     world = np.asarray(report.error_global_mm, dtype=np.float64)
     if not (np.isfinite(local).any() or np.isfinite(world).any()):
-        return _figure(title, "", _empty("No error was measured for this clip."))
+        return Figure(title, "No error was measured for this clip.")
     at = np.arange(len(local)) / report.fps
     names = ("pose, relative to the root", "in the world, drift included")
     colors = (_SIM, _REF)
@@ -75,13 +59,13 @@ def _error(report: Report) -> str:
         inline=True,
     )
     text = "Mean distance between the joints of simulation and reference."
-    return _figure(title, text, body, tuple(zip(names, colors, strict=True)), "s", True)
+    return Figure(title, text, body, tuple(zip(names, colors, strict=True)), "s", True)
 
 
-def _help(report: Report) -> str:
+def _help(report: Report) -> Figure:
     title = "Help per frame"
     if report.force is None and report.torque is None:
-        return _figure(title, "", _empty("No residual force was recorded for this run."))
+        return Figure(title, "No residual force was recorded for this run.")
     series: list[tuple[str, np.ndarray, np.ndarray]] = []
     colors: list[str] = []
     for name, vector, color in (
@@ -100,7 +84,7 @@ def _help(report: Report) -> str:
     )
     legend = tuple((name, c) for (name, *_), c in zip(series, colors, strict=True))
     text = "What the residual force and torque on the root add from outside."
-    return _figure(title, text, body, legend, "s", True)
+    return Figure(title, text, body, legend, "s", True)
 
 
 def _columns(curve: dict[str, np.ndarray], name: str, count: int | None = None) -> np.ndarray | None:
@@ -111,11 +95,11 @@ def _columns(curve: dict[str, np.ndarray], name: str, count: int | None = None) 
     return out if np.isfinite(out).any() and (count is None or len(out) == count) else None
 
 
-def _curve(report: Report) -> str:
+def _curve(report: Report) -> Figure:
     title = "Learning curve"
     reward = _columns(report.curve, "reward")
     if reward is None:
-        return _figure(title, "", _empty("No learning curve: nothing was learned, or it was not kept."))
+        return Figure(title, "No learning curve: nothing was learned, or it was not kept.")
     samples, seconds = (_columns(report.curve, k, len(reward)) for k in ("samples", "seconds"))
     x, label, unit = np.arange(len(reward), dtype=np.float64), "iteration", "iterations"
     top: tuple[str, Callable[[float], float]] | None = None
@@ -139,10 +123,10 @@ def _curve(report: Report) -> str:
         inline=True,
     )
     last = reward[np.isfinite(reward)][-1]
-    return _figure(title, f"Mean reward while learning; last value {last:.3g}.", body, (), unit)
+    return Figure(title, f"Mean reward while learning; last value {last:.3g}.", body, (), unit)
 
 
-def _reward(report: Report) -> str:
+def _reward(report: Report) -> Figure:
     title = "Reward per term"
     reward = report.score.get("reward")
     if isinstance(reward, dict):
@@ -156,13 +140,13 @@ def _reward(report: Report) -> str:
             )
             total = number(reward.get("total"))
             whole = "" if total is None else f" Weighted total: {total:.3f}."
-            return _figure(title, f"Averages over the evaluated frames.{whole}", body)
+            return Figure(title, f"Averages over the evaluated frames.{whole}", body)
     value = number(reward.get("total") if isinstance(reward, dict) else reward)
     text = "No reward was recorded." if value is None else f"Only the total was recorded: {value:.3f}."
-    return _figure(title, "", _empty(text))
+    return Figure(title, text)
 
 
-def notes(report: Report, held_reference: int, held_simulated: int) -> str:
+def notes(report: Report, held_reference: int, held_simulated: int) -> list[str]:
     """What was guessed, repaired or limited, and frames that could not be drawn."""
     lines = list(report.notes)
     for track, held in ((report.reference, held_reference), (report.simulated, held_simulated)):
@@ -171,13 +155,9 @@ def notes(report: Report, held_reference: int, held_simulated: int) -> str:
                 f"{held} frame{'s' if held > 1 else ''} of '{track.name}' had values that "
                 "are not finite; the replay holds the last good pose there."
             )
-    if not lines:
-        return "<p>Nothing was guessed or repaired.</p>"
-    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+    return lines
 
 
-def facts(report: Report) -> str:
-    """Clip, method, seed and so on, as a list of names and values."""
-    rows = report.facts or {"frames": str(len(report.error_mm)), "fps": f"{report.fps:g}"}
-    cells = (f"<dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd>" for k, v in rows.items())
-    return f"<dl>{''.join(cells)}</dl>"
+def facts(report: Report) -> dict[str, str]:
+    """Clip, method, seed and so on."""
+    return report.facts or {"frames": str(len(report.error_mm)), "fps": f"{report.fps:g}"}

@@ -76,17 +76,6 @@ def _write(text: str, path: Path | str | None) -> str:
     return text
 
 
-_Line = tuple[str, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]
-
-
-def _split(entry: Sequence[Any]) -> _Line:
-    name, x, y = str(entry[0]), _numbers(entry[1]), _numbers(entry[2])
-    band = entry[3:] if len(entry) == 5 else (entry[3] if len(entry) == 4 else None)
-    if band is None:
-        return name, x, y, None, None
-    return name, x, y, _numbers(band[0]), _numbers(band[1])
-
-
 def _range(values: list[np.ndarray], zero: bool) -> tuple[float, float]:
     flat = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.zeros(0)
     if flat.size == 0:
@@ -116,17 +105,19 @@ def line_plot(
     """Lines over a shared x axis as one SVG text.
 
     Args:
-        series: `(name, x, y)`, or `(name, x, y, (low, high))` with a shaded band, or the five flat; gaps
-            where NaN.
+        series: `(name, x, y)`, or `(name, x, y, (low, high))` with a shaded band; gaps where NaN.
         path: where to write the file too.
         zero: let the y axis include 0.
         right: label and factor of a second y axis, right value = factor times left value.
         top: label and function of a second x axis.
         inline: for a page that brings style and heading.
     """
-    lines = [_split(entry) for entry in series]
+    lines = [
+        (str(name), _numbers(x), _numbers(y), [_numbers(v) for edges in band for v in edges])
+        for name, x, y, *band in series
+    ]
     xs = [x for _, x, *_ in lines]
-    ys = [v for _, _, *rest in lines for v in rest if v is not None]
+    ys = [v for _, _, y, band in lines for v in (y, *band)]
     flat = np.concatenate([v[np.isfinite(v)] for v in xs]) if xs else np.zeros(0)
     x0, x1 = (float(flat.min()), float(flat.max())) if flat.size else (0.0, 1.0)
     x1 = x1 if x1 > x0 else x0 + 1.0
@@ -160,10 +151,11 @@ def line_plot(
     sides = (right[0] if right else "", top[0] if top else "")
     out.append(_labels(xlabel, ylabel, *sides, left, end, up, down))
     plot: dict[str, Any] = {"x": [x0, x1], "px": [left, end], "py": [up, down], "w": _W, "series": []}
-    for k, (name, x, y, low, high) in enumerate(lines):
+    for k, (name, x, y, band) in enumerate(lines):
         color = colors[k % len(colors)]
         keep = _thin(len(x))
-        if low is not None and high is not None:
+        if band:
+            low, high = band
             ok = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
             edge = np.concatenate([px(x[ok]), px(x[ok])[::-1]])
             rim = np.concatenate([py(high[ok]), py(low[ok])[::-1]])
@@ -185,7 +177,6 @@ def bar_plot(
     items: Sequence[tuple[str, float]],
     title: str,
     xlabel: str,
-    path: Path | str | None = None,
     *,
     most: float | None = None,
     color: str = COLORS[0],
@@ -224,7 +215,7 @@ def bar_plot(
         x = max(px(value), px(0.0)) if math.isfinite(value) else px(0.0)
         out.append(f'<text class="pp-k" x="{x + 8:.1f}" y="{y + 20:g}">{text}</text>')
     out.append(_labels(xlabel, "", "", "", left, end, up, down))
-    return _write("".join(out).replace(" data-plot", "", 1) + "</svg>", path)
+    return "".join(out).replace(" data-plot", "", 1) + "</svg>"
 
 
 def _few(values: np.ndarray) -> list[float | None]:

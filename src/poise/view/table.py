@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 from poise.view.data import number
 from poise.view.verdict import percent
@@ -43,7 +42,7 @@ def amount(value: Any, unit: str = "") -> str:
     """A figure with its unit, or a dash where there is none."""
     size = number(value)
     if size is None:
-        return escape(value) if isinstance(value, str) else NONE
+        return value if isinstance(value, str) else NONE
     if isinstance(value, bool):
         return "yes" if value else "no"
     if unit == "%":
@@ -55,11 +54,15 @@ def amount(value: Any, unit: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
-def _row(name: str, value: str, before: str, meaning: str, mark: str = "") -> str:
-    return (
-        f'<tr><th scope="row">{escape(name)}</th><td class="n {mark}">{value}</td>'
-        f'<td class="n">{before}</td><td class="m">{escape(meaning)}</td></tr>'
-    )
+class Row(NamedTuple):
+    """One figure of the table: what it is called, its amount and the clip's own, what it means, and
+    whether it is "better" or "worse" than the clip's, else ""."""
+
+    name: str
+    value: str
+    before: str = ""
+    meaning: str = ""
+    mark: str = ""
 
 
 def _mark(after: float | None, before: float | None) -> str:
@@ -69,30 +72,28 @@ def _mark(after: float | None, before: float | None) -> str:
     return "better" if after < before else "worse"
 
 
-def score_table(score: dict[str, Any]) -> str:
-    """The whole score as an HTML table; keys that are not known are listed last as they are."""
+def score_rows(score: dict[str, Any]) -> list[Row]:
+    """The whole score as rows of a table; keys that are not known are listed last as they are."""
     raw = score.get("reference")
     before: dict[str, Any] = raw if isinstance(raw, dict) else {}
     share = number(score.get("succ"))
     rule = str(score.get("succ_rule") or "share of starts that reach the end")
-    rows = [_row("Whole clip tracked", NONE if share is None else percent(share), "", rule)]
+    rows = [Row("Whole clip tracked", NONE if share is None else percent(share), "", rule)]
     for key, name, unit, meaning in _ROWS:
         mark = _mark(number(score.get(key)), number(before.get(key)))
         beside = amount(before[key], unit) if key in before else ""
-        rows.append(_row(name, amount(score.get(key), unit), beside, meaning, mark))
+        rows.append(Row(name, amount(score.get(key), unit), beside, meaning, mark))
     reward = score.get("reward")
     total = reward.get("total") if isinstance(reward, dict) else reward
     if number(total) is not None:
-        rows.append(_row("Reward", amount(total), "", "mean per step"))
+        rows.append(Row("Reward", amount(total), "", "mean per step"))
     table = score.get("help")
     if isinstance(table, dict):
         known = {key for key, *_ in _HELP}
         for key, name, unit, text in _HELP:
-            rows.append(_row(f"Help: {name.lower()}", amount(table.get(key), unit), "", text))
-        rows += [_row(f"Help: {key}", amount(v), "", "") for key, v in table.items() if key not in known]
-    rows += [_row(name, amount(score.get(key), unit), "", text) for key, name, unit, text in _RUN]
+            rows.append(Row(f"Help: {name.lower()}", amount(table.get(key), unit), "", text))
+        rows += [Row(f"Help: {key}", amount(v)) for key, v in table.items() if key not in known]
+    rows += [Row(name, amount(score.get(key), unit), "", text) for key, name, unit, text in _RUN]
     listed = _SPECIAL | {key for key, *_ in _ROWS + _RUN}
     rest = {k: v for k, v in score.items() if k not in listed and not isinstance(v, dict | list)}
-    rows += [_row(str(k), amount(v), "", "") for k, v in rest.items()]
-    head = '<tr><th>Measure</th><th>Simulation</th><th>Clip itself</th><th class="m">Meaning</th></tr>'
-    return f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
+    return rows + [Row(str(k), amount(v)) for k, v in rest.items()]

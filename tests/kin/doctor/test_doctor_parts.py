@@ -13,9 +13,9 @@ from planted_faults import exchanged, lifted
 from poise.body import Anatomy
 from poise.errors import PoiseError
 from poise.kin import anatomy_of, examine, find_guesses, fit_humanoid, grounded, heal, support_of
+from poise.kin.doctor.doctor import limit_faults
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import trembling
-from poise.kin.doctor.limits import limit_faults
 from poise.kin.doctor.sides import side_votes
 from poise.kin.doctor.slides import mend_slides
 from poise.kin.doctor.support import foot_slips, slide_faults
@@ -165,7 +165,7 @@ def test_a_stated_floor_is_believed_by_the_body() -> None:
     known = grounded(clip, None, 0.17)
     assert known.skeleton.source.ground_m == 0.17
     _, held, report = fit_humanoid(known)
-    assert report.ground[0].lift_m == 0.0
+    assert report.clips[0].ground.lift_m == 0.0
     # Without it the soles decide, and they stand 20 cm up.
     assert free[0][:, 2].mean() < clip.root_pos[:, 2].mean() - 0.1
     assert abs(held[0][:, 2].mean() - known.root_pos[:, 2].mean()) < 0.04

@@ -7,14 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from paper_humanoid import body_points, count_jumps, paper_humanoid
 
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
 from poise.kin import IkBody, IkConfig, Kinematics, analytic_ik, clip_ik, clip_to_qpos, ik_body
-from poise.kin.ik.angles import count_jumps
-from poise.kin.ik.body import body_points
-from poise.kin.ik.paper import paper_humanoid
 from poise.motion import Skeleton, read_clip
 from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, quat_to_matrix
 

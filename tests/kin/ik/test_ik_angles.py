@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from paper_humanoid import count_jumps
 
 from poise.kin.ik.angles import (
     continuous_euler,
-    count_jumps,
     euler_angles,
     one_turn_check,
     pointing_angles,
@@ -19,13 +19,7 @@ from poise.kin.ik.angles import (
     zyx_angles,
     zyx_matrix,
 )
-from poise.kin.ik.vectors import (
-    arc,
-    frame_of,
-    prefix_product,
-    rotate,
-    square_to,
-)
+from poise.kin.ik.bend import arc, frame_of, prefix_product, rotate, square_to
 from poise.spatial import euler_to_quat, normalize, quat_to_matrix
 
 ORDERS = ["".join(p) for p in itertools.permutations("XYZ")]

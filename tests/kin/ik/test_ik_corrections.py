@@ -7,14 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from paper_humanoid import body_points, count_jumps, paper_humanoid
 
 import toy_human
 from poise.body import generate_table
 from poise.errors import PoiseError
 from poise.kin import CORRECTIONS, IkBody, IkConfig, Kinematics, analytic_ik, ik_body
-from poise.kin.ik.angles import count_jumps
-from poise.kin.ik.body import body_points
-from poise.kin.ik.paper import paper_humanoid
 from poise.motion import Skeleton
 from poise.spatial import quat_to_matrix
 

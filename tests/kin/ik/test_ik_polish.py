@@ -7,12 +7,12 @@ import sys
 import numpy as np
 import pytest
 import torch
+from paper_humanoid import body_points
 
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import IkBody, Kinematics, PolishConfig, clip_ik, polish
-from poise.kin.ik.body import body_points
+from poise.kin import IkBody, Kinematics, clip_ik, polish
 from poise.spatial import quat_to_matrix
 
 pytest.importorskip("mink")
@@ -61,7 +61,7 @@ def test_a_target_out_of_reach_brings_no_worse(humanoid):
     q = clip_ik(toy_human.swing(seconds=0.2), humanoid)
     far = points(humanoid, q)["LeftHand"] + [0.0, 1.0, 1.0]
     keep = points(humanoid, q)["Hips"]
-    got = polish(q, {"LeftHand": far, "Hips": keep}, humanoid, PolishConfig(steps=5))
+    got = polish(q, {"LeftHand": far, "Hips": keep}, humanoid, steps=5)
     assert got.after_mm < got.before_mm
     assert np.isfinite(got.qpos).all()
 

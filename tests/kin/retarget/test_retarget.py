@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from poise.body.topology import subtree
 from poise.errors import PoiseError
 from poise.kin import RetargetConfig, retarget
 from poise.kin.feet.contact import rest_height
 from poise.kin.limbs import match_positions
-from poise.kin.retarget.common_pose import common_pose, hanging
+from poise.kin.retarget.common_pose import common_pose
 from poise.kin.retarget.plant import BLEND_S, contact_weight
 from poise.kin.retarget.standing import World, hinge_axis
 from poise.motion import Clip, Skeleton, find_roles, read_clip, resample, trim
@@ -401,9 +402,9 @@ def test_the_ground_is_where_feet_rest() -> None:
     assert rest_height(points, 60.0) == pytest.approx(0.03, abs=2e-3)
 
 
-def test_hanging_is_the_subtree() -> None:
+def test_what_hangs_on_a_joint_is_its_subtree() -> None:
     s = human()
-    assert {s.names[j] for j in hanging(s, s.index("LeftLeg"))} == {"LeftLeg", "LeftFoot", "LeftToe"}
+    assert {s.names[j] for j in subtree(s, s.index("LeftLeg"))} == {"LeftLeg", "LeftFoot", "LeftToe"}
 
 
 def test_the_report_is_plain_data_and_sentences() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from poise.body import Humanoid
 from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
 from poise.kin.feet.level import Levelled
+from poise.kin.fit import ClipFit
 from poise.kin.ground import clip_flights
 from poise.motion import Clip
 
@@ -50,10 +51,9 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     clip = clip.replaced(cyclic=False)
     on = place_on_body(clip, humanoid.table, tracker.example, rate, near=humanoid)
     flights = clip_flights(on.moved, humanoid.table)
-    one = ((clip.name,), (clip.fps,), (flights,), (on.cleaned,), (None,), (on.ground,))
-    report = FitReport(*one, (on.joint_error_mm,), (), ())
+    fit = ClipFit(clip.name, clip.fps, flights, on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
-    return Placed(clip, on.moved, on.qpos, report, on.retargeting, on.level, notes)
+    return Placed(clip, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
 
 
 def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:

@@ -209,10 +209,8 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     many["com"] = many["com"] + shift
     many["qpos"] = made.pose.qpos
     made = made.with_pose(replace(pose, **many))
-    report = imitation.report
-    each = ("fps", "flights", "clean", "cycles", "ground", "joint_error_mm")
-    copies = {name: getattr(report, name) * count for name in each}
-    report = replace(report, names=tuple(names), **copies)
+    fits = tuple(replace(imitation.report.clips[0], name=n) for n in names)
+    report = replace(imitation.report, clips=fits)
     clips = ClipLibrary(tuple(clip.replaced(name=n) for n in names), (1.0,) * count)
     return replace(imitation, library=clips, reference=made, report=report)
 

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable
+from poise.kin.fk import carried
 from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
-from poise.kin.runs import find_runs
-from poise.kin.solids import centre_of_mass
+from poise.kin.series import find_runs, gaussian
+from poise.kin.solids import centre_of_mass, poses_of
 from poise.motion import Clip
-from poise.spatial import GRAVITY, quat_rotate
+from poise.spatial import GRAVITY
 
 Kind = Literal["held", "leaning", "below"]
 #: Standard deviation (s) of the low-pass on the centre of mass before it is differentiated twice.
@@ -93,8 +94,7 @@ def not_alone(clip: Clip, table: BodyTable, rules: AloneRules | None = None) -> 
     `aloft_m` for more than `held_s`.
     """
     rules = rules or AloneRules()
-    joints = [r.joint for r in table.rows]
-    pos, quat = (torch.tensor(x[:, joints]) for x in clip.world())
+    pos, quat = poses_of(clip, table)
     points = extreme_points(table, pos, quat).numpy()
     com = centre_of_mass(table, pos, quat).numpy()
     low = points[..., 2].min(-1)
@@ -137,12 +137,10 @@ def extreme_points(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
                 ends = [(0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]
             elif geom.kind == "box":
                 ends, radius = list(itertools.product(*((-x, x) for x in size))), 0.0
+            down = torch.tensor([0.0, 0.0, radius], dtype=pos.dtype)
             for end in ends:
-                local = torch.tensor(geom.pos, dtype=pos.dtype) + quat_rotate(
-                    turn, torch.tensor(end, dtype=pos.dtype)
-                )
-                point = pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i]))
-                out.append(point - torch.tensor([0.0, 0.0, radius], dtype=pos.dtype))
+                local = carried(torch.tensor(geom.pos, dtype=pos.dtype), turn, end)
+                out.append(carried(pos[:, i], quat[:, i], local) - down)
     return torch.stack(out, 1)
 
 
@@ -152,10 +150,10 @@ def balance_point(com: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
     The path is smoothed by a Gaussian of `SMOOTH_S`, going on beyond its ends as it comes.
     """
     reach = min(round(4 * SMOOTH_S * fps), len(com) - 1)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (SMOOTH_S * fps)) ** 2)
+    kernel = gaussian(SMOOTH_S * fps, reach)
     # An odd reflection keeps the speed at the ends, where an even one would stop the body.
     padded = np.pad(com, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
-    smooth = np.stack([np.convolve(x, kernel / kernel.sum(), "valid") for x in padded.T], -1)
+    smooth = np.stack([np.convolve(x, kernel, "valid") for x in padded.T], -1)
     acc = np.gradient(np.gradient(smooth, axis=0), axis=0) * fps**2
     up = GRAVITY + acc[:, 2]
     held = np.maximum(up, LEAST_WEIGHT * GRAVITY)

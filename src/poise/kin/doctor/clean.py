@@ -62,7 +62,7 @@ def _by_joint(found: Sequence[Any]) -> list[tuple[str, list[Any]]]:
 
 
 def _frames(found: Sequence[Any]) -> str:
-    count = sum(f.frames for f in found)
+    count = sum(f.stop - f.start + 1 for f in found)
     return f"{count} frame{'' if count == 1 else 's'}"
 
 

@@ -10,20 +10,23 @@ import numpy as np
 import torch
 
 from poise.body import Anatomy
+from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
-from poise.kin.doctor.faults import Fault, by_kind
+from poise.kin.doctor.faults import Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
-from poise.kin.doctor.limits import limit_faults
 from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import mend_path, mend_slides
-from poise.kin.doctor.support import Support, anatomy_of, slide_faults, support_faults, support_of
+from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
 from poise.kin.feet.contact import NEAR_M
 from poise.kin.flight import likely_rate
-from poise.kin.ground import smooth_lift
+from poise.kin.hinges import chain_angles
+from poise.kin.series import smooth_lift
 from poise.metrics import floating, foot_slide, jerk, penetration
 from poise.motion import Clip
 
+#: Degrees beyond a limit that a file states which count, and for how long (s): they are rough.
+BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
 
@@ -57,7 +60,11 @@ def examine(clip: Clip) -> Examination:
     faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
     faults += [*limit_faults(clip), *_read_faults(clip)]
     if support is not None:
-        faults += [*support_faults(clip, support), *_rate_faults(support, clip)]
+        faults += [
+            *height_faults(clip, support),
+            *slide_faults(clip, support),
+            *_rate_faults(support, clip),
+        ]
     if exchanged_sides(clip, anatomy):
         hint = "the joints named left lie on the body's right; --swap-sides exchanges the names"
         faults.append(Fault("sides", "", 0, clip.frames - 1, 1.0, hint))
@@ -96,7 +103,7 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     lift = np.full(clip.frames, -support.off_m)
     settle = support.fit.settle_m
     if any(
-        f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in support_faults(clip, support)
+        f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in height_faults(clip, support)
     ):
         lift -= settle
     # Points deeper than their margin come up to half of it, so that rounding leaves nothing behind.
@@ -136,6 +143,33 @@ def _read_faults(clip: Clip) -> list[Fault]:
         Fault(kind, joint, a, clip.frames - 1 if b < 0 else b, size * scale.get(kind, 1.0))
         for kind, joint, a, b, size in clip.skeleton.source.mended
     ]
+
+
+def limit_faults(clip: Clip) -> list[Fault]:
+    """Spells in which a joint is more than `BEYOND_DEG` beyond the file's own limits.
+
+    Angles are the file's own degrees of freedom, continuous in time; each may be a whole turn away.
+    """
+    out: list[Fault] = []
+    source = clip.skeleton.source
+    if source.format != "asf-amc" or not source.channels:
+        return out
+    gap = round(0.1 * clip.fps)
+    for j, channel in enumerate(source.channels):
+        letters = [c[1].upper() for c in channel.order if c[0] == "r"]
+        if j == 0 or not letters or len(channel.limits) != len(letters):
+            continue
+        axis = channel.axis or (0.0, 0.0, 0.0)
+        frame = torch.tensor(asf_axis_quat(axis, channel.axis_order, source.up_axis))
+        # ASF lists the first-applied turn first, a chain its outermost hinge.
+        low, high = np.array(channel.limits[::-1]).T
+        middle = torch.tensor((low + high) / 2)
+        order = "".join(reversed(letters))
+        angles = chain_angles(torch.tensor(clip.rot[:, j]), order, frame, middle).numpy()
+        over = np.degrees(np.maximum(np.maximum(low - angles, angles - high), 0.0)).max(-1)
+        found = spell_faults("limit", clip.skeleton.names[j], over, over > BEYOND_DEG, gap)
+        out += [f for f in found if f.stop - f.start >= round(LASTING_S * clip.fps)]
+    return out
 
 
 def _rate_faults(support: Support, clip: Clip) -> list[Fault]:

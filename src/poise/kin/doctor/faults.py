@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 
 
 class Kind(NamedTuple):
@@ -82,11 +82,3 @@ def spell_faults(
     """
     runs = [(a, b) for a, b in find_runs(bad, gap) if b - a + 1 >= least]
     return [Fault(kind, joint, a, b, float(np.max(size[a : b + 1]))) for a, b in runs]
-
-
-def frames_of(faults: Sequence[Fault], frames: int) -> np.ndarray:
-    """`(T,)` bool, the frames that some of the faults cover."""
-    out = np.zeros(frames, dtype=bool)
-    for fault in faults:
-        out[max(fault.start, 0) : fault.stop + 1] = True
-    return out

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from poise.body import Anatomy
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
-from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, quat_to_rotvec, rotvec_to_quat
+from poise.spatial import normalize, quat_angle, quat_between, quat_mul, quat_to_rotvec, rotvec_to_quat
 
 #: Angles (rad) from the neutral pose that no foot or hand reaches. A foot: 50 degrees of plantar flexion
 #: (American Academy of Orthopaedic Surgeons) and about twice that in a ballet dancer on pointe, to which
@@ -38,11 +38,6 @@ class Flip:
     angle_deg: float
     before_deg: float
     after_deg: float
-
-    @property
-    def frames(self) -> int:
-        """How many frames were turned back."""
-        return self.stop - self.start + 1
 
 
 def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip, ...]]:
@@ -75,7 +70,7 @@ def unflip(clip: Clip, anatomy: Anatomy, speed: float) -> tuple[Clip, tuple[Flip
             if back is None:
                 continue
             spell = slice(start, stop + 1)
-            fixed = normalize(quat_mul(rot[spell, j], back.expand(stop + 1 - start, 4)))
+            fixed = normalize(quat_mul(rot[spell, j], back))
             turned, before, after = quat_angle(back), away[spell].median(), _from(home, fixed).median()
             rot[spell, j] = fixed
             numbers = [math.degrees(float(x)) for x in (turned, before, after)]
@@ -118,12 +113,12 @@ def neutral_pose(clip: Clip, anatomy: Anatomy) -> tuple[Tensor, bool]:
 
 
 def _from(home: Tensor, rot: Tensor) -> Tensor:
-    return quat_angle(quat_mul(quat_conj(home).expand_as(rot), rot))
+    return quat_angle(quat_between(home, rot))
 
 
 def _jumps(rot: Tensor, start: int, stop: int, step: float, fps: float) -> bool:
     """Whether some step near either end of the spell is larger than `step` rad."""
-    steps = quat_angle(quat_mul(quat_conj(rot[:-1]), rot[1:]))
+    steps = quat_angle(quat_between(rot[:-1], rot[1:]))
     reach = max(1, round(REACH_S * fps))
     # Step k leads from frame k to frame k + 1.
     ends = [steps[max(start - reach, 0) : start + reach]] if start else []
@@ -153,7 +148,7 @@ def _turn_back(
     if own is not None:
         turns.append(own)
     spell = rot[start : stop + 1]
-    rest = [float(_from(home, quat_mul(spell, t.expand_as(spell))).median()) for t in turns]
+    rest = [float(_from(home, quat_mul(spell, t)).median()) for t in turns]
     best = int(np.argmin(rest))
     return turns[best] if rest[best] < HOME else None
 
@@ -164,16 +159,16 @@ def _jump_turn(rot: Tensor, start: int, stop: int, step: float) -> Tensor | None
     for inner, outer, way in ((start, start - 1, -1), (stop, stop + 1, 1)):
         if not 0 <= outer + way < len(rot):
             continue
-        drift = quat_mul(quat_conj(rot[outer + way]), rot[outer])
+        drift = quat_between(rot[outer + way], rot[outer])
         if quat_angle(drift) > step:
             return None
         # Where the joint would have been, had it gone on as it did outside the spell.
         expected = quat_mul(rot[outer], drift)
-        turns.append(quat_mul(quat_conj(rot[inner]), expected))
+        turns.append(quat_between(rot[inner], expected))
     if not turns or min(float(quat_angle(t)) for t in turns) < HALF_TURN:
         return None
     if len(turns) == 2:
-        if quat_angle(quat_mul(quat_conj(turns[0]), turns[1])) > math.radians(15.0):
+        if quat_angle(quat_between(turns[0], turns[1])) > math.radians(15.0):
             return None
         second = turns[1] if float(turns[0] @ turns[1]) > 0 else -turns[1]
         turns = [normalize(turns[0] + second)]

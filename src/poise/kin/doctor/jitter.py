@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import torch
+from scipy.ndimage import median_filter
 from torch import Tensor
 
 from poise.kin.doctor.faults import Fault, spell_faults
+from poise.kin.series import fade_beside, gaussian_sums
 from poise.motion import Clip
-from poise.spatial import normalize, quat_conj, quat_mul, quat_rotate, quat_to_rotvec, unwrap_quats
+from poise.spatial import normalize, quat_between, quat_mul, quat_rotate, quat_to_rotvec, unwrap_quats
 
 #: Noise (m, rms) of the root, and of one end of a bone against the other, that counts as trembling.
 ROOT_M, BONE_M = 0.003, 0.003
@@ -37,15 +39,16 @@ def trembling(path: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.nd
     if frames < 2 * half + 1:
         return np.zeros(frames), np.zeros(frames, dtype=bool)
     # A fourth difference is centred on its third frame, a second difference on its second.
-    high, low = (_usual(torch.diff(path, n=n, dim=0).norm(dim=-1).numpy(), n // 2, half) for n in (4, 2))
+    high, low = (
+        median_filter(
+            np.pad(torch.diff(path, n=n, dim=0).norm(dim=-1).numpy(), n // 2, mode="edge"),
+            2 * half + 1,
+            mode="mirror",
+        )
+        for n in (4, 2)
+    )
     size = high / math.sqrt(70.0)
     return size, (size > limit) & (high > SHARP * low)
-
-
-def _usual(values: np.ndarray, ends: int, half: int) -> np.ndarray:
-    """The median of `values` over +-half frames, after padding by `ends` on both sides."""
-    padded = np.pad(np.pad(values, ends, mode="edge"), half, mode="reflect")
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=-1)
 
 
 def jitter_faults(clip: Clip) -> list[Fault]:
@@ -95,7 +98,7 @@ def mend_jitter(clip: Clip) -> Clip:
             continue
         own = smooth[j]
         turned[:, j] = world[:, j] if own is None else own
-        local = turned[:, j] if above is None else quat_mul(quat_conj(above), turned[:, j])
+        local = turned[:, j] if above is None else quat_between(above, turned[:, j])
         changed = (turned[:, j] != world[:, j]).any(-1)
         if parent >= 0:
             changed |= (turned[:, parent] != world[:, parent]).any(-1)
@@ -128,16 +131,13 @@ def _calmer(local: Tensor, world: Tensor) -> bool:
 
 
 def _shaking(track: Tensor) -> Tensor:
-    steps = quat_to_rotvec(quat_mul(quat_conj(track[:-1]), track[1:]))
+    steps = quat_to_rotvec(quat_between(track[:-1], track[1:]))
     return torch.diff(steps, n=3, dim=0).square().mean() if len(steps) > 3 else steps.sum() * 0
 
 
 def _smoothed_bones(track: Tensor, bones: list[Tensor], fps: float) -> Tensor | None:
-    for bone in bones:
-        track_now = _smoothed(unwrap_quats(track), fps, BONE_M, bone)
-        if track_now is not None:
-            return track_now
-    return None
+    tries = (_smoothed(unwrap_quats(track), fps, BONE_M, bone) for bone in bones)
+    return next((t for t in tries if t is not None), None)
 
 
 def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Tensor | None:
@@ -164,11 +164,6 @@ def _smoothed(path: Tensor, fps: float, limit: float, bone: Tensor | None) -> Te
 
 def _blend(path: Tensor, start: int, stop: int, sigma: float) -> Tensor:
     """The Gaussian mean inside the spell, the path itself beyond the filter's reach."""
-    reach = math.ceil(3 * sigma)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=path.dtype) / sigma) ** 2)
-    before, behind = path[:1].expand(reach, -1), path[-1:].expand(reach, -1)
-    mean = (torch.cat((before, path, behind)).unfold(0, 2 * reach + 1, 1) * kernel).sum(-1)
-    at = torch.arange(len(path), dtype=path.dtype)
-    away = torch.maximum(start - at, at - stop).clamp(0, reach + 1) / (reach + 1)
-    weight = (0.5 + 0.5 * torch.cos(math.pi * away)).unsqueeze(-1)
-    return path + weight * (mean / kernel.sum() - path)
+    total, weights, reach = gaussian_sums(path, sigma)
+    weight = fade_beside(len(path), start, stop, reach + 1).unsqueeze(-1)
+    return path + weight * (total / weights - path)

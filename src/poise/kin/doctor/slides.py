@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter1d
 from torch import Tensor
 
 from poise.kin.doctor.faults import Fault
 from poise.kin.doctor.support import Support, foot_slips
 from poise.kin.feet.contact import Sole
 from poise.kin.feet.hold import FIRM, Standing, hold
+from poise.kin.series import gaussian
 from poise.motion import Clip
 
 #: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
@@ -25,16 +25,16 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     The mean slip of the planted sole points, averaged over time, is taken off the root's horizontal
     velocity wherever feet were found to slide; slower slips than `ROLL_SPEED` stay.
     """
-    slip, weight = _slips(clip, support)
+    feet = foot_slips(support)
+    # How many feet stand, and the mean of their slips (m/s).
+    weight = np.sum([contact for _, _, contact in feet], axis=0).astype(float)
+    slip = np.sum([slip for _, slip, _ in feet], axis=0) / np.maximum(weight, 1.0)[:, None]
     if not weight.any() or not faults:
         return clip
-    kernel = _gaussian(COMMON_S * clip.fps)
-    total = np.convolve(np.pad(weight, len(kernel) // 2), kernel, "valid")
-    mean = np.stack(
-        [np.convolve(np.pad(slip[:, k] * weight, len(kernel) // 2), kernel, "valid") for k in range(2)],
-        -1,
-    )
-    mean = mean / np.maximum(total, 1e-6)[:, None]
+    kernel = gaussian(COMMON_S * clip.fps)
+    parts = [np.pad(x, len(kernel) // 2) for x in (weight, slip[:, 0] * weight, slip[:, 1] * weight)]
+    total, *mean = (np.convolve(x, kernel, "valid") for x in parts)
+    mean = np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None]
     size = np.linalg.norm(mean, axis=-1, keepdims=True)
     mean = mean * np.maximum(1.0 - ROLL_SPEED / np.maximum(size, 1e-9), 0.0)
     near = np.zeros(clip.frames - 1)
@@ -42,8 +42,8 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
         near[max(fault.start - 1, 0) : fault.stop + 1] = 1.0
     # The correction fades out over the averaging time beside the spells that slide.
     reach = max(1, round(COMMON_S * clip.fps))
-    hull = np.lib.stride_tricks.sliding_window_view(np.pad(near, reach), 2 * reach + 1).max(-1)
-    window = _gaussian(0.3 * COMMON_S * clip.fps)
+    hull = maximum_filter1d(near, 2 * reach + 1, mode="constant")
+    window = gaussian(0.3 * COMMON_S * clip.fps)
     hull = np.convolve(np.pad(hull, len(window) // 2, mode="edge"), window, "valid")
     path = np.array(clip.root_pos)
     path[1:, :2] -= np.cumsum(mean * hull[:, None], axis=0) / clip.fps
@@ -74,17 +74,3 @@ def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     root, rot = clip.tensors()
     out = hold(clip.skeleton, root, rot, clip.fps, standing, rounds=1)
     return clip.replaced(rot=out.numpy())
-
-
-def _slips(clip: Clip, support: Support) -> tuple[np.ndarray, np.ndarray]:
-    """Mean horizontal slip `(T - 1, 2)` m/s of the feet that stand, and how many stand `(T - 1)`."""
-    feet = foot_slips(support)
-    count = np.sum([contact for _, _, contact in feet], axis=0).astype(float)
-    total = np.sum([slip for _, slip, _ in feet], axis=0)
-    return total / np.maximum(count, 1.0)[:, None], count
-
-
-def _gaussian(sigma: float) -> np.ndarray:
-    reach = max(1, math.ceil(3 * sigma))
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)
-    return kernel / kernel.sum()

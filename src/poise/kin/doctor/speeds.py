@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from poise.body import Anatomy
-from poise.kin.runs import find_runs
+from poise.kin.series import fade_beside, find_runs, gaussian_sums
 from poise.motion import Clip
-from poise.spatial import normalize, quat_angle, quat_conj, quat_mul, slerp, unwrap_quats
+from poise.spatial import normalize, quat_angle, quat_between, slerp, unwrap_quats
 
 #: rad/s that no human joint reaches. Elbows come nearest to it: 2,300 degrees per second (40 rad/s) in
 #: professional pitchers (Fleisig et al. 1999, J. Biomech. 32). Only their shoulders are faster, about
@@ -46,11 +46,6 @@ class SpeedRepair:
     before: float
     after: float
     change_deg: float
-
-    @property
-    def frames(self) -> int:
-        """How many frames were changed."""
-        return self.stop - self.start + 1
 
 
 def speed_limits(clip: Clip, anatomy: Anatomy) -> list[float]:
@@ -93,11 +88,11 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
 
 def _steps(track: Tensor) -> Tensor:
     """Angles (rad) between neighbouring frames."""
-    return quat_angle(quat_mul(quat_conj(track[:-1]), track[1:]))
+    return quat_angle(quat_between(track[:-1], track[1:]))
 
 
 def _change(old: Tensor, new: Tensor) -> float:
-    return float(quat_angle(quat_mul(quat_conj(old), new)).max())
+    return float(quat_angle(quat_between(old, new)).max())
 
 
 def _repair(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[str, tuple[int, int]]:
@@ -134,7 +129,7 @@ def _shortest(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[
         if a <= 0 or b >= frames - 1:
             short = b - a <= max(1, round(END_S * fps))
             return (-1 if a <= 0 else a, frames if b >= frames - 1 else b) if short else None
-        turn = float(quat_angle(quat_mul(quat_conj(track[a]), track[b])))
+        turn = float(quat_angle(quat_between(track[a], track[b])))
         if turn * fps / (b - a) <= limit / 2:
             return a, b
         a, b = a - 1, b + 1
@@ -157,14 +152,9 @@ def _smooth(track: Tensor, a: int, b: int, limit: float, fps: float) -> tuple[in
     """Blends in the Gaussian mean around frames a to b in place, with the least deviation that does."""
     original, frames, sigma = unwrap_quats(track), len(track), 1.0
     while True:
-        reach = math.ceil(3 * sigma)
-        kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=track.dtype) / sigma) ** 2)
-        padded = torch.cat((original[:1].expand(reach, 4), original, original[-1:].expand(reach, 4)))
-        mean = normalize((padded.unfold(0, 2 * reach + 1, 1) * kernel).sum(-1))
+        mean, _, reach = gaussian_sums(original, sigma)
         # Full weight in the spell, falling to nothing over the filter's reach.
-        at = torch.arange(frames, dtype=track.dtype)
-        away = torch.maximum(a - at, at - b).clamp(0, reach) / reach
-        track[:] = slerp(original, mean, 0.5 + 0.5 * torch.cos(math.pi * away))
+        track[:] = slerp(original, normalize(mean), fade_beside(frames, a, b, reach))
         lo, hi = max(a - reach, 0), min(b + reach, frames - 1)
         track[:lo], track[hi + 1 :] = original[:lo], original[hi + 1 :]
         if float(_steps(track)[lo:hi].max()) * fps <= limit or sigma * 1.5 > WIDEST_S * fps:

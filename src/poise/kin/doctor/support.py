@@ -13,12 +13,12 @@ from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.doctor.faults import Fault, spell_faults
 from poise.kin.feet.contact import NEAR_M, soles_of
+from poise.kin.fk import carried
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights
-from poise.kin.runs import find_runs
-from poise.kin.solids import centre_of_mass, lowest_height
+from poise.kin.series import find_runs
+from poise.kin.solids import heights
 from poise.metrics import foot_contacts
 from poise.motion import Clip
-from poise.spatial import quat_rotate
 
 #: How far (m) the estimated soles of a clip may be off the floor before the whole clip is: the file
 #: tells where ankles and toes are, not how thick the soles below them.
@@ -68,9 +68,8 @@ class Support:
             low,
             margin,
             names,
-            lowest_height(table, pos, quat).min(-1).values.numpy(),
-            centre_of_mass(table, pos, quat)[:, 2].numpy(),
-            fit_heights(table, pos, quat, clip.fps, False),
+            *heights(table, pos, quat),
+            fit_heights(table, pos, quat, clip.fps),
         )
 
     @property
@@ -127,16 +126,10 @@ def _low_points(
     names = [skeleton.names[j] for j in joints]
     for j, tip in skeleton.ends:
         if j in joints:
-            arm = torch.tensor(tip, dtype=pos.dtype).expand(clip.frames, 3)
-            columns.append(pos[:, j, 2] + quat_rotate(quat[:, j], arm)[:, 2])
+            columns.append(carried(pos[:, j], quat[:, j], tip)[:, 2])
             margins.append(TIP_M)
             names.append(skeleton.names[j])
     return torch.stack(columns, -1).numpy(), np.array(margins), tuple(names)
-
-
-def support_faults(clip: Clip, support: Support) -> list[Fault]:
-    """Floating, penetration and sliding feet."""
-    return [*height_faults(clip, support), *slide_faults(clip, support)]
 
 
 def height_faults(clip: Clip, support: Support) -> list[Fault]:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.kin.doctor.faults import Fault
-from poise.kin.runs import find_runs
+from poise.kin.series import find_runs
 from poise.motion import Clip
 from poise.motion.io.guess import root_jumps
 from poise.spatial import quat_distance, slerp
@@ -85,27 +85,16 @@ def find_gaps(clip: Clip) -> list[tuple[int, float]]:
 
 def timing_faults(clip: Clip) -> list[Fault]:
     """Frozen and missing frames, and root teleports."""
-    holds = find_holds(clip)
-    out = [
-        Fault(
-            "frozen frames",
-            "",
-            h.start,
-            h.stop,
-            h.stop - h.start + 1.0,
-            "in the place of lost ones" if h.filled else "put in between",
-        )
-        for h in holds
-    ]
+    out, holds = [], find_holds(clip)
+    for h in holds:
+        detail = "in the place of lost ones" if h.filled else "put in between"
+        out.append(Fault("frozen frames", "", h.start, h.stop, h.stop - h.start + 1.0, detail))
     # The step out of a hold is told already.
     known = {h.stop + 1 for h in holds}
-    out += [
-        Fault(
-            "missing frames", "", t, t, round(ratio) - 1.0, f"all joints step {ratio:.1f} times as far"
-        )
-        for t, ratio in find_gaps(clip)
-        if t not in known and round(ratio) > 1
-    ]
+    for t, ratio in find_gaps(clip):
+        if t not in known and round(ratio) > 1:
+            detail = f"all joints step {ratio:.1f} times as far"
+            out.append(Fault("missing frames", "", t, t, round(ratio) - 1.0, detail))
     root = clip.skeleton.names[0]
     jumps = root_jumps(clip.root_pos, clip.fps)
     out += [Fault("teleport", root, t, t, metres, f"in one frame to frame {t}") for t, metres in jumps]

@@ -23,7 +23,8 @@ from torch.nn import functional
 
 from poise.body import BodyTable
 from poise.body.table import BodyRow, Geom
-from poise.kin.runs import find_runs
+from poise.kin.fk import carried
+from poise.kin.series import find_runs
 from poise.metrics.plausibility import CONTACT_RISE, SWING_SPEED
 from poise.spatial import quat_rotate
 
@@ -69,9 +70,8 @@ def soles_of(table: BodyTable, pos: Tensor, quat: Tensor) -> dict[int, Sole]:
         turn, middle = (torch.tensor(x, dtype=pos.dtype) for x in (box.quat, box.pos))
         ends = []
         for end in (-1.0, 1.0):
-            corner = torch.tensor([end * box.size[0], 0.0, -box.size[2]], dtype=pos.dtype)
-            local = middle + quat_rotate(turn, corner)
-            ends.append(pos[:, i] + quat_rotate(quat[:, i], local.expand_as(pos[:, i])))
+            corner = carried(middle, turn, (end * box.size[0], 0.0, -box.size[2]))
+            ends.append(carried(pos[:, i], quat[:, i], corner))
         out[i] = Sole(pos[:, i], torch.stack(ends, 1))
     return out
 
@@ -105,34 +105,32 @@ def contact_labels(
     return label
 
 
-def standing_labels(
-    clips: Sequence[Tensor], fps: float, above: float = 0.04, speed: float = TOUCH_SPEED
-) -> list[Tensor]:
+def standing_labels(clips: Sequence[Tensor], fps: float) -> list[Tensor]:
     """Contact `(T, F)` bool of the foot joints `(T, F, 3)` m of each clip, at heights told by the clips.
 
     Rules that know only steps (`motion.windows.step_contacts`) hardly ever find a foot standing in
     recordings with feet that slide by a few centimetres per second. Here a joint's own standing height,
     the lowest tenth of its slow frames in all clips, counts, and per clip within 4 cm below and 6 cm
-    above of it, since floors differ; low is what is less than `above` m above that, slow as in
+    above of it, since floors differ; low is what is less than `NEAR_M` above that, slow as in
     `contact_labels`.
     """
-    usual = torch.stack([_standing(torch.cat([_slow(c[:, k], fps, speed) for c in clips]))
+    usual = torch.stack([_standing(torch.cat([_slow(c[:, k], fps) for c in clips]))
                          for k in range(clips[0].shape[1])])  # fmt: skip
     out = []
     for points in clips:
         own = points[..., 2].quantile(0.1, dim=0)
-        limits = own.clamp(usual - 0.04, usual + 0.06) + above
+        limits = own.clamp(usual - 0.04, usual + 0.06) + NEAR_M
         # Each joint has a floor of its own.
         lowered = points.clone()
         lowered[..., 2] -= limits
-        out.append(contact_labels(lowered, fps, 0.0, speed))
+        out.append(contact_labels(lowered, fps, 0.0))
     return out
 
 
-def _slow(points: Tensor, fps: float, speed: float) -> Tensor:
+def _slow(points: Tensor, fps: float) -> Tensor:
     """Heights of those of the points `(T, 3)` that hardly move to the next frame."""
     moved = torch.diff(points, dim=0).norm(dim=-1) * fps
-    return points[1:, 2][moved < speed]
+    return points[1:, 2][moved < TOUCH_SPEED]
 
 
 def _standing(heights: Tensor) -> Tensor:
@@ -168,7 +166,7 @@ def stance_heights(table: BodyTable, pos: Tensor, quat: Tensor, fps: float) -> n
         turn = torch.tensor(box.quat, dtype=pos.dtype)
         up = quat_rotate(turn, torch.tensor([0.0, 0.0, 1.0], dtype=pos.dtype))
         sole = torch.tensor(box.pos, dtype=pos.dtype) - up * box.size[2]
-        point = pos[:, i] + quat_rotate(quat[:, i], sole.expand_as(pos[:, i]))
+        point = carried(pos[:, i], quat[:, i], sole)
         level = quat_rotate(quat[:, i], up.expand_as(pos[:, i]))[:, 2] > LEVEL
         found.append(point[level & (point_speed(point, fps) < STAND_SPEED), 2])
     heights = torch.cat(found).numpy() if found else np.zeros(0)
@@ -182,13 +180,13 @@ def lowest_and_slow(point: Tensor, fps: float) -> Tensor:
     return (height <= low + 1e-9) & (point_speed(point, fps) < STAND_SPEED)
 
 
-def bearing(ends: list[Tensor], fps: float, ground: float = 0.0) -> list[Tensor]:
-    """How much the ends `(T, 2, 3)` of each sole bear between frames: `(T - 1, 2)` in [0, 1]."""
+def bearing(ends: list[Tensor], fps: float) -> list[Tensor]:
+    """How much the ends `(T, 2, 3)` of each sole bear on z = 0 between frames: `(T - 1, 2)`, 0 to 1."""
     if not ends:
         return []
     points = torch.cat(ends, 1)
     step = torch.diff(points, dim=0) * fps
-    height = torch.maximum(points[1:, :, 2], points[:-1, :, 2]) - ground
+    height = torch.maximum(points[1:, :, 2], points[:-1, :, 2])
     near = ((CLEAR_M - height) / (CLEAR_M - BEARS_M)).clamp(0.0, 1.0)
     # The faster a point is, the less it is a standing foot that slips (Tukey's biweight).
     slow = (1.0 - (step[..., :2].norm(dim=-1) / SWING_SPEED).clamp(max=1.0).square()).square()

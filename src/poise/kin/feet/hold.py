@@ -20,7 +20,7 @@ from torch import Tensor
 from poise.body import BodyTable
 from poise.kin.feet.contact import Sole, bearing, dragged, soles_of
 from poise.kin.feet.lead import lead, led
-from poise.kin.ground import smooth_lift
+from poise.kin.series import smooth_lift
 from poise.kin.solids import lowest_height
 from poise.motion import Clip, Skeleton
 from poise.spatial import forward_kinematics
@@ -86,15 +86,14 @@ class Held:
     max_mm: float
 
 
-def hold_feet(clip: Clip, table: BodyTable, ground: float = 0.0) -> tuple[Clip, Held]:
+def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
     """The clip with its standing feet held, and what that took; all but the legs stays as it is.
 
     A foot bears where an end of its sole is near the floor and neither rises nor swings (`bearing`).
     Feet that are dragged on purpose are left alone. Soles under the floor are lifted out of it, too.
 
     Args:
-        table: the body with the soles; feet without a box have no sole.
-        ground: height (m) of the floor.
+        table: the body with the soles; feet without a box have no sole. The floor is at z = 0.
     """
     if clip.frames < 3:
         return clip, Held(0.0, 0.0)
@@ -103,10 +102,10 @@ def hold_feet(clip: Clip, table: BodyTable, ground: float = 0.0) -> tuple[Clip, 
     def standing(pos: Tensor, quat: Tensor) -> dict[int, Standing]:
         pos, quat = pos[:, rows], quat[:, rows]
         soles, low, out = soles_of(table, pos, quat), lowest_height(table, pos, quat), {}
-        weights = bearing([sole.ends for sole in soles.values()], clip.fps, ground)
+        weights = bearing([sole.ends for sole in soles.values()], clip.fps)
         for (row, sole), weight in zip(soles.items(), weights, strict=True):
             weight = weight * ~dragged(sole, weight, clip.fps)[:, None]
-            deep = (ground - low[:, row]).clamp_min(0.0).numpy()
+            deep = (-low[:, row]).clamp_min(0.0).numpy()
             lift = torch.tensor(smooth_lift(deep, clip.fps, LIFT_S)) if deep.any() else None
             out[rows[row]] = Standing(sole, weight, lift)
             steps = (weight.amax(-1) > 0).numpy()

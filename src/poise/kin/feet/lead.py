@@ -23,7 +23,7 @@ from torch import Tensor
 from poise.kin.feet.contact import Sole
 from poise.kin.limbs import limb_of, match_positions
 from poise.motion import Skeleton
-from poise.spatial import axis_angle_to_quat, forward_kinematics, quat_conj, quat_mul
+from poise.spatial import axis_angle_to_quat, forward_kinematics, quat_between, quat_mul
 
 #: A (s) and B (1/s) of the module's text.
 SMOOTH_S, RETURN_PER_S = 0.006, 0.6
@@ -98,8 +98,8 @@ def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]
         # The foot keeps its turn in the world, so its own turn is that of the world seen from it.
         own = quat[:, joint]
         tilt = axis_angle_to_quat(one.axis.to(own.dtype), one.tilt)
-        about = quat_mul(axis_angle_to_quat(up.expand(len(own), 3), one.turn), tilt)
-        out[:, joint] = quat_mul(out[:, joint], quat_mul(quat_conj(own), quat_mul(about, own)))
+        about = quat_mul(axis_angle_to_quat(up, one.turn), tilt)
+        out[:, joint] = quat_mul(out[:, joint], quat_between(own, quat_mul(about, own)))
     kept = torch.ones(rot.shape[:2], dtype=torch.bool)
     for joint in leads:
         kept[:, list(limb_of(skeleton, joint))] = ~touched[:, None]

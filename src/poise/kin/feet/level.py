@@ -14,8 +14,9 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.kin.feet.contact import lowest_and_slow, sole_boxes
+from poise.kin.fk import carried
 from poise.motion import Clip
-from poise.spatial import quat_conj, quat_mul, quat_rotate, shortest_arc
+from poise.spatial import quat_between, quat_conj, quat_mul, quat_rotate, shortest_arc
 
 #: Frames of standing of which the mean is to be trusted.
 ENOUGH_FRAMES = 5
@@ -43,9 +44,9 @@ class Levelled:
             return clip
         rot = torch.tensor(clip.rot)
         for joint, turn in turns.items():
-            rot[:, joint] = quat_mul(rot[:, joint], turn.expand(len(rot), 4))
+            rot[:, joint] = quat_mul(rot[:, joint], turn)
             for child in clip.skeleton.children(joint):
-                rot[:, child] = quat_mul(quat_conj(turn).expand(len(rot), 4), rot[:, child])
+                rot[:, child] = quat_between(turn, rot[:, child])
         return clip.replaced(rot=rot.numpy())
 
 
@@ -60,9 +61,7 @@ def level_feet(clip: Clip, table: BodyTable) -> Levelled:
     turns: dict[int, Tensor] = {}
     for _, row, box in sole_boxes(table):
         normal = quat_rotate(torch.tensor(box.quat, dtype=pos.dtype), up)
-        place = pos[:, row.joint] + quat_rotate(
-            quat[:, row.joint], torch.tensor(box.pos, dtype=pos.dtype).expand(len(pos), 3)
-        )
+        place = carried(pos[:, row.joint], quat[:, row.joint], box.pos)
         stands = lowest_and_slow(place, clip.fps)
         if int(stands.sum()) < ENOUGH_FRAMES:
             continue

@@ -15,18 +15,10 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.errors import PoiseError, did_you_mean
-from poise.kin.ik.angles import (
-    by_order,
-    continuous_euler,
-    pointing_angles,
-    unwrapped,
-    zyx_angles,
-    zyx_matrix,
-)
+from poise.kin.ik.angles import continuous_euler, pointing_angles, unwrapped, zyx_angles, zyx_matrix
+from poise.kin.ik.bend import arc, rotate
 from poise.kin.ik.body import IkBody
-from poise.kin.ik.config import IkConfig
-from poise.kin.ik.frames import Frames, rest_frames
-from poise.kin.ik.vectors import arc, rotate
+from poise.kin.ik.frames import Frames, IkConfig, rest_frames
 from poise.motion import Clip
 from poise.spatial import euler_to_quat, matrix_to_quat, normalize, quat_to_matrix, unwrap_quats
 
@@ -191,7 +183,9 @@ def _free_angles(
     # The chain's rotation (B_parent link)^T B, stated in the hinges' own frame.
     local = (axes.mT @ (zero.mT @ world[:, free]) @ axes).numpy()
     out: dict[int, np.ndarray] = {}
-    for order, group in by_order([body.table.rows[i].order for i in free]).items():
+    orders = [body.table.rows[i].order for i in free]
+    for order in dict.fromkeys(orders):
+        group = [k for k, o in enumerate(orders) if o == order]
         found = continuous_euler(local[:, group], order, config.on("branches"))
         out.update({free[g]: found[:, k] for k, g in enumerate(group)})
     return out

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from poise.kin.branches import best_path, euler_path, wrapped
-from poise.kin.hinges import through_lock
+from poise.kin.hinges import best_path, euler_path, through_lock, wrapped
 
 #: lambda of Eq. 7 (rad).
 JUMP = 5.0
@@ -124,16 +122,3 @@ def _about(v: np.ndarray, w: np.ndarray, axis: int) -> np.ndarray:
     """Angles `(T)` about one axis that bring `v (T, 3)` nearest to `w`; 0 where either lies on it."""
     a, b = (axis + 1) % 3, (axis + 2) % 3
     return np.arctan2(v[:, a] * w[:, b] - v[:, b] * w[:, a], v[:, a] * w[:, a] + v[:, b] * w[:, b])
-
-
-def count_jumps(angles: np.ndarray, limit: float = math.pi / 2) -> np.ndarray:
-    """How often each angle `(T, n)` steps by more than `limit` rad from one frame to the next: `(n)`."""
-    return (np.abs(np.diff(angles, axis=0)) > limit).sum(0)
-
-
-def by_order(orders: Sequence[str]) -> dict[str, list[int]]:
-    """Indices of equal hinge orders."""
-    out: dict[str, list[int]] = {}
-    for i, order in enumerate(orders):
-        out.setdefault(order, []).append(i)
-    return out

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from poise.body import BodyTable, Humanoid, find_anatomy
 from poise.kin.fk import Kinematics
-from poise.kin.ik.vectors import frame_of, rotate, square_to
+from poise.kin.ik.bend import frame_of, square_to
 from poise.motion import Skeleton
 from poise.spatial import normalize, quat_to_matrix
 
@@ -205,12 +205,3 @@ def _normal(
             # T-pose is what Eqs. 10 and 13 say.
             usual = first if float(first @ torch.linalg.cross(upper, -up)) >= 0 else -first
     return normalize(square_to(usual, upper))
-
-
-def body_points(body: IkBody, pos: Tensor, rot: Tensor) -> Tensor:
-    """World positions `(T, P, 3)` of points; bodies at `pos (T, R, 3)` turned by `rot (T, R, 3, 3)`."""
-    out = [pos]
-    for foot, toe in sorted(body.toes.items(), key=lambda item: item[1]):
-        local = body.rest_rot[foot].T @ (body.rest_pos[toe] - body.rest_pos[foot])
-        out.append((pos[:, foot] + rotate(rot[:, foot], local))[:, None])
-    return torch.cat(out, 1)

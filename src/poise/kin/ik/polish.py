@@ -14,23 +14,12 @@ from poise.body import Humanoid, make_spec
 from poise.errors import PoiseError, did_you_mean
 from poise.kin.ik.body import IkBody
 
-
-@dataclass(frozen=True)
-class PolishConfig:
-    """How much is given up for the targets.
-
-    posture: weight (m/rad) that keeps hinge angles; root: weight that keeps the pelvis, per m and rad;
-    both against 1 for a target's metre. steps: Gauss-Newton steps per frame at most.
-    stop_mm: a frame is done when all its targets are this near, or three steps brought them no nearer.
-    limits: whether the hinges' ranges hold. damping: of each step.
-    """
-
-    posture: float = 3e-3
-    root: float = 0.2
-    steps: int = 12
-    stop_mm: float = 0.1
-    limits: bool = False
-    damping: float = 1e-8
+#: Weights against 1 for a target's metre: of hinge angles (m/rad), and of the pelvis (per m and rad).
+POSTURE, ROOT = 3e-3, 0.2
+#: A frame is done when all its targets are this near (mm), or three steps brought them no nearer.
+STOP_MM = 0.1
+#: Damping of each step.
+DAMPING = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +38,7 @@ def polish(
     qpos: np.ndarray,
     targets: Mapping[str, np.ndarray],
     humanoid: Humanoid,
-    config: PolishConfig | None = None,
+    steps: int = 12,
 ) -> Polished:
     """The motion with joints on their targets, as near to `qpos (T, 7 + hinges)` as they allow.
 
@@ -58,12 +47,12 @@ def polish(
 
     Args:
         targets: `(T, 3)` m world of bodies or toes by name (`IkBody.points`); NaN rows are free.
+        steps: Gauss-Newton steps per frame at most.
 
     Raises:
         PoiseError: mink is not installed, an unknown target, a wrong shape.
     """
     mink = _mink()
-    config = config or PolishConfig()
     start = time.perf_counter()
     given = np.asarray(qpos, dtype=np.float64)
     qpos = given.copy()
@@ -77,10 +66,9 @@ def polish(
         for name in goals
     }
     pelvis = body.points[0]
-    keep = mink.FrameTask(pelvis, "body", position_cost=config.root, orientation_cost=config.root)
-    posture = mink.PostureTask(model, cost=config.posture)
+    keep = mink.FrameTask(pelvis, "body", position_cost=ROOT, orientation_cost=ROOT)
+    posture = mink.PostureTask(model, cost=POSTURE)
     state = mink.Configuration(model)
-    limits = [mink.ConfigurationLimit(model)] if config.limits else []
     before, after = [], []
     for t, q in enumerate(qpos):
         state.update(q)
@@ -97,11 +85,11 @@ def polish(
         error = _errors(state, here, body)
         before.append(error.mean())
         best, best_q, worse = error.max(), state.q.copy(), 0
-        for _ in range(config.steps):
-            if best < config.stop_mm or worse > 2:
+        for _ in range(steps):
+            if best < STOP_MM or worse > 2:
                 break
             velocity = mink.solve_ik(
-                state, [*active, keep, posture], 1.0, "daqp", damping=config.damping, limits=limits
+                state, [*active, keep, posture], 1.0, "daqp", damping=DAMPING, limits=[]
             )
             state.integrate_inplace(velocity, 1.0)
             error = _errors(state, here, body)

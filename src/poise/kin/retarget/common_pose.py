@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body.topology import subtree
 from poise.errors import PoiseError
+from poise.kin.fk import carried
 from poise.kin.retarget.standing import (
     Stances,
     World,
@@ -20,12 +22,12 @@ from poise.kin.retarget.standing import (
     pose_positions,
     rest_axes,
 )
-from poise.motion import Clip, Roles, Skeleton
+from poise.motion import Clip, Roles
 from poise.motion.roles import SIDES
 from poise.spatial import (
     axis_angle_to_quat,
     normalize,
-    quat_conj,
+    quat_between,
     quat_mul,
     quat_rotate,
     quat_rotate_inv,
@@ -49,6 +51,7 @@ _NEXT = {"upper_arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "fo
 class CommonPose:
     """A skeleton facing +x with vertical legs, arms 45 degrees from its sides and flat feet.
 
+    roles: the skeleton and its parts.
     pos: `(J, 3)` m, the middle between the hip joints at the origin. rot: `(J, 4)` wxyz, world.
     above: `(J, 4)` wxyz, local rotations that joints above the pelvis keep.
     treads: `(2, 3)` m, in the frame of the left and right foot, the point on which it stands and rolls
@@ -58,6 +61,7 @@ class CommonPose:
     evidence: from what the pose was found, in a sentence.
     """
 
+    roles: Roles
     pos: np.ndarray
     rot: np.ndarray
     above: np.ndarray
@@ -67,17 +71,23 @@ class CommonPose:
     sole: float
     evidence: str
 
-    def lowest(self, roles: Roles, pos: Tensor, quat: Tensor, joints: Collection[int]) -> Tensor:
-        """`(T)` m, the lowest of those of `joints` that are parts of the body, of their tips and treads.
+    def depth(self, world: World, ground: float = 0.0, joints: Collection[int] | None = None) -> Tensor:
+        """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
 
-        pos, quat: `(T, J, 3)` and `(T, J, 4)`, world. Without any part it is infinite.
+        The floor lies as far under the `ground` of the treads as the soles do while standing.
         """
+        return (ground - self.sole - self.lowest(world, joints)).clamp_min(0.0)
+
+    def lowest(self, world: World, joints: Collection[int] | None = None) -> Tensor:
+        """`(T)` m, the lowest of those of `joints` (default: all) that are parts of the body, of their
+        tips and treads; infinite without any part."""
+        roles, (pos, quat) = self.roles, world
+        joints = range(len(roles.skeleton)) if joints is None else joints
         heights = [pos[:, r.joint, 2] for r in roles.rows if r.joint in joints]
         feet = [(roles.joint(f"{side}_foot"), t) for side, t in zip(SIDES, self.treads, strict=True)]
         for j, tip in (*self.tips, *feet):
             if j in joints:
-                reach = torch.tensor(tip, dtype=pos.dtype).expand(len(pos), 3)
-                heights.append((pos[:, j] + quat_rotate(quat[:, j], reach))[:, 2])
+                heights.append(carried(pos[:, j], quat[:, j], tip)[:, 2])
         if not heights:
             return torch.full((len(pos),), torch.inf, dtype=pos.dtype)
         return torch.stack(heights, -1).min(-1).values
@@ -175,7 +185,7 @@ class _Builder:
                 self._align_hinge(rot, side, kinds)
         parents = self.skeleton.parents
         local = torch.stack(
-            [rot[0]] + [quat_mul(quat_conj(rot[p]), rot[j]) for j, p in enumerate(parents) if p >= 0]
+            [rot[0]] + [quat_between(rot[p], rot[j]) for j, p in enumerate(parents) if p >= 0]
         )
         pos, rot = pose_positions(self.roles, local)
         hips = (pos[self._joint("left_thigh")] + pos[self._joint("right_thigh")]) / 2
@@ -191,8 +201,8 @@ class _Builder:
         tread = float(np.mean(heights))
         tips = tuple((r.joint, v) for r in self.roles.rows if (v := self._believed(r.joint)) is not None)
         arrays = pos.numpy(), rot.numpy(), above.numpy(), treads.numpy()
-        pose = CommonPose(*arrays, -tread, tips, 0.0, self.evidence)
-        low = pose.lowest(self.roles, pos[None], rot[None], range(len(self.skeleton)))
+        pose = CommonPose(self.roles, *arrays, -tread, tips, 0.0, self.evidence)
+        low = pose.lowest(World(pos[None], rot[None]))
         return replace(pose, sole=max(0.0, tread - float(low[0])))
 
     def _align_hinge(self, rot: Tensor, side: str, kinds: tuple[str, str, str]) -> None:
@@ -213,8 +223,8 @@ class _Builder:
         angle = torch.atan2(torch.linalg.cross(now, wanted) @ way, now @ wanted)
         if float(angle.abs()) > _MOST_TWIST:
             return
-        ends = hanging(self.skeleton, limb[2])
-        for j in hanging(self.skeleton, limb[0]) - ends:
+        ends = subtree(self.skeleton, limb[2])
+        for j in set(subtree(self.skeleton, limb[0])) - set(ends):
             rot[j] = quat_mul(axis_angle_to_quat(way, angle), rot[j])
 
     def _joint(self, role: str) -> int:
@@ -321,12 +331,3 @@ def _way(side: str, kind: str) -> Tensor:
     out = 1.0 if side == "left" else -1.0
     leg = kind in ("thigh", "shin")
     return normalize(torch.tensor([0.0, 0.0 if leg else out, -1.0], dtype=torch.float64))
-
-
-def hanging(skeleton: Skeleton, joint: int) -> set[int]:
-    """`joint` and all that hangs on it."""
-    out = {joint}
-    for j in range(joint + 1, len(skeleton)):
-        if skeleton.parents[j] in out:
-            out.add(j)
-    return out

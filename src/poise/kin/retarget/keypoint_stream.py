@@ -30,19 +30,17 @@ class StreamConfig:
 
     smooth_s: time constant of the filter on the keypoints, 0 for none (`FadingFilter`). lookahead: 1
         takes velocities from the frames before and after, one control step late; 0 from the last two.
-    max_gap_s: how long a missing keypoint travels along with the others before the stream says so.
     max_speed: m/s, a keypoint that jumps faster is taken as missing (sprinters' feet reach 20).
     """
 
     smooth_s: float = 0.0
     lookahead: int = 1
-    max_gap_s: float = 0.5
     max_speed: float = 25.0
 
     def __post_init__(self) -> None:
         if self.lookahead not in (0, 1):
             raise PoiseError(f"a stream looks 0 or 1 control steps ahead, not {self.lookahead}")
-        if not (self.smooth_s >= 0 and self.max_gap_s >= 0 and self.max_speed > 0):
+        if not (self.smooth_s >= 0 and self.max_speed > 0):
             raise PoiseError("times and speeds of a stream must not be negative")
 
 
@@ -51,7 +49,7 @@ class GoalFrame:
     """The goal at one control step.
 
     time_s: when it was. pos: `(B, 3)` m of the humanoid's bodies. linvel: `(B, 3)` m/s. stale_s: for how
-    long the keypoint that is longest missing has been so; beyond `max_gap_s` it is a guess.
+    long the keypoint that is longest missing has been so and has travelled along with the others.
     """
 
     time_s: float

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.feet.contact import TOUCH_M, contact_labels, rest_height
-from poise.kin.ground import smooth_lift
+from poise.body.topology import subtree
+from poise.kin.feet.contact import TOUCH_M, contact_labels
+from poise.kin.fk import carried
 from poise.kin.limbs import Limb, match_positions
-from poise.kin.retarget.common_pose import CommonPose, hanging
+from poise.kin.retarget.passage import Passage
 from poise.kin.retarget.standing import World
-from poise.motion import Clip, Roles
-from poise.motion.joint_map import JointMap
+from poise.kin.series import smooth_lift
+from poise.motion import Clip
 from poise.motion.roles import SIDES
 from poise.spatial import forward_kinematics, quat_rotate
 
@@ -23,44 +24,6 @@ from poise.spatial import forward_kinematics, quat_rotate
 BLEND_S = 0.25
 #: Half the time (s) over which a lift is spread.
 LIFT_S = 0.05
-
-
-@dataclass(frozen=True)
-class Scale:
-    """The map of the source's space into the target's: x' = c + k (x - c), and its ground."""
-
-    factor: float
-    centre: tuple[float, float, float]
-    ground: float
-
-    @staticmethod
-    def between(
-        world: World,
-        fps: float,
-        joints: JointMap,
-        here: CommonPose,
-        there: CommonPose,
-        factor: float | None,
-    ) -> Scale:
-        """Scaled by the heights of the hips over the feet, about where the clip begins on its ground."""
-        factor = there.hip_height / here.hip_height if factor is None else factor
-        pos, quat = world
-        treads = []
-        for side, tread in zip(SIDES, here.treads, strict=True):
-            foot = joints.source.joint(f"{side}_foot") or 0
-            treads.append(
-                pos[:, foot] + quat_rotate(quat[:, foot], torch.tensor(tread).expand(len(pos), 3))
-            )
-        ground = rest_height(torch.stack(treads, 1), fps)
-        hips = [pos[0, joints.source.joint(f"{s}_thigh") or 0] for s in SIDES]
-        middle = (hips[0] + hips[1]) / 2
-        return Scale(factor, (float(middle[0]), float(middle[1]), ground), ground)
-
-    def place(self, x: Tensor) -> Tensor:
-        """Points `(..., 3)` m of the source's world where the target has them."""
-        centre = torch.tensor(self.centre, dtype=x.dtype)
-        # Written so that a factor of 1 changes no digit.
-        return x + (self.factor - 1.0) * (x - centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +44,19 @@ class Foot:
     def points(self, pos: Tensor, quat: Tensor, target: bool) -> Tensor:
         """`(T, 3)` m, where the held point is."""
         joint, tread = (self.target, self.tread_target) if target else (self.source, self.tread_source)
-        return pos[:, joint] + quat_rotate(quat[:, joint], tread.expand(len(pos), 3))
+        return carried(pos[:, joint], quat[:, joint], tread)
 
 
-def feet_of(joints: JointMap, here: CommonPose, there: CommonPose) -> tuple[Foot, ...]:
+def feet_of(passage: Passage) -> tuple[Foot, ...]:
     """Both feet, and the hands that both skeletons have."""
+    here, there = passage.here, passage.there
     out = []
     for kinds, label in (
         (("thigh", "shin", "foot"), "foot"),
         (("upper_arm", "forearm", "hand"), "hand"),
     ):
         for k, side in enumerate(SIDES):
-            pairs = [joints.limb_pair(f"{side}_{kind}") for kind in kinds]
+            pairs = [passage.joints.limb_pair(f"{side}_{kind}") for kind in kinds]
             if any(p is None for p in pairs):
                 continue
             chain = [p for p in pairs if p is not None]
@@ -121,13 +85,11 @@ def source_contacts(world: World, fps: float, feet: tuple[Foot, ...], ground: fl
 def plant(
     clip: Clip,
     world: World,
-    joints: JointMap,
-    poses: tuple[CommonPose, CommonPose],
+    passage: Passage,
     rot: Tensor,
     root: Tensor,
     feet: tuple[Foot, ...],
     contacts: Tensor,
-    scale: Scale,
     hold: bool,
     clear: bool,
 ) -> tuple[Tensor, Tensor]:
@@ -138,19 +100,19 @@ def plant(
     in the source are lifted; where trunk, knees or elbows are, or a limb does not reach, the whole body
     is. The limbs are solved by two bones in closed form; feet and hands keep their turn.
     """
-    skeleton = joints.target.skeleton
+    skeleton, scale = passage.joints.target.skeleton, passage.scale
     offsets = torch.tensor(skeleton.offsets)
-    depth = floor_depth(joints.source, poses[0], *world, scale.ground) * scale.factor
+    depth = passage.here.depth(world, scale.ground) * scale.factor
 
-    def lift(pos: Tensor, quat: Tensor, parts: set[int]) -> Tensor:
+    def lift(pos: Tensor, quat: Tensor, parts: Collection[int]) -> Tensor:
         """The smooth lift `(T)` m that keeps some joints from being deeper than the source is."""
-        excess = floor_depth(joints.target, poses[1], pos, quat, scale.ground, parts) - depth
+        excess = passage.there.depth(World(pos, quat), scale.ground, parts) - depth
         if float(excess.max()) < 1e-6:
             return torch.zeros(len(pos), dtype=pos.dtype)
         return torch.tensor(smooth_lift(excess.clamp_min(0.0).numpy(), clip.fps, LIFT_S, clip.cyclic))
 
     if clear:
-        ends = {j for foot in feet for j in hanging(skeleton, foot.target)}
+        ends = {j for foot in feet for j in subtree(skeleton, foot.target)}
         pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
         up = torch.zeros_like(root)
         up[:, 2] = lift(pos, quat, set(range(len(skeleton))) - ends)
@@ -166,7 +128,7 @@ def plant(
         if clear:
             moved = pos + (goal - pos[:, foot.target])[:, None]
             up = torch.zeros_like(goal)
-            up[:, 2] = lift(moved, quat, hanging(skeleton, foot.target))
+            up[:, 2] = lift(moved, quat, subtree(skeleton, foot.target))
             goal = goal + up
         goals[foot.target] = goal
     by_end: dict[int | str, Limb] = {foot.target: foot.limb for foot in feet}
@@ -174,7 +136,7 @@ def plant(
     if clear:
         pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
         up = torch.zeros_like(root)
-        up[:, 2] = lift(pos, quat, set(range(len(skeleton))))
+        up[:, 2] = lift(pos, quat, range(len(skeleton)))
         root = root + up
     return rot, root
 
@@ -190,19 +152,3 @@ def contact_weight(contact: Tensor, fps: float) -> Tensor:
     before = at[(k - 1).clamp(min=0)]
     away = torch.minimum((after - frames).abs(), (frames - before).abs()).double() / fps
     return 0.5 + 0.5 * torch.cos(torch.pi * (away / BLEND_S).clamp(max=1.0))
-
-
-def floor_depth(
-    roles: Roles,
-    pose: CommonPose,
-    pos: Tensor,
-    quat: Tensor,
-    ground: float,
-    joints: Collection[int] | None = None,
-) -> Tensor:
-    """`(T)` m, how deep the lowest of some joints (default: all) and their tips is under the floor.
-
-    The floor lies as far under the `ground` of the treads as the soles do while standing.
-    """
-    joints = range(len(roles.skeleton)) if joints is None else joints
-    return (ground - pose.sole - pose.lowest(roles, pos, quat, joints)).clamp_min(0.0)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from poise.kin.retarget.common_pose import CommonPose
-from poise.kin.retarget.plant import Foot, Scale, floor_depth
+from poise.kin.retarget.passage import Passage, Scale, hip_middle
+from poise.kin.retarget.plant import Foot
 from poise.kin.retarget.standing import World, body_axes
 from poise.metrics.tracking import MM
-from poise.motion import Roles
 from poise.motion.joint_map import JointMap
 from poise.motion.roles import SIDES
 from poise.spatial import normalize
@@ -55,9 +54,7 @@ class RetargetReport:
 
     def to_dict(self) -> dict[str, Any]:
         """The report as plain numbers, lists and names, ready for JSON."""
-        out = {
-            k: v for k, v in ((n, getattr(self, n)) for n in self.__dataclass_fields__) if k != "joints"
-        }
+        out = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "joints"}
         source, target = self.joints.source.skeleton.names, self.joints.target.skeleton.names
         out["bones"] = {name: {"mean_deg": a, "max_deg": b} for name, a, b in self.bones}
         out["ends"] = dict(self.ends)
@@ -110,35 +107,32 @@ class RetargetReport:
 def measure(
     worlds: tuple[World, World],
     fps: float,
-    joints: JointMap,
-    poses: tuple[CommonPose, CommonPose],
+    passage: Passage,
     feet: tuple[Foot, ...],
     contacts: Tensor,
-    scale: Scale,
     seconds: float,
 ) -> RetargetReport:
     """Measures what came of a retargeting; see `RetargetReport`. worlds: source and target."""
-    bones = _bones(joints, worlds[0][0], worlds[1][0])
-    angles = [torch.cat([a for _, a in bones])] if bones else [torch.zeros(1)]
-    trunk = [body_axes(r, w[0])[1] for r, w in zip((joints.source, joints.target), worlds, strict=True)]
-    lean = [_up(pose, r) for pose, r in zip(poses, (joints.source, joints.target), strict=True)]
-    ends = _ends(joints, worlds[0][0], worlds[1][0], poses)
+    joints, scale, poses = passage.joints, passage.scale, (passage.here, passage.there)
+    bones = _bones(joints, worlds[0].pos, worlds[1].pos)
+    angles = torch.cat([a for _, a in bones]) if bones else torch.zeros(1)
+    trunk = [body_axes(p.roles, w.pos)[1] for p, w in zip(poses, worlds, strict=True)]
+    lean = [body_axes(p.roles, torch.tensor(p.pos))[1] for p in poses]
+    tilt = _angle(*trunk) - float(_angle(*lean))
+    ends = _ends(passage, worlds[0].pos, worlds[1].pos)
     slide, held = _slide(feet, contacts, worlds, scale, fps)
     depths = [
-        floor_depth(roles, pose, *world, scale.ground) * factor * MM
-        for roles, pose, world, factor in zip(
-            (joints.source, joints.target), poses, worlds, (scale.factor, 1.0), strict=True
-        )
+        pose.depth(world, scale.ground) * factor * MM
+        for pose, world, factor in zip(poses, worlds, (scale.factor, 1.0), strict=True)
     ]
-    tilt = _angle(trunk[0], trunk[1]) - float(_angle(lean[0], lean[1]))
     return RetargetReport(
         joints,
         (poses[0].evidence, poses[1].evidence),
         scale.factor,
         scale.ground,
         tuple((name, float(a.mean()), float(a.max())) for name, a in bones),
-        float(angles[0].mean()),
-        float(angles[0].max()),
+        float(angles.mean()),
+        float(angles.max()),
         float(tilt.abs().mean()),
         ends,
         float(np.mean([e for _, e in ends])) if ends else 0.0,
@@ -156,10 +150,6 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
     return torch.rad2deg(2.0 * torch.atan2((a - b).norm(dim=-1), (a + b).norm(dim=-1)))
 
 
-def _up(pose: CommonPose, roles: Roles) -> Tensor:
-    return body_axes(roles, torch.tensor(pose.pos))[1]
-
-
 def _bones(joints: JointMap, source: Tensor, target: Tensor) -> list[tuple[str, Tensor]]:
     out = []
     for kind, after in _BONES:
@@ -174,18 +164,14 @@ def _bones(joints: JointMap, source: Tensor, target: Tensor) -> list[tuple[str, 
     return out
 
 
-def _ends(
-    joints: JointMap, source: Tensor, target: Tensor, poses: tuple[CommonPose, CommonPose]
-) -> tuple[tuple[str, float], ...]:
-    def seen(pos: Tensor, which: int) -> Tensor:
-        thighs = [joints.limb_pair(f"{side}_thigh") for side in SIDES]
-        hips = sum((pos[:, p[which]] for p in thighs if p is not None), torch.zeros(())) / 2
-        return (pos - hips[:, None]) / poses[which].hip_height
-
-    a, b = seen(source, 0), seen(target, 1)
+def _ends(passage: Passage, source: Tensor, target: Tensor) -> tuple[tuple[str, float], ...]:
+    a, b = (
+        (pos - hip_middle(passage.joints, pos, which)[:, None]) / pose.hip_height
+        for which, (pos, pose) in enumerate(((source, passage.here), (target, passage.there)))
+    )
     out = []
     for role in ("left_hand", "right_hand", "left_foot", "right_foot", "head"):
-        pair = joints.limb_pair(role)
+        pair = passage.joints.limb_pair(role)
         if pair is not None:
             apart = (a[:, pair[0]] - b[:, pair[1]]).norm(dim=-1).mean()
             out.append((role.replace("_", " "), float(apart) * 100))

@@ -1,13 +1,17 @@
-"""Skeleton2Humanoid's humanoid: a skeleton's bones in a T-pose, all frames along the world's axes."""
+"""Skeleton2Humanoid's humanoid: a skeleton's bones in a T-pose, all frames along the world's axes; and
+what is measured of a solution on it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from poise.body import BodyConfig, BodyTable, generate_table
+from poise.kin.ik.bend import rotate
 from poise.kin.ik.body import IkBody, ik_body
 from poise.motion import Skeleton
 from poise.spatial import matrix_to_quat
@@ -77,3 +81,17 @@ def _offset(body: IkBody, point: int, parent: int) -> np.ndarray:
     if body.table.rows[parent].side == "right":
         along[0] = -along[0]
     return along / np.linalg.norm(along) * np.linalg.norm(bone)
+
+
+def body_points(body: IkBody, pos: Tensor, rot: Tensor) -> Tensor:
+    """World positions `(T, P, 3)` of points; bodies at `pos (T, R, 3)` turned by `rot (T, R, 3, 3)`."""
+    out = [pos]
+    for foot, toe in sorted(body.toes.items(), key=lambda item: item[1]):
+        local = body.rest_rot[foot].T @ (body.rest_pos[toe] - body.rest_pos[foot])
+        out.append((pos[:, foot] + rotate(rot[:, foot], local))[:, None])
+    return torch.cat(out, 1)
+
+
+def count_jumps(angles: np.ndarray, limit: float = math.pi / 2) -> np.ndarray:
+    """How often each angle `(T, n)` steps by more than `limit` rad from one frame to the next: `(n)`."""
+    return (np.abs(np.diff(angles, axis=0)) > limit).sum(0)
