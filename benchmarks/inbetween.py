@@ -48,6 +48,7 @@ from poise.metrics import physics
 from poise.nets.between import BetweenConfig
 from poise.nets.transition import Filled, Known
 
+Net = Literal["transformer", "rtn"]
 PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}
 #: What is tried on validation, at one length; the iterations (0 to 7) are chosen at each.
 SETTINGS = (
@@ -239,7 +240,7 @@ def trained(task: Task, folder: Path, steps: int, again: bool) -> InbetweenModel
     return train(task, folder, steps, on_block=shown)[0]
 
 
-def run_one(net: str, seed: int, protocol: Protocol, args: argparse.Namespace, found: dict) -> None:
+def run_one(net: Net, seed: int, protocol: Protocol, args: argparse.Namespace, found: dict) -> None:
     """Trains one network with one seed and scores it, with and without adaptation, into `found`."""
     folder = args.work / protocol.name / f"{net}-{seed}"
     task, steps = begin(
