@@ -181,13 +181,13 @@ class Lookahead:
 
     @property
     def num_obs(self) -> int:
-        """Width of the observations."""
-        return self.copies.num_obs
+        """Width of the observations that the policy takes."""
+        return getattr(self.policy, "num_obs", self.copies.num_obs)
 
     @property
     def num_actions(self) -> int:
-        """Width of the actions."""
-        return self.copies.num_actions
+        """Width of the actions that the policy gives."""
+        return getattr(self.policy, "num_actions", self.copies.num_actions)
 
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for observations `(N, O)` of the worlds as they stand.
