@@ -54,17 +54,18 @@ def twin_draws(
     policy: GaussianPolicy, patch: pytest.MonkeyPatch, noises: tuple[torch.Generator, torch.Generator]
 ) -> None:
     """Makes a trainer draw its noise for each half of the rows as a process of its own would."""
-    sample = policy.sample
+    act = policy.act
 
-    def halves(obs: Tensor, _: object) -> tuple[Tensor, ...]:
-        parts = [sample(x, n) for x, n in zip(obs.chunk(2), noises, strict=True)]
-        return tuple(torch.cat(x) for x in zip(*parts, strict=True))
+    def halves(obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if generator is None:
+            return act(obs)
+        return torch.cat([act(x, n) for x, n in zip(obs.chunk(2), noises, strict=True)])
 
     def normal(out: Tensor, _: torch.Generator) -> None:
         for half, n in zip(out.chunk(2, 1), noises, strict=True):
             half.copy_(torch.randn(half.shape, generator=n))
 
-    patch.setattr(policy, "sample", halves)
+    patch.setattr(policy, "act", halves)
     patch.setattr(poise.learn.rollout, "standard_normal", normal)
 
 
