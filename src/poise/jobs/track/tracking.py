@@ -4,12 +4,13 @@ tracked = track("kick.bvh", search=True)
 tracked.card, tracked.clip, tracked.save("out")
 """
 
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -144,7 +145,8 @@ def track(
     method = tracker.config.method + (", searched" if found else "")
     card = scored(rollouts, imitation, about, RULE, method)
     judged = judge(rollouts, success_rule(RULE))
-    failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
+    failed_at = cast("list[int]", judged.failed_at.tolist())
+    failed = [(i, t) for i, t in enumerate(failed_at) if t >= 0]
     mended = acts.fallen if isinstance(acts, Keeper) else ()
     frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
     clean = None
@@ -195,7 +197,7 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     clip, reference = imitation.library.clips[0], imitation.reference
     names = [f"{clip.name}-{k + 1}" for k in range(count)]
     moves = np.pad(places(count), ((0, 0), (0, 1)))
-    motions = []
+    motions: list[np.ndarray] = []
     for move in moves:
         qpos = reference.qpos.numpy().copy()
         qpos[:, :3] += move
