@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
@@ -33,7 +33,8 @@ NAMED = 8
 @dataclass(frozen=True)
 class Options:
     """Let a trained policy do a motion that it need not know, without help and without training: write
-    the motion, score.json and report.html. For a motion that it loses it can --search, or --learn it."""
+    the motion, score.json and report.html. It looks ahead, and a motion that is lost so is searched; what
+    is lost then it can --learn."""
 
     clip: Annotated[Positional[Path], arg(metavar="FILE")]
     """The motion file: a clip of any human skeleton, or keypoints; or a folder of them."""
@@ -43,18 +44,22 @@ class Options:
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
     Poise."""
-    search: Flag = False
-    """If the policy loses the motion, look for it: many characters try at once, those that come near it
-    go on. What is found is one simulation, without help; it takes seconds for each of the motion."""
+    controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
+    """policy acts alone, at once; lookahead tries in copies of the character before it acts, which is
+    nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto looks
+    ahead, and searches what is lost so."""
+    budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
+    """Simulated control steps for each that is made, of lookahead; by default 192. More are nearer and
+    cleaner, and take longer."""
     characters: Annotated[int, arg(metavar="N")] = 512
-    """Characters that --search at once; more find harder motions."""
+    """Characters that search at once; more find harder motions."""
     rounds: Annotated[int, arg(metavar="N")] = 1
-    """How often it is searched; later rounds stay about what was found, and come nearer."""
+    """How often is searched; later rounds stay about what was found, and come nearer."""
     learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
     """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
     threads: Annotated[int, arg(metavar="N")] = 0
-    """Cores for --search and --learn; 0 is all."""
+    """Cores for lookahead, search and --learn; 0 is all."""
     reset_on_fail: Flag = False
     """Put a character that is 0.5 m off back onto the motion, and go on."""
     recover: Flag = False
@@ -64,7 +69,7 @@ class Options:
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
-    """Seed of the noise, and of what --search and --learn draw."""
+    """Seed of the noise, and of what lookahead, search and --learn draw."""
     hold_feet: Flag = True
     """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -102,6 +107,7 @@ def check(o: Options) -> None:
     check_range("learn", o.learn, 0, 100_000)
     check_range("characters", o.characters, 8, 65_536)
     check_range("rounds", o.rounds, 1, 20)
+    check_range("budget", o.budget, 1, 1_000_000)
     check_range("threads", o.threads, 0)
     if o.learn and o.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
@@ -125,20 +131,22 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     from poise.jobs.track import TrackConfig, write
     from poise.jobs.track.noise import noise_of
     from poise.jobs.tracker import save_tracker
-    from poise.plan import SamplingConfig
+    from poise.plan import LookaheadConfig, SamplingConfig
 
     noise = noise_of(o.noise)
+    ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     given = read(o.clip, o.reading)
     if tracker is None:
         with working("opening the policy"):
             tracker = open_run(o.policy).tracker
-    search = SamplingConfig(o.characters, rounds=o.rounds, seed=o.seed) if o.search else None
+    search = SamplingConfig(o.characters, rounds=o.rounds)
     config = TrackConfig(
-        noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count, search, o.threads
-    )
+        noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count, o.controller, ahead,
+        search, o.threads,
+    )  # fmt: skip
     with claimed(out):
         # What is to be learned is the motion alone.
-        plain = replace(config, recover=False, search=None) if o.learn else config
+        plain = replace(config, recover=False, controller="policy") if o.learn else config
         tracked = follow(tracker, given, plain)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
@@ -153,10 +161,24 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     said, lost = outcome(tracked, o.reset_on_fail), is_lost(tracked)
     say(said)
     if lost:
-        say(advice(o))
-    word = "lost" if lost else "found" if tracked.found else "came back" if tracked.losses else "tracked"
+        say(advice(o, tracked))
+    word = (
+        "lost"
+        if lost
+        else "found"
+        if tracked.controller == "search"
+        else "came back"
+        if tracked.losses
+        else "tracked"
+    )
     failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
-    result = {"outcome": word, "sentence": said, "failures": failures, "score": done.card.to_dict()}
+    result = {
+        "outcome": word,
+        "controller": tracked.controller,
+        "sentence": said,
+        "failures": failures,
+        "score": done.card.to_dict(),
+    }
     saved = {"policy": o.save_policy} if o.save_policy else {}
     told = (*tracked.notes, *done.notes)
     code = LOST if lost else 0
@@ -170,21 +192,25 @@ def is_lost(tracked: Tracked) -> bool:
 
 
 def follow(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
-    """The motion as it is tracked, with a bar where it is searched."""
+    """The motion as it is tracked, with a bar while it is looked ahead or searched."""
     from poise.jobs.track import track
 
     with contextlib.ExitStack() as shown:
         shown.enter_context(working("tracking"))
-        began, bars = time.monotonic(), list[Callable[[float, str], None]]()
+        began, now = time.monotonic(), ""
+        bar: Callable[[float, str], None] | None = None
 
-        def show(done: int, steps: int) -> None:
-            if not bars:
+        def show(what: str, done: int, steps: int) -> None:
+            nonlocal began, now, bar
+            if bar is None or what != now:
                 shown.close()
-                bars.append(shown.enter_context(showing("searching")))
-            share, spent = done / steps, time.monotonic() - began
-            bars[0](share, f"{100 * share:.0f} % searched, {left(spent, share)}")
+                began, now = time.monotonic(), what
+                bar = shown.enter_context(showing(what))
+            share = done / steps
+            spent = time.monotonic() - began
+            bar(share, f"{what}, {100 * share:.0f} % done, {left(spent, share)}")
 
-        return track(given, tracker, config, on_search=show)
+        return track(given, tracker, config, progress=show)
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
@@ -212,21 +238,24 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
     return learned.tracker
 
 
-def advice(options: Options) -> str:
+def advice(options: Options, tracked: Tracked) -> str:
     """What to do about a motion that was lost."""
     o = options
     learns = "with --learn 10 the policy first learns this motion, for 10 minutes at most."
     if o.learn:
         return f"The same command with more minutes goes on learning: --learn {2 * o.learn:g}."
-    if o.search:
+    if tracked.found is not None:
         return f"Try --characters {2 * o.characters}; or {learns}"
-    return f"With --search many characters look for it; {learns}" if o.count == 1 else "W" + learns[1:]
+    if o.count == 1 and o.controller != "auto":
+        return f"With --controller auto many characters search what is lost; {learns}"
+    return "W" + learns[1:]
 
 
 def outcome(tracked: Tracked, reset: bool) -> str:
     """Where the character failed, in one sentence."""
     reference, times = tracked.imitation.reference, tracked.failed_s
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
+    off = f"{tracked.card.mpjpe_global_mm:.0f} mm off on average"
     count, fell = len(reference.length), {k for k, _ in tracked.failures}
     if count > 1:
         first = f", the first lost at {tracked.failures[0][1]:.1f} s" if fell else ""
@@ -234,10 +263,11 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if tracked.losses is not None:
         return tracked.losses.sentence()
-    if not times and tracked.found is not None:
-        return f"Found to its end, {seconds:.1f} s, without help; the policy alone loses it."
+    if not times and tracked.controller == "search":
+        return f"Found by a search to its end, {seconds:.1f} s, without help, {off}."
     if not times:
-        return f"Tracked to its end, {seconds:.1f} s, without help."
+        by = "with lookahead" if tracked.controller == "lookahead" else "by the policy alone"
+        return f"Tracked {by} to its end, {seconds:.1f} s, without help, {off}."
     if not reset:
         return (
             f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; "

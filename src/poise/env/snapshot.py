@@ -19,8 +19,8 @@ class Snapshot:
     """What n worlds were, see `ImitationEnv.snapshot`.
 
     Attributes:
-        worlds: tensors `(n, ...)` by name: physics "sim", the goal's and the plug-ins' rows, "age",
-            "action", ...
+        worlds: tensors `(n, ...)` by name: physics "sim", and its "qpos" and "qvel" for another kind of
+            backend; the goal's and the plug-ins' rows, "age", "action", ...
         physics: width of the physics without derived fields, the first columns of "sim".
         goal: what the goal's rows point into.
         shared: what all worlds of the environment share: help, failure rates, odds, random generators;
@@ -48,7 +48,8 @@ class Snapshot:
 def take(env: ImitationEnv, rows: Tensor | None) -> Snapshot:
     """What worlds `rows (n,)` of an environment are, all for None: physics, bodies, goal, episode,
     recovery; and of all worlds what they share: help, failure rates, odds, random generators."""
-    worlds = {"sim": env.backend.snapshot(), **_rows(env)}
+    state = env.backend.state
+    worlds = {"sim": env.backend.snapshot(), "qpos": state.qpos, "qvel": state.qvel, **_rows(env)}
     copies = {k: v.clone() if rows is None else v.index_select(0, rows) for k, v in worlds.items()}
     width = env.backend.snapshot(derived=False).shape[1]
     return Snapshot(copies, width, dict(env.goal.shared()), _shared(env) if rows is None else None)
@@ -74,11 +75,15 @@ def put(env: ImitationEnv, snapshot: Snapshot, rows: Tensor | None) -> None:
             value[rows] = snapshot.worlds[name]
     for plugin in env.plugins:
         plugin.assign(rows, env.goal.body(rows))
-    sim = snapshot.worlds["sim"]
-    if sim.shape[1] != env.backend.snapshot().shape[1]:
+    sim, backend = snapshot.worlds["sim"], env.backend
+    if sim.shape[1] == backend.snapshot().shape[1]:
+        backend.restore(sim, rows)
+    elif snapshot.physics == backend.snapshot(derived=False).shape[1]:
         # Other terms have other fields of the state fetched, which follow from the rest.
-        sim = sim[:, : snapshot.physics]
-    env.backend.restore(sim, rows)
+        backend.restore(sim[:, : snapshot.physics], rows)
+    else:
+        # Another kind of backend, such as a world of several characters.
+        backend.write(rows, snapshot.worlds["qpos"], snapshot.worlds["qvel"])
     if rows is None and snapshot.shared is not None:
         for plugin in env.plugins:
             plugin.load_state(snapshot.shared)

@@ -128,12 +128,12 @@ class Skeleton:
         except ValueError:
             raise PoiseError(f"there is no joint '{name}'. {did_you_mean(name, self.names)}") from None
 
-    def same_bones(self, other: Skeleton) -> bool:
-        """Whether the other skeleton has the same joints and bones, to within `SAME_M`."""
+    def same_bones(self, other: Skeleton, atol: float = SAME_M) -> bool:
+        """Whether the other skeleton has the same joints and bones, to within `atol` m."""
         if (self.names, self.parents) != (other.names, other.parents):
             return False
         # The root's offset is no bone.
-        return bool(np.allclose(self.offsets[1:], other.offsets[1:], rtol=0.0, atol=SAME_M))
+        return bool(np.allclose(self.offsets[1:], other.offsets[1:], rtol=0.0, atol=atol))
 
     def children(self, joint: int) -> tuple[int, ...]:
         """Indices of the joints with the parent `joint`."""

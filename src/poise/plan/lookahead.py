@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -76,7 +76,8 @@ class LookaheadConfig:
         if self.candidates < max(FEWEST, 2 * len(self.smoothing)):
             least = max(FEWEST, 2 * len(self.smoothing))
             what = f"lookahead needs at least {least} candidates, got {self.candidates}"
-            raise PoiseError(what, hint=f"Give {least * self.horizon / self.hold_steps:g} steps or more")
+            steps = least * self.horizon / self.hold_steps
+            raise PoiseError(what, hint=f"Give a budget of {steps:g} simulated steps or more")
         if not 1 <= self.hold_steps <= self.horizon:
             what = f"hold_steps must lie in 1 to the horizon {self.horizon}, got {self.hold_steps}"
             raise PoiseError(what, "LookaheadConfig")
@@ -94,6 +95,15 @@ class LookaheadConfig:
     def budget(self) -> float:
         """Simulated control steps for each that is made."""
         return self.candidates * self.horizon / self.hold_steps
+
+    def with_budget(self, steps: float) -> LookaheadConfig:
+        """The same with as many candidates as so many simulated control steps for each that is made
+        allow.
+
+        Raises:
+            PoiseError: too few.
+        """
+        return replace(self, candidates=int(steps * self.hold_steps / self.horizon))
 
 
 class _Choice(NamedTuple):

@@ -1,8 +1,8 @@
 """Tracking any motion with a trained policy: one simulated episode, nothing is trained."""
 
+from poise.jobs.track.controllers import Keeper, look_ahead
 from poise.jobs.track.tracked import Clean, Tracked, write
 from poise.jobs.track.tracking import (
-    Keeper,
     TrackConfig,
     imitation_of,
     side_by_side,
@@ -15,6 +15,7 @@ __all__ = [
     "TrackConfig",
     "Tracked",
     "imitation_of",
+    "look_ahead",
     "side_by_side",
     "track",
     "write",

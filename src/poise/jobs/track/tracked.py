@@ -50,8 +50,8 @@ class Tracked(Result):
     placed: the motion on the body. failures: (character, seconds) of each failure in the order of time;
     without `reset_on_fail` and `recover` at most one per character. clean: what the noise changed, None
     without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
-    was lost and found again; None where it was not. found: with `search`, what that came to; None where
-    the policy alone did not lose the motion.
+    was lost and found again; None where it was not. found: what a search came to; None where
+    nothing was searched. controller: which did the motion: "policy", "lookahead" or "search".
     """
 
     tracker: Tracker
@@ -63,6 +63,7 @@ class Tracked(Result):
     notes: tuple[str, ...]
     losses: Losses | None = None
     found: SamplingResult | None = None
+    controller: str = "policy"
 
     @property
     def failed_s(self) -> tuple[float, ...]:

@@ -1,33 +1,30 @@
 """A trained controller tracks any motion: no training, no help, one episode from its first frame.
 
-tracked = track("kick.bvh", search=True)
+tracked = track("kick.bvh")
 tracked.card, tracked.clip, tracked.save("out")
 """
 
-# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
-from poise.env import Acts, ImitationEnv, Reference
+from poise.env import Reference
 from poise.errors import PoiseError
-from poise.eval import run_episodes
-from poise.eval.rolloutset import judge
 from poise.jobs.open import Run, open_run
-from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.runs import Evaluation, scored
-from poise.jobs.track.crowd import Crowd, places
+from poise.jobs.track.controllers import RULE, Controller, Show, done_by
+from poise.jobs.track.crowd import places
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.points import fitted, follow, points_of
-from poise.jobs.track.recovering import look_for, replay, sentence, with_returns
+from poise.jobs.track.recovering import with_returns
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
@@ -36,15 +33,13 @@ from poise.motion import Clip, ClipLibrary, read_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Noise, perturb_clip, perturb_points
-from poise.plan import SamplingConfig
+from poise.plan import LookaheadConfig, SamplingConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
 from poise.settings import changed
 
 #: Characters in one world.
 MOST = 64
-#: Which failure ends tracking: a mean distance of 0.5 m.
-RULE = "phc"
 
 
 @dataclass(frozen=True)
@@ -58,8 +53,12 @@ class TrackConfig:
             character.
         smooth_hz: cut-off of a low-pass on keypoints.
         count: characters that do the motion side by side in one world, see `track.crowd`.
-        search: a motion that the policy loses is looked for, see `plan.sampling`; for one character.
-        threads: cores of the search, 0 is all of them.
+        controller: "policy" acts alone, "lookahead" simulates what it may do before it acts
+            (`plan.lookahead`), "search" looks for the whole motion (`plan.sampling`), for one character;
+            "auto" looks ahead, and searches what is lost so. With `recover` the policy acts alone.
+        lookahead: how it looks ahead; its seed is `seed`.
+        search: how it searches; its seed is `seed`.
+        threads: cores of lookahead and search, 0 is all of them.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -68,7 +67,9 @@ class TrackConfig:
     recover: bool = False
     smooth_hz: float | None = None
     count: int = 1
-    search: SamplingConfig | None = None
+    controller: Controller = "auto"
+    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
+    search: SamplingConfig = field(default_factory=SamplingConfig)
     threads: int = 0
 
     def __post_init__(self) -> None:
@@ -77,9 +78,23 @@ class TrackConfig:
         if self.recover and (self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that is put back onto the motion"
             raise PoiseError(f"only a single character comes back by itself, not {what}")
-        if self.search and (self.recover or self.reset_on_fail or self.count > 1):
+        if self.controller == "search" and (self.recover or self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes or is put back"
             raise PoiseError(f"a motion is searched for a single character, not {what}")
+        if self.controller == "lookahead" and self.recover:
+            what = "a character that comes back by itself does not look ahead yet"
+            raise PoiseError(what, hint="Leave recover or the controller out")
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether lookahead is wanted."""
+        return self.controller == "lookahead" or (self.controller == "auto" and not self.recover)
+
+    @property
+    def searches(self) -> bool:
+        """Whether what is lost is searched."""
+        single = not (self.recover or self.reset_on_fail or self.count > 1)
+        return self.controller == "search" or (self.controller == "auto" and single)
 
 
 def track(
@@ -87,8 +102,7 @@ def track(
     policy: Tracker | Run | str | Path | None = None,
     config: TrackConfig | None = None,
     *,
-    search: bool | SamplingConfig = False,
-    on_search: Callable[[int, int], None] | None = None,
+    progress: Show | None = None,
     **settings: Any,
 ) -> Tracked:
     """Lets a trained policy do a motion that it need not know, without help and without training.
@@ -100,18 +114,16 @@ def track(
         clip: a clip, keypoints, or a file; keypoints in a file stay keypoints.
         policy: a policy file, the folder of a run of poise train perpetual, or one that is open; by
             default the policy that comes with Poise.
-        config: how it is tracked; `settings` are those that differ, such as recover=True or count=4.
-        search: a motion that the policy loses is looked for by many characters at once.
-        on_search: is told how many control steps of how many are searched.
+        config: how it is tracked; `settings` are those that differ, such as recover=True, count=4 or
+            controller="policy".
+        progress: is told what is done ("looking ahead", "searching"), and how many control steps of how
+            many are done.
 
     Raises:
         PoiseError: a motion that cannot be read, that no human makes or that is too short, or no such
             policy.
     """
     config = changed(config or TrackConfig(), settings)
-    if search:
-        how = search if isinstance(search, SamplingConfig) else SamplingConfig(seed=config.seed)
-        config = replace(config, search=how)
     if isinstance(policy, Tracker):
         tracker = policy
     else:
@@ -127,50 +139,33 @@ def track(
     goals = imitation.reference.pose.pos
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
-    acts, losses, found = tracker.policy, None, None
-    if config.search and loses(tracker, imitation):
-        found = look_for(tracker, imitation, config.search, 0, config.threads, on_search)
-        acts = replay(found, acts)
-        notes.append(sentence(found, config.search, imitation.reference.rate_hz))
+    losses, replayed = None, None
     if config.recover and (back := with_returns(tracker, placed, imitation)):
-        placed, imitation, acts, losses = back
-    all_of_them = torch.arange(config.count)
-    starts, sim = torch.zeros_like(all_of_them), imitation.config.sim
-    crowd = Crowd(imitation.humanoid, sim, config.count) if config.count > 1 else None
-    env = imitation.env(1, None, False, 1, help_scale=0.0, guard=crowd is None, backend=crowd)
-    if config.reset_on_fail:
-        acts = Keeper(env, acts)
-    rollouts, recordings = run_episodes(lambda _: env, acts, all_of_them, starts, cycles=1)
+        placed, imitation, replayed, losses = back
+    done, said = done_by(tracker, imitation, config, replayed, progress)
+    notes += said
+    rollouts, frames = done.rollouts, done.failures
     about, rate = tracker.about, imitation.reference.rate_hz
-    method = tracker.config.method + (", searched" if found else "")
-    card = scored(rollouts, imitation, about, RULE, method)
-    judged = judge(rollouts, success_rule(RULE))
-    failed_at = cast("list[int]", judged.failed_at.tolist())
-    failed = [(i, t) for i, t in enumerate(failed_at) if t >= 0]
-    mended = acts.fallen if isinstance(acts, Keeper) else ()
-    frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
+    suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
+    card = scored(rollouts, imitation, about, RULE, tracker.config.method + suffix)
     clean = None
     if config.noise:
         seen = rollouts.pos[0], goals
-        clean = _beside_clean(tracker, motion, judged.mask[0], *seen, config)
+        clean = _beside_clean(tracker, motion, done.judged.mask[0], *seen, config)
         notes.append(clean.sentence())
     if float(about.get("help_n", 0.0)) > 0:
         notes.append(
             f"The policy is that of an unfinished training that still helped by up to "
             f"{float(about['help_n']):.0f} N; here nothing helps."
         )
-    evaluation = Evaluation(card, rollouts, recordings)
+    evaluation = Evaluation(card, rollouts, done.recordings)
     times = tuple((character, frame / rate) for character, frame in frames)
     if losses is not None:
         times = tuple((0, t) for t in losses.lost)
-    return Tracked(tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, found)
-
-
-def loses(tracker: Tracker, imitation: Imitation) -> bool:
-    """Whether the policy alone loses a task's first motion."""
-    first = torch.zeros(1, dtype=torch.long)
-    results = evaluate_clips(imitation, tracker.policy, first, 0.0, 1)
-    return not bool(results.succeeded)
+    return Tracked(
+        tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
+        done.controller,
+    )  # fmt: skip
 
 
 def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
@@ -215,40 +210,6 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     report = replace(imitation.report, clips=fits)
     clips = ClipLibrary(tuple(clip.replaced(name=n) for n in names), (1.0,) * count)
     return replace(imitation, library=clips, reference=made, report=report)
-
-
-class Keeper:
-    """A policy that puts characters back onto the reference before it acts, where they failed.
-
-    Attributes:
-        fallen: (world, frame) of every failure that it mended.
-    """
-
-    def __init__(self, env: ImitationEnv, policy: Acts):
-        self.env, self.policy = env, policy
-        sizes = (getattr(policy, name, getattr(env, name)) for name in ("num_obs", "num_actions"))
-        self.num_obs, self.num_actions = sizes
-        self.fallen: list[tuple[int, int]] = []
-        self._limit_mm = success_rule(RULE).limit_m * 1000.0
-
-    def act(self, obs: Tensor) -> Tensor:
-        """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
-        env = self.env
-        failed = ~(mpjpe_global(env.pose().pos, env.goal_pose().pos) <= self._limit_mm)
-        if bool(failed.any()):
-            obs = self._mend(env, failed, obs)
-        return self.policy.act(obs)
-
-    def _mend(self, env: ImitationEnv, failed: Tensor, obs: Tensor) -> Tensor:
-        rows = failed.nonzero().flatten()
-        self.fallen += [(int(i), int(env.frame[i])) for i in rows]
-        clip, frame, before = env.clip.clone(), env.frame.clone(), env.backend.snapshot()
-        fresh = env.reset_to(clip, frame)
-        others = (~failed).nonzero().flatten()
-        if len(others):
-            # Starting anew is for all worlds at once; the others go on from where they were.
-            env.backend.restore(before[others], others)
-        return torch.where(failed[:, None], fresh, obs)
 
 
 def read_motion(clip: Clip | Keypoints | str | Path) -> Clip | Keypoints:

@@ -1,0 +1,192 @@
+"""Which controller does a motion: the policy alone, the policy that looks ahead, or a search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.env import Acts, ImitationEnv
+from poise.errors import PoiseError
+from poise.eval import run_episodes
+from poise.eval.episodes import Recording
+from poise.eval.rolloutset import Judged, RolloutSet, judge
+from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.track.crowd import Crowd
+from poise.jobs.track.recovering import Replay, look_for, replay, sentence
+from poise.jobs.tracker import Tracker
+from poise.metrics import mpjpe_global, success_rule
+from poise.plan import Lookahead, LookaheadConfig, SamplingResult
+from poise.recipes.imitation import Imitation
+from poise.settings import changed
+
+if TYPE_CHECKING:
+    from poise.jobs.track.tracking import TrackConfig
+
+Controller = Literal["auto", "policy", "lookahead", "search"]
+#: Is told what is done, and how many control steps of how many are done.
+Show = Callable[[str, int, int], None]
+#: Which failure ends tracking: a mean distance of 0.5 m.
+RULE = "phc"
+#: What is said where a policy cannot look ahead.
+NO_CRITIC = "The policy was saved without its critic, which lookahead needs; it acts without."
+
+
+class Done(NamedTuple):
+    """How a motion was done.
+
+    Attributes:
+        rollouts, recordings: the episode, see `run_episodes`.
+        judged: by the field's rule.
+        failures: (character, frame) of each failure in the order of time.
+        controller: which did it: "policy", "lookahead" or "search".
+        found: what the search came to; None where nothing was searched.
+    """
+
+    rollouts: RolloutSet
+    recordings: list[Recording]
+    judged: Judged
+    failures: list[tuple[int, int]]
+    controller: str
+    found: SamplingResult | None = None
+
+
+def done_by(
+    tracker: Tracker,
+    imitation: Imitation,
+    config: TrackConfig,
+    replayed: Replay | None = None,
+    show: Show | None = None,
+) -> tuple[Done, Sequence[str]]:
+    """Does a task's motion with the controller that is wanted, or whatever it takes.
+
+    Args:
+        replayed: actions that were made already; nothing else is tried then.
+
+    Returns:
+        how it was done, and sentences on that.
+    """
+    notes: list[str] = []
+    if replayed is not None:
+        return _episode(imitation, config, replayed, "policy"), notes
+    looks = config.looks_ahead and tracker.value is not None
+    if config.looks_ahead and not looks:
+        notes.append(NO_CRITIC)
+    if looks:
+        ahead = look_ahead(tracker, imitation, config.lookahead, config.threads, config.seed)
+        try:
+            done = _episode(imitation, config, ahead, "lookahead", show)
+        finally:
+            ahead.copies.close()
+    else:
+        done = _episode(imitation, config, tracker.policy, "policy")
+    if config.searches and done.failures:
+        how = changed(config.search, {"seed": config.seed})
+        told = show and (lambda made, steps: show("searching", made, steps))
+        found = look_for(tracker, imitation, how, 0, config.threads, told)
+        notes.append(sentence(found, how, imitation.reference.rate_hz))
+        if found.reached > done.failures[0][1]:
+            done = _episode(imitation, config, replay(found, tracker.policy), "search")
+        done = done._replace(found=found)
+    return done, notes
+
+
+def look_ahead(
+    tracker: Tracker, imitation: Imitation, config: LookaheadConfig, threads: int = 0, seed: int = 0
+) -> Lookahead:
+    """The tracker's policy with lookahead in copies of a character of a task, without help.
+
+    Args:
+        threads: of the physics of the copies; 0 is all cores.
+        seed: takes the place of the settings' own.
+
+    Raises:
+        PoiseError: the policy has no critic.
+    """
+    if tracker.value is None:
+        raise PoiseError("the policy was saved without its critic, which lookahead needs")
+    # Copies that lose the motion may go bad; they are left behind.
+    copies = imitation.bare(rewards=True).env(
+        config.candidates, auto_reset=False, threads=threads, help_scale=0.0, guard=False
+    )
+    return Lookahead(copies, tracker.policy, tracker.value, changed(config, {"seed": seed}))
+
+
+def loses(tracker: Tracker, imitation: Imitation) -> bool:
+    """Whether the policy alone loses a task's first motion."""
+    first = torch.zeros(1, dtype=torch.long)
+    results = evaluate_clips(imitation, tracker.policy, first, 0.0, 1)
+    return not bool(results.succeeded)
+
+
+def _episode(
+    imitation: Imitation, config: TrackConfig, acts: Acts, controller: str, show: Show | None = None
+) -> Done:
+    """One episode of all characters."""
+    count, task = config.count, imitation
+    every = torch.arange(count)
+    crowd = Crowd(task.humanoid, task.config.sim, count) if count > 1 else None
+    env = task.env(1, None, False, 1, help_scale=0.0, guard=crowd is None, backend=crowd)
+    if isinstance(acts, Lookahead):
+        acts.watch(env)
+    if show is not None:
+        acts = _Shown(acts, env, "looking ahead", int(task.reference.length[0]) - 1, show)
+    keeper = Keeper(env, acts) if config.reset_on_fail else None
+    starts = torch.zeros_like(every)
+    rollouts, recordings = run_episodes(lambda _: env, keeper or acts, every, starts, cycles=1)
+    judged = judge(rollouts, success_rule(RULE))
+    failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
+    mended = keeper.fallen if keeper is not None else ()
+    frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
+    return Done(rollouts, recordings, judged, frames, controller)
+
+
+class _Shown:
+    """A controller that tells how far it is."""
+
+    def __init__(self, acts: Acts, env: ImitationEnv, what: str, steps: int, show: Show):
+        self.acts, self.what, self.steps, self.show, self.made = acts, what, steps, show, 0
+        self.num_obs = getattr(acts, "num_obs", env.num_obs)
+        self.num_actions = getattr(acts, "num_actions", env.num_actions)
+
+    def act(self, obs: Tensor) -> Tensor:
+        """What the controller does."""
+        self.show(self.what, self.made, self.steps)
+        self.made += 1
+        return self.acts.act(obs)
+
+
+class Keeper:
+    """A policy that puts characters back onto the reference before it acts, where they failed.
+
+    Attributes:
+        fallen: (world, frame) of every failure that it mended.
+    """
+
+    def __init__(self, env: ImitationEnv, policy: Acts):
+        self.env, self.policy = env, policy
+        sizes = (getattr(policy, name, getattr(env, name)) for name in ("num_obs", "num_actions"))
+        self.num_obs, self.num_actions = sizes
+        self.fallen: list[tuple[int, int]] = []
+        self._limit_mm = success_rule(RULE).limit_m * 1000.0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
+        env = self.env
+        failed = ~(mpjpe_global(env.pose().pos, env.goal_pose().pos) <= self._limit_mm)
+        if bool(failed.any()):
+            obs = self._mend(env, failed, obs)
+        return self.policy.act(obs)
+
+    def _mend(self, env: ImitationEnv, failed: Tensor, obs: Tensor) -> Tensor:
+        rows = failed.nonzero().flatten()
+        self.fallen += [(int(i), int(env.frame[i])) for i in rows]
+        clip, frame, before = env.clip.clone(), env.frame.clone(), env.backend.snapshot()
+        fresh = env.reset_to(clip, frame)
+        others = (~failed).nonzero().flatten()
+        if len(others):
+            # Starting anew is for all worlds at once; the others go on from where they were.
+            env.backend.restore(before[others], others)
+        return torch.where(failed[:, None], fresh, obs)
