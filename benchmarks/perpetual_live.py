@@ -42,7 +42,9 @@ def noisy(run: Run, folders: Sequence[Path], tell: Tell) -> dict[str, Any]:
     for file in (f for folder in folders for f in motion_files_of(folder)):
         try:
             clip = read_clip(file.path)
-            done = track(points_of(clip, Stated()) or clip, run.tracker, TrackConfig())
+            done = track(
+                points_of(clip, Stated()) or clip, run.tracker, TrackConfig(controller="policy")
+            )
         except PoiseError as problem:
             refused.append({"file": file.name, "why": problem.what})
             continue

@@ -16,6 +16,9 @@ from poise.jobs.open import open_run
 from poise.motion import read_clip, trim, write_clip
 from toy_policy import WALK, toy_run
 
+#: Without lookahead and search, with which even this policy comes far.
+ALONE = ("--controller", "policy")
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -36,7 +39,7 @@ def file(run: Path, short: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """The policy as one file, as the command line writes it."""
     folder = tmp_path_factory.mktemp("policy")
     path = folder / "policy.safetensors"
-    argv = ["track", str(short), "--policy", str(run), "-o", str(folder / "out")]
+    argv = ["track", str(short), "--policy", str(run), "-o", str(folder / "out"), *ALONE]
     # A policy that was trained for three iterations loses it.
     assert main([*argv, "--save-policy", str(path)]) == LOST
     return path
@@ -46,7 +49,7 @@ def test_motion_score_and_report(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "made.bvh"
-    assert main(["track", str(short), "--policy", str(file), "-o", str(out)]) == LOST
+    assert main(["track", str(short), "--policy", str(file), "-o", str(out), *ALONE]) == LOST
     said = capsys.readouterr().out
     assert "Lost: the character failed at" in said and "--reset-on-fail puts it back" in said
     assert str(out) in said and (tmp_path / "made/report.html").exists()
@@ -62,7 +65,18 @@ def test_a_motion_that_is_lost_is_learned(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "made.bvh"
-    argv = ["track", str(short), "--policy", str(file), "-o", str(out), "--threads", "1", "--learn"]
+    argv = [
+        "track",
+        str(short),
+        "--policy",
+        str(file),
+        "-o",
+        str(out),
+        *ALONE,
+        "--threads",
+        "1",
+        "--learn",
+    ]
     before = file.read_bytes()
     assert main([*argv, "0.02"]) == LOST
     said = capsys.readouterr()
@@ -83,20 +97,55 @@ def test_a_motion_that_is_lost_is_learned(
 def test_a_motion_that_is_lost_is_looked_for(
     file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    argv = ["track", str(short), "--policy", str(file), "-o", str(tmp_path / "o.bvh"), "--search"]
+    argv = [
+        "track",
+        str(short),
+        "--policy",
+        str(file),
+        "-o",
+        str(tmp_path / "o.bvh"),
+        "--controller",
+        "search",
+    ]
     code = main([*argv, "--characters", "16", "--threads", "1"])
     said = capsys.readouterr()
-    assert code == (0 if "Found to its end" in said.out else LOST)
-    assert "0 % searched" in said.err and "16 characters looked for it" in said.out
+    assert code == (0 if "Found by a search to its end" in said.out else LOST)
+    assert "searching, 0 % done" in said.err and "16 characters looked for it" in said.out
     score = json.loads((tmp_path / "o/score.json").read_text())
     assert score["method"] == "perpetual-single, searched" and score["help"]["limit_n"] == 0.0
-    if "Found to its end" not in said.out:
+    if "Found by a search to its end" not in said.out:
         assert "Try --characters 32" in said.out
     assert main([*argv, "--rounds", "0"]) == 2 and "--rounds must lie" in capsys.readouterr().err
     assert main([*argv, "--characters", "4"]) == 2
     assert "--characters must lie in 8 to" in capsys.readouterr().err
-    crowd = ["track", str(short), "-o", str(tmp_path / "many"), "--search", "--count", "2"]
+    crowd = ["track", str(short), "-o", str(tmp_path / "many"), "--controller", "search", "--count", "2"]
     assert main(crowd) == 2 and "single character" in capsys.readouterr().err
+
+
+def test_by_default_it_looks_ahead(
+    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["track", str(short), "--policy", str(file), "--characters", "8", "--threads", "1"]
+    code = main([*argv, "-o", str(tmp_path / "a"), "--budget", "60", "--seed", "1"])
+    said = capsys.readouterr()
+    assert "looking ahead, 0 % done" in said.err
+    score = json.loads((tmp_path / "a/score.json").read_text())
+    if code == 0 and "Tracked with lookahead to its end" in said.out:
+        assert score["method"] == "perpetual-single, lookahead" and "mm off on average" in said.out
+        assert "The policy alone loses the motion" in said.out
+    else:
+        assert "8 characters looked for it" in said.out
+    # Alone it does not search, and it says what would.
+    code = main([*argv, "-o", str(tmp_path / "b"), "--controller", "lookahead", "--budget", "30"])
+    assert code == 0 or "--controller auto" in capsys.readouterr().out
+    # Again the same.
+    main([*argv, "-o", str(tmp_path / "c"), "--budget", "60", "--seed", "1"])
+    again = json.loads((tmp_path / "c/score.json").read_text())
+    assert again["mpjpe_mm"] == score["mpjpe_mm"]
+    for wrong, words in (("3", "at least 10 candidates"), ("0", "--budget must lie in")):
+        assert main([*argv, "-o", str(tmp_path / "d"), "--budget", wrong]) == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()
 
 
 def test_what_cannot_be_learned_is_refused(
@@ -114,7 +163,7 @@ def test_another_skeleton_with_noise_and_resets(
 ) -> None:
     person = put(tmp_path, "person.txt", deepmimic(45))
     out = tmp_path / "out"
-    argv = ["track", str(person), "--policy", str(file), "-o", str(out), "--noise", "jitter:0.2"]
+    argv = ["track", str(person), "--policy", str(file), "-o", str(out), *ALONE, "--noise", "jitter:0.2"]
     assert main([*argv, "--seed", "3", "--reset-on-fail"]) == LOST
     said = capsys.readouterr().out
     assert "on another skeleton" in said and "without noise" in said
@@ -127,7 +176,7 @@ def test_the_report_tells_of_the_file_that_came_in(
     file: Path, tmp_path: Path, refused, capsys: pytest.CaptureFixture[str]
 ) -> None:
     person, out = put(tmp_path, "person.txt", deepmimic(45)), tmp_path / "out"
-    main(["track", str(person), "--policy", str(file), "-o", str(out)])
+    main(["track", str(person), "--policy", str(file), "-o", str(out), *ALONE])
     page = (out / "report.html").read_text("utf-8")
     assert "deepmimic" in page and "The file states no unit" not in page
     put(out, "score.json", "{}")
@@ -140,7 +189,10 @@ def test_the_report_tells_of_the_file_that_came_in(
 
 def test_a_crowd(file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["track", str(short), "--policy", str(file), "-o", str(out), "--count", "2"]) == LOST
+    assert (
+        main(["track", str(short), "--policy", str(file), "-o", str(out), *ALONE, "--count", "2"])
+        == LOST
+    )
     assert "0 of 2 characters tracked all" in capsys.readouterr().out
     assert {p.name for p in out.iterdir()} == {
         "simulated_short-1.bvh", "simulated_short-2.bvh", "score.json", "report.html"

@@ -31,16 +31,21 @@ REWARDS = [
     (reward.root_velocity, {}),
 ]
 OBSERVATIONS = [
-    obs.root_height,
-    obs.root_tilt,
-    obs.root_velocity,
-    obs.joint_angles,
-    obs.joint_velocities,
-    obs.phase,
-    obs.body_positions,
-    obs.target_joints,
-    obs.target_root,
-    obs.target_bodies,
+    (obs.root_height, {}),
+    (obs.root_tilt, {}),
+    (obs.root_velocity, {}),
+    (obs.joint_angles, {}),
+    (obs.joint_velocities, {}),
+    (obs.phase, {}),
+    (obs.body_positions, {}),
+    (obs.target_joints, {}),
+    (obs.target_root, {}),
+    (obs.target_bodies, {}),
+]
+FAILURES = [
+    (done.root_too_low, {}),
+    (done.bodies_too_far, {}),
+    (done.any_body_too_far, {}),
 ]
 
 
@@ -175,8 +180,8 @@ def test_local_end_effectors_forgive_where_in_the_world():
     assert reward.end_effectors(a_frame(sim, far), bodies).max() < 0.01
 
 
-@pytest.mark.parametrize("term", OBSERVATIONS)
-def test_observations_are_free_of_place_and_heading(term):
+@pytest.mark.parametrize(("term", "params"), OBSERVATIONS)
+def test_observations_are_free_of_place_and_heading(term, params):
     frame = a_frame(a_pose())
     assert frame.ahead is not None
     moved = frame.replaced(
@@ -184,7 +189,7 @@ def test_observations_are_free_of_place_and_heading(term):
         ref=turned(frame.ref, 2.3, (4.0, -7.0)),
         ahead=turned(frame.ahead, 2.3, (4.0, -7.0)),
     )
-    here, there = term(frame), term(moved)
+    here, there = term(frame, **params), term(moved, **params)
     assert here.ndim == 2 and here.shape[0] == N
     torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-4)
 
@@ -207,6 +212,12 @@ def test_observations_by_hand():
         obs.target_root(frame.replaced(ahead=None))
 
 
+@pytest.mark.parametrize(("term", "params"), FAILURES)
+def test_failures_are_one_yes_or_no_per_environment(term, params):
+    failed = term(a_frame(a_pose(0), a_pose(1)), **params)
+    assert failed.shape == (N,) and failed.dtype == torch.bool
+
+
 def test_failures_by_hand():
     sim = a_pose()
     pos = sim.pos.clone()
@@ -226,9 +237,7 @@ def test_terms_are_pure():
     frame = a_frame(sim, ref)
     poses = [sim, ref, frame.ahead]
     before = [[getattr(p, f.name).clone() for f in fields(Pose)] for p in poses if p]
-    terms = [*REWARDS, *((o, {}) for o in OBSERVATIONS)]
-    terms += [(d, {}) for d in (done.root_too_low, done.bodies_too_far, done.any_body_too_far)]
-    for term, params in terms:
+    for term, params in (*REWARDS, *OBSERVATIONS, *FAILURES):
         once = term(frame, **params)
         assert torch.equal(once, term(frame, **params)) and not once.requires_grad
     after = [[getattr(p, f.name) for f in fields(Pose)] for p in poses if p]

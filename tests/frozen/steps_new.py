@@ -257,24 +257,28 @@ def aside(metres: float) -> Clip:
 
 
 def job_track(folder: Path) -> dict[str, np.ndarray]:
-    return _tracked(track(walk(), open_run().tracker), folder)
+    return _tracked(track(walk(), open_run().tracker, controller="policy"), folder)
 
 
 def job_track_search(folder: Path) -> dict[str, np.ndarray]:
     search = SamplingConfig(characters=64, retries=2, rounds=2)
-    done = track(aside(0.6), open_run().tracker, TrackConfig(search=search, threads=1))
+    done = track(
+        aside(0.6), open_run().tracker, TrackConfig(controller="search", search=search, threads=1)
+    )
     assert done.found is not None and done.found.whole
     return _tracked(done, folder)
 
 
 def job_track_recover(folder: Path) -> dict[str, np.ndarray]:
-    done = track(aside(2.0), open_run().tracker, TrackConfig(recover=True))
+    done = track(aside(2.0), open_run().tracker, TrackConfig(controller="policy", recover=True))
     assert done.losses is not None
     return _tracked(done, folder)
 
 
 def job_track_noise_crowd(folder: Path) -> dict[str, np.ndarray]:
-    config = TrackConfig(noise=noise_of(("jitter:0.5",)), count=2, reset_on_fail=True)
+    config = TrackConfig(
+        controller="policy", noise=noise_of(("jitter:0.5",)), count=2, reset_on_fail=True
+    )
     done = track(trim(walk(), 0, 50), open_run().tracker, config)
     return _tracked(done, folder)
 
@@ -333,7 +337,9 @@ def job_perpetual_run(folder: Path) -> dict[str, np.ndarray]:
 def job_perpetual_ways_run(folder: Path) -> dict[str, np.ndarray]:
     how = {"help_start": 0.0, "expert": False, "action": "additive", "recovery": True, "num_envs": 8}
     out = _perpetual(folder, lively(), tiny(**how), 10)
-    return out | _tracked(track(walk(0, 40), open_run(folder / "run").tracker), folder)
+    return out | _tracked(
+        track(walk(0, 40), open_run(folder / "run").tracker, controller="policy"), folder
+    )
 
 
 def job_verbs(folder: Path) -> dict[str, np.ndarray]:

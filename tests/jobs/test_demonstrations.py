@@ -201,7 +201,7 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     frames = len(done.evaluation.recordings[0].qpos)
     assert frames == int(done.imitation.reference.length[0]) == len(done.placed.qpos)
     # Up to where it was lost everything is as without.
-    plain = track(clip, able)
+    plain = track(clip, able, controller="policy")
     upto = round(done.losses.lost[0] * 30)
     a, b = (t.evaluation.recordings[0].qpos[:upto] for t in (done, plain))
     assert abs(a - b).max() < 1e-9

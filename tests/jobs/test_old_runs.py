@@ -54,7 +54,9 @@ def perpetual_results(name: str) -> Results:
     policy, _ = trained_policy(OLD / name, task)
     r = evaluate_clips(task, policy, threads=1)
     card = try_recovery(task, policy, 2, threads=1)
-    tracked = track(trim(read_clip(OLD / "walk.bvh"), 0, 40), open_run(OLD / name).tracker)
+    tracked = track(
+        trim(read_clip(OLD / "walk.bvh"), 0, 40), open_run(OLD / name).tracker, controller="policy"
+    )
     found = {
         "succeeded": r.succeeded.tolist(),
         "tracked": r.tracked.tolist(),
@@ -68,7 +70,7 @@ def perpetual_results(name: str) -> Results:
 
 def tracker_results() -> Results:
     """The embedded walk with the shipped policy."""
-    done = track(read_clip(OLD / "walk.bvh"), open_run(TRACKER).tracker)
+    done = track(read_clip(OLD / "walk.bvh"), open_run(TRACKER).tracker, controller="policy")
     return _figures(done.evaluation.card), {"qpos": done.evaluation.recordings[0].qpos}
 
 
@@ -148,7 +150,7 @@ def test_a_motion_that_was_found_is_found_again_and_replays(
 ) -> None:
     tracker = open_run(TRACKER).tracker
     clip = read_clip(OLD / "aside.bvh")
-    assert track(clip, tracker, TrackConfig()).failures
+    assert track(clip, tracker, TrackConfig(controller="policy")).failures
     task = imitation_of(tracker, [place(clip, tracker)])
     figures, found = search_results()
     # Which of many characters is best may be another one on another machine; that it is found may not.

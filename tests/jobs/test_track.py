@@ -54,7 +54,7 @@ def points(clip: Clip) -> Keypoints:
 
 def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> None:
     clip = walk(0, 40)
-    tracked = track(clip, tracker)
+    tracked = track(clip, tracker, controller="policy")
     card = tracked.evaluation.card
     assert tracked.placed.moved is None and card.help.limit_n == 0.0 and card.method
     assert card.episodes == 1 and card.succ == 0.0
@@ -71,7 +71,7 @@ def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> N
     back = read_clip(tmp_path / "out.bvh")
     assert back.skeleton.names == clip.skeleton.names and back.frames == 40
     # The same again gives the same.
-    again = track(clip, tracker)
+    again = track(clip, tracker, controller="policy")
     np.testing.assert_array_equal(
         again.evaluation.recordings[0].qpos, tracked.evaluation.recordings[0].qpos
     )
@@ -99,7 +99,7 @@ def test_the_reference_on_the_body_comes_home_as_it_was(tracker: Tracker, tmp_pa
 
 def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) -> None:
     source = swing(0.5, 60.0, scale=1.1)
-    tracked = track(source, tracker)
+    tracked = track(source, tracker, controller="policy")
     done = write(tracked, tmp_path, tmp_path / "out.npz", hold=False)
     assert set(done.paths) == {"simulated", "body", "score", "report"}
     back, body = read_clip(done.paths["simulated"]), read_clip(done.paths["body"])
@@ -110,8 +110,8 @@ def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) ->
 
 
 def test_resets_change_nothing_before_the_first_failure(tracker: Tracker) -> None:
-    plain = track(walk(), tracker)
-    again = track(walk(), tracker, TrackConfig(reset_on_fail=True))
+    plain = track(walk(), tracker, controller="policy")
+    again = track(walk(), tracker, TrackConfig(controller="policy", reset_on_fail=True))
     assert len(again.failed_s) > 1 and again.failed_s[0] == plain.failed_s[0]
     # The score is that of the character that was not put back.
     assert again.evaluation.card.mpjpe_mm == plain.evaluation.card.mpjpe_mm
@@ -149,7 +149,7 @@ def test_only_those_that_fell_are_put_back(tracker: Tracker) -> None:
 
 def test_keypoints_are_streamed_to_a_policy_of_keypoints(pointed: Tracker) -> None:
     given = points(swing(1.0, 60.0, speed=0.5))
-    tracked = track(given, pointed)
+    tracked = track(given, pointed, controller="policy")
     assert any("Each goal comes from the keypoints" in note for note in tracked.notes)
     fit = imitation_of(pointed, [tracked.placed]).reference.pose
     pose = tracked.imitation.reference.pose
@@ -159,20 +159,22 @@ def test_keypoints_are_streamed_to_a_policy_of_keypoints(pointed: Tracker) -> No
     speed = (pose.pos[2:] - pose.pos[:-2]) * 15.0
     assert torch.allclose(pose.linvel[1:-1], speed, atol=0.02)
     # With gaps and noise it goes on.
-    noisy = track(given, pointed, TrackConfig(noise=(Jitter(strength=0.2),), seed=1))
+    noisy = track(
+        given, pointed, TrackConfig(controller="policy", noise=(Jitter(strength=0.2),), seed=1)
+    )
     assert any("without noise" in note for note in noisy.notes)
 
 
 def test_keypoints_are_fitted_for_a_policy_of_rotations(tracker: Tracker, pointed: Tracker) -> None:
     given = points(swing(0.5, 60.0))
-    tracked = track(given, tracker)
+    tracked = track(given, tracker, controller="policy")
     assert any("fitted to the keypoints" in note for note in tracked.notes)
     assert set(tracked.placed.source.skeleton.names) >= set(JOINT_PLACES) - {"Neck", "Head"}
     lost = given.positions.copy()
     lost[:, given.names.index("Nose")] = np.nan
     lost[5:8, given.names.index("LWrist")] = np.nan
     holes = given.replaced(positions=lost)
-    assert any("longest gap" in note for note in track(holes, pointed).notes)
+    assert any("longest gap" in note for note in track(holes, pointed, controller="policy").notes)
 
 
 def test_files_of_keypoints_are_known(data_dir: Path) -> None:
@@ -185,7 +187,7 @@ def test_files_of_keypoints_are_known(data_dir: Path) -> None:
 
 
 def test_noise_moves_the_input_and_says_so(tracker: Tracker) -> None:
-    config = TrackConfig(noise=(Jitter(),), seed=4)
+    config = TrackConfig(controller="policy", noise=(Jitter(),), seed=4)
     tracked = track(walk(0, 30), tracker, config)
     (note,) = [n for n in tracked.notes if "without noise" in n]
     assert "input with noise" in note
@@ -204,7 +206,7 @@ def test_angles_come_within_a_turn_of_their_ranges(tracker: Tracker) -> None:
 
 def test_it_agrees_with_an_evaluation_of_the_run(tracker: Tracker) -> None:
     """A clip on the body's skeleton is scored as the run's own evaluation would score it."""
-    tracked = track(walk(0, 30), tracker)
+    tracked = track(walk(0, 30), tracker, controller="policy")
 
     def make(worlds: int) -> ImitationEnv:
         return tracked.imitation.env(worlds, auto_reset=False, threads=1, help_scale=0.0)
@@ -216,7 +218,7 @@ def test_it_agrees_with_an_evaluation_of_the_run(tracker: Tracker) -> None:
 
 def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:
     with pytest.raises(PoiseError, match="needs at least 3"):
-        track(walk(0, 2), tracker)
+        track(walk(0, 2), tracker, controller="policy")
     chain = Skeleton(("a", "b", "c"), (-1, 0, 1), np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 1.0]]))
     rot = np.tile([1.0, 0, 0, 0], (10, 3, 1))
     with pytest.raises(PoiseError):

@@ -78,8 +78,8 @@ def test_its_state_looks_like_that_of_worlds(tracker: Tracker) -> None:
 
 
 def test_each_tracks_as_if_alone(tracker: Tracker) -> None:
-    alone = track(walk(0, 25), tracker)
-    many = track(walk(0, 25), tracker, TrackConfig(count=3))
+    alone = track(walk(0, 25), tracker, controller="policy")
+    many = track(walk(0, 25), tracker, TrackConfig(controller="policy", count=3))
     want = alone.evaluation.recordings[0].qpos
     for k, recording in enumerate(many.evaluation.recordings):
         got = recording.qpos.copy()
@@ -92,7 +92,7 @@ def test_each_tracks_as_if_alone(tracker: Tracker) -> None:
 
 def test_a_crowd_of_another_skeleton_is_delivered(tracker: Tracker, tmp_path: Path) -> None:
     source = swing(0.7, 30.0)
-    tracked = track(source, tracker, TrackConfig(count=2, reset_on_fail=True))
+    tracked = track(source, tracker, TrackConfig(controller="policy", count=2, reset_on_fail=True))
     done = write(tracked, tmp_path, hold=False)
     assert set(done.paths) == {
         "simulated_swing-1", "simulated_swing-2", "body_swing-1", "body_swing-2", "score", "report",

@@ -47,7 +47,10 @@ def test_the_curve_is_that_of_tracking(tracker: Tracker, tmp_path: Path) -> None
     # Without noise the input is the motion itself.
     assert clean.mpjpe_mm == pytest.approx(clean.off_mm, rel=1e-5)
     assert 5.0 < noisy.noise_mm < 100.0 and noisy.motions == 2
-    cards = [track(m, tracker, TrackConfig(levels[1].noise, 3)).evaluation.card for m in motions]
+    cards = [
+        track(m, tracker, TrackConfig(levels[1].noise, 3, controller="policy")).evaluation.card
+        for m in motions
+    ]
     assert noisy.mpjpe_mm == pytest.approx(sum(c.mpjpe_global_mm for c in cards) / 2)
     paths = write_robustness(found, tmp_path)
     said = json.loads(paths["json"].read_text())

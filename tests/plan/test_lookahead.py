@@ -18,7 +18,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.metrics.shapes import BOX, Shapes
 from poise.plan import Lookahead, LookaheadConfig
-from poise.plan.prices import motion_price
+from poise.plan.prices import CALM, Roughness
 from poise.recipes.imitation import Imitation
 from toy_policy import toy_run, walk
 
@@ -163,22 +163,33 @@ def test_prices_by_hand() -> None:
     quat = torch.zeros(2, 5, 1, 4)
     quat[..., 0] = 1.0
     none = pos[0, :0]
-    slide = motion_price(pos, quat, none, BODY, (0,), 30.0, 0.0, 2.0)
-    # 4 steps x 4 corners x 0.3 m/s over half of 8 points, times the price.
-    torch.testing.assert_close(slide, torch.tensor([0.0, 4 * 4 * 0.3 / 4 * 2.0]))
-    pos[1, :, 0, 0] = 7.0 * time**3
-    jerk = motion_price(pos, quat, none, BODY, (0,), 30.0, 0.5, 0.0)
-    # x''' = 42 m/s^3 in both third differences.
-    torch.testing.assert_close(jerk, torch.tensor([0.0, 2 * 0.042 * 0.5]), atol=1e-4, rtol=1e-3)
+
+    def rough(pos: Tensor, past: Tensor = none) -> Roughness:
+        return Roughness.of(pos, quat[: len(pos), : pos.shape[1]], past, BODY, (0,), 30.0)
+
+    still, slides = rough(pos[:1]), rough(pos)
+    # 4 corners x 0.3 m/s over half of 8 points.
+    torch.testing.assert_close(slides.slide, torch.tensor([[0.0] * 4, [0.3] * 4]))
+    torch.testing.assert_close(slides.price(still, 0.0, 2.0), torch.tensor([0.0, 4 * 0.3 * 2.0]))
+    # What slides as the reference does costs nothing.
+    torch.testing.assert_close(slides.price(rough(pos[1:]), 0.0, 2.0), torch.zeros(2), atol=1e-5, rtol=0)
+    pos[1, :, 0, 0] = 70.0 * time**3
+    jerked = rough(pos)
+    # 420 m/s^3 in both third differences, beside a calm reference and beside itself.
+    torch.testing.assert_close(jerked.jerk[1], torch.full((2,), 420.0), atol=0.5, rtol=1e-3)
+    calm = jerked.price(still, 0.5, 0.0)
+    torch.testing.assert_close(calm, torch.tensor([0.0, 2 * 420 / CALM * 0.5]), atol=0.02, rtol=1e-3)
+    same = jerked.price(rough(pos[1:]), 0.5, 0.0)
+    torch.testing.assert_close(same, torch.tensor([0.0, 2 * 0.5]), atol=1e-3, rtol=1e-3)
     past = torch.full((3, 1, 3), 0.02) * torch.tensor([0.0, 0.0, 1.0])
-    longer = motion_price(pos, quat, past, BODY, (0,), 30.0, 0.5, 0.0)
-    assert float(longer[0]) == 0.0 and float(longer[1]) > float(jerk[1])
+    assert rough(pos, past).jerk.shape == (2, 5) and not rough(pos, past).jerk[0].any()
+    assert not rough(pos[:, :1]).price(still, 1.0, 1.0).any()
 
 
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"candidates": 3}, "at least 6 candidates"),
+        ({"candidates": 3}, "at least 10 candidates"),
         ({"hold_steps": 20}, "hold_steps must lie in 1 to the horizon"),
         ({"noise_range": (0.3, 0.1)}, "noise_range must rise"),
         ({"smoothing": (1.0,)}, "shares of smoothing"),

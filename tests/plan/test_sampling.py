@@ -20,6 +20,7 @@ from poise.plan import SamplingConfig
 from toy_policy import toy_run, walk
 
 FEW = SamplingConfig(characters=32, retries=1)
+SEARCH = TrackConfig(controller="search", search=FEW)
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +31,10 @@ def tracker(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
 
 def test_what_is_found_is_one_simulation(tracker: Tracker) -> None:
     clip = walk(0, 40)
-    plain = track(clip, tracker)
+    plain = track(clip, tracker, controller="policy")
     (lost,) = plain.failed_s
     shown: list[tuple[int, int]] = []
-    done = track(clip, tracker, TrackConfig(search=FEW), on_search=lambda *x: shown.append(x))
+    done = track(clip, tracker, SEARCH, progress=lambda _, *x: shown.append(x))
     found = done.found
     assert found is not None and found.reached > round(lost * 30) and found.tries >= 32 * found.reached
     assert shown[0] == (0, 39) and all(a <= found.reached for a, _ in shown)
@@ -73,7 +74,7 @@ def test_where_nobody_comes_through_the_search_ends(tracker: Tracker) -> None:
     clip = walk(0, 40)
     pos = clip.root_pos.copy()
     pos[12:, 1] += 3.0
-    tracked = track(clip.replaced(root_pos=pos), tracker, TrackConfig(search=FEW))
+    tracked = track(clip.replaced(root_pos=pos), tracker, SEARCH)
     found = tracked.found
     assert found is not None and not found.whole and found.reached <= 12
     # Tried anew from farther back, so that more was tried than one way there.
@@ -98,19 +99,19 @@ def test_bad_settings_are_refused() -> None:
     with pytest.raises(PoiseError, match="must be positive"):
         SamplingConfig(noise_range=(0.3, 0.1))
     with pytest.raises(PoiseError, match="searched for a single character"):
-        TrackConfig(search=FEW, count=2)
+        TrackConfig(controller="search", count=2)
     with pytest.raises(PoiseError, match="one that comes or is put back"):
-        TrackConfig(search=FEW, recover=True)
+        TrackConfig(controller="search", recover=True)
 
 
 def test_a_motion_that_is_not_lost_is_not_searched() -> None:
-    tracked = track(walk(), open_run().tracker, TrackConfig(search=FEW))
+    tracked = track(walk(), open_run().tracker, SEARCH)
     assert tracked.found is None and not tracked.failures
 
 
 def test_a_kick_that_the_policy_loses_is_found(data_dir: Path) -> None:
     clip = read_clip(data_dir / "deepmimic_txt/humanoid3d_spinkick.txt")
-    tracked = track(clip, open_run().tracker, TrackConfig(search=SamplingConfig()))
+    tracked = track(clip, open_run().tracker, TrackConfig(controller="search"))
     assert tracked.found is not None and tracked.found.whole
     card = tracked.evaluation.card
     assert not tracked.failures and card.succ == 1.0 and card.help.limit_n == 0.0

@@ -16,8 +16,14 @@ from poise.jobs.open import open_run
 from poise.jobs.runs import begin
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
-from poise.recipes.residual_force import config_of, most_help, schedule
+from poise.recipes.residual_force import config_of, most_help, schedule, task
 from toy_human import swing
+
+#: A setting, a value, and the term that this value brings in and that is not there by default.
+SETTINGS = [
+    ("reward", "local", "root_pose"),
+    ("done", "height", "root_too_low"),
+]
 
 
 def names(terms) -> list[str]:
@@ -40,6 +46,15 @@ def test_the_default_is_the_papers_reward_with_implicit_help(built):
     assert sum(t.weight for t in task.rewards if t.imitation) == pytest.approx(1.0)
     assert names(task.dones) == ["bodies_too_far"] and task.pd.mode == "additive"
     assert RECIPE["config"] is ResidualForce and RECIPE["build"] is build
+
+
+@pytest.mark.parametrize(("setting", "value", "term"), SETTINGS)
+def test_settings_bring_terms_in(built, setting, value, term):
+    made = task(ResidualForce(**{setting: value}), built.humanoid)
+    before, after = (
+        {(type(t), t.name) for t in (*x.obs, *x.rewards, *x.dones)} for x in (built.task, made)
+    )
+    assert term in [name for _, name in after - before]
 
 
 def test_where_paper_and_code_differ():

@@ -33,8 +33,8 @@ NAMED = 8
 @dataclass(frozen=True)
 class Options:
     """Let a trained policy do a motion that it need not know, without help and without training: write
-    the motion, score.json and report.html. It looks ahead, and a motion that is lost so is searched; what
-    is lost then it can --learn."""
+    the motion, score.json and report.html. It looks ahead, and a motion that is lost so is searched;
+    what is lost then it can --learn."""
 
     clip: Annotated[Positional[Path], arg(metavar="FILE")]
     """The motion file: a clip of any human skeleton, or keypoints; or a folder of them."""
@@ -46,8 +46,8 @@ class Options:
     Poise."""
     controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
     """policy acts alone, at once; lookahead tries in copies of the character before it acts, which is
-    nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto looks
-    ahead, and searches what is lost so."""
+    nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto
+    looks ahead, and searches what is lost so."""
     budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
     """Simulated control steps for each that is made, of lookahead; by default 192. More are nearer and
     cleaner, and take longer."""

@@ -34,7 +34,12 @@ from poise.metrics import (
 )
 from poise.motion import Clip
 
-TRACKING = ("mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame2")
+TRACKING = (
+    "mpjpe_mm",
+    "mpjpe_global_mm",
+    "vel_mm_per_frame",
+    "acc_mm_per_frame2",
+)
 PLAUSIBILITY = ("foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk")
 
 

@@ -31,7 +31,7 @@ from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.kin.solids import shapes_of
 from poise.metrics import mpjpe_global
-from poise.plan.prices import motion_price
+from poise.plan.prices import Roughness
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4
@@ -53,8 +53,8 @@ class LookaheadConfig:
         warm: share of the copies with offsets about those that the last decision had planned to go on
             with; the others have theirs about none.
         smoothing: shares of the last action that actions keep; the copies take them in turns.
-        jerk_price: cost of 1 km/s^3 of the bodies' mean jerk in a control step.
-        slide_price: cost of 1 m/s with which points of the soles slide in a control step.
+        jerk_price: cost of a control step as jerky as the goal, see `Roughness.price`.
+        slide_price: cost of 1 m/s with which soles slide more than the goal's, in a control step.
         slack: how much more than the best one a copy may cost in tracking alone, and still be chosen.
         discount: gamma.
         seed: seed of all draws.
@@ -65,10 +65,10 @@ class LookaheadConfig:
     hold_steps: int = 4
     noise_range: tuple[float, float] = (0.03, 0.3)
     warm: float = 0.5
-    smoothing: tuple[float, ...] = (0.0, 0.5, 0.7)
-    jerk_price: float = 1.5
-    slide_price: float = 4.0
-    slack: float = 1.0
+    smoothing: tuple[float, ...] = (0.0, 0.5, 0.7, 0.9, 0.97)
+    jerk_price: float = 0.25
+    slide_price: float = 6.0
+    slack: float = 3.0
     discount: float = 0.97
     seed: int = 0
 
@@ -181,13 +181,13 @@ class Lookahead:
 
     @property
     def num_obs(self) -> int:
-        """Width of the observations."""
-        return self.copies.num_obs
+        """Width of the observations that the policy takes."""
+        return getattr(self.policy, "num_obs", self.copies.num_obs)
 
     @property
     def num_actions(self) -> int:
-        """Width of the actions."""
-        return self.copies.num_actions
+        """Width of the actions that the policy gives."""
+        return getattr(self.policy, "num_actions", self.copies.num_actions)
 
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for observations `(N, O)` of the worlds as they stand.
@@ -245,6 +245,8 @@ class Lookahead:
         c, env = self.config, self.copies
         obs, start = env.restore(snapshot), env.pose()
         pos, quat = [start.pos.clone()], [start.quat.clone()]
+        aim = env.goal_pose()
+        ref_pos, ref_quat = [aim.pos[:1].clone()], [aim.quat[:1].clone()]
         cost, lost = torch.zeros(c.candidates), torch.zeros(c.candidates, dtype=torch.bool)
         keep, factor = self._keep if past else torch.zeros_like(self._keep), 1.0
         for h in range(c.horizon):
@@ -257,15 +259,21 @@ class Lookahead:
             pose = env.pose()
             pos.append(pose.pos.clone())
             quat.append(pose.quat.clone())
-            off = mpjpe_global(pose.pos, env.goal_pose().pos) / 1000.0
+            aim = env.goal_pose()
+            ref_pos.append(aim.pos[:1].clone())
+            ref_quat.append(aim.quat[:1].clone())
+            off = mpjpe_global(pose.pos, aim.pos) / 1000.0
             lost |= ~(off <= LOST)
             cost, factor = cost - factor * env.imitation, factor * c.discount
         cost = cost - factor * self.value(obs)
         self.steps += c.candidates * (len(pos) - 1)
-        before = torch.stack(past) if past else pos[0][:0]
-        price = motion_price(
-            torch.stack(pos, 1), torch.stack(quat, 1), before, self._shapes, self._feet,
-            env.goal.rate_hz, c.jerk_price, c.slide_price,
+        rough, source = (
+            Roughness.of(
+                torch.stack(p, 1), torch.stack(q, 1), torch.stack(was) if was else p[0][:0],
+                self._shapes, self._feet, env.goal.rate_hz,
+            )
+            for p, q, was in ((pos, quat, past), (ref_pos, ref_quat, []))
         )  # fmt: skip
+        price = rough.price(source, c.jerk_price, c.slide_price)
         whole = ~lost & cost.isfinite() & price.isfinite()
         return torch.where(whole, cost, torch.inf), price

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,39 +11,55 @@ from torch import Tensor
 from poise.metrics.plausibility import foot_contacts, jerk
 from poise.metrics.shapes import Shapes, foot_points
 
+#: m/s^3, the mean jerk below which a reference counts as calm.
+CALM = 50.0
 
-def motion_price(
-    pos: Tensor,
-    quat: Tensor,
-    past: Tensor,
-    shapes: Shapes,
-    feet: Sequence[int],
-    rate_hz: float,
-    jerk_price: float,
-    slide_price: float,
-) -> Tensor:
-    """`(K,)` price of predicted motion, with the score card's own measures.
 
-        sum_t jerk_price |x'''_t| / 1000 + slide_price sum_p c_tp |v_tp| / (P / 2),
+@dataclass(frozen=True, eq=False)
+class Roughness:
+    """How roughly K motions of T frames go, by the score card's own measures.
 
-    |x'''| the mean jerk of all bodies in m/s^3, v the horizontal velocity (m/s) of P points on the soles
-    and c whether they touch the ground.
-
-    Args:
-        pos: `(K, T, B, 3)` m, world positions of the bodies, the first where they are now.
-        quat: `(K, T, B, 4)` wxyz.
-        past: `(k, B, 3)` m, up to three frames before them, which all copies share.
-        shapes: the solids of the bodies.
-        feet: indices of the feet among the bodies.
-        rate_hz: frames a second.
-        jerk_price: of 1 km/s^3, for a frame.
-        slide_price: of 1 m/s, for a frame.
+    Attributes:
+        jerk: `(K, T')` m/s^3, mean over the bodies, from frame to frame.
+        slide: `(K, T - 1)` m/s with which points of the soles that touch the ground move along it,
+            summed over the points and divided by half their number.
     """
-    price = torch.zeros(len(pos))
-    if jerk_price and len(past) + pos.shape[1] > 3:
+
+    jerk: Tensor
+    slide: Tensor
+
+    @classmethod
+    def of(
+        cls, pos: Tensor, quat: Tensor, past: Tensor, shapes: Shapes, feet: Sequence[int], rate_hz: float
+    ) -> Roughness:
+        """Measures predictions.
+
+        Args:
+            pos: `(K, T, B, 3)` m, world positions of the bodies, the first where they are now.
+            quat: `(K, T, B, 4)` wxyz.
+            past: `(k, B, 3)` m, up to three frames before them, which all motions share.
+            shapes: the solids of the bodies.
+            feet: indices of the feet among the bodies.
+            rate_hz: frames a second.
+        """
         whole = torch.cat((past.expand(len(pos), -1, -1, -1), pos), 1)
-        price = price + jerk_price / 1000.0 * jerk(whole, rate_hz).sum(-1)
-    if slide_price and pos.shape[1] > 1:
         speed, contact = foot_contacts(foot_points(pos, quat, shapes, feet), rate_hz)
-        price = price + slide_price / 1000.0 * (speed * contact).sum((1, 2)) / (speed.shape[-1] / 2)
-    return price
+        slide = (speed * contact).sum(-1) / 1000.0 / (speed.shape[-1] / 2)
+        few = whole.shape[1] < 4
+        return cls(slide[:, :0] if few else jerk(whole, rate_hz), slide)
+
+    def price(self, reference: Roughness, jerk_price: float, slide_price: float) -> Tensor:
+        """`(K,)`, what these motions cost beside a reference `(1, ...)`,
+
+            jerk_price sum_t j_t / max(mean j_ref, CALM) + slide_price sum_t max(0, s_t - mean s_ref),
+
+        with the jerk j and the slide s, so that a leap may be as jerky as a leap is, and standing feet
+        stand.
+        """
+        if not self.slide.shape[1]:
+            return torch.zeros(len(self.slide))
+        price = slide_price * (self.slide - reference.slide.mean()).clamp_min(0.0).sum(1)
+        if self.jerk.shape[1]:
+            source = float(reference.jerk.mean()) if reference.jerk.shape[1] else 0.0
+            price = price + jerk_price / max(source, CALM) * self.jerk.sum(1)
+        return price

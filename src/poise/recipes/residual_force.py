@@ -34,6 +34,7 @@ from poise.control import (
     SuccessHelp,
 )
 from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
+from poise.env.frame import TermFunction
 from poise.env.terms import done, obs, reward
 from poise.kin import fit_humanoid
 from poise.kin.place import on_own_body
@@ -221,20 +222,25 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
     if help_ is not None:
         weight = 0.05 if config.faithful == "code" else 0.1
         rewards += (RewardTerm("residual", reward.residual, weight, imitation=False),)
-    own = (obs.root_height, obs.root_tilt, obs.root_velocity, obs.joint_angles, obs.joint_velocities)
-    seen = (*own, obs.phase)
+    observations: tuple[ObsTerm | TermFunction, ...] = (
+        obs.root_height,
+        obs.root_tilt,
+        obs.root_velocity,
+        obs.joint_angles,
+        obs.joint_velocities,
+        obs.phase,
+    )
     if config.observation == "reference":
-        targets = (obs.body_positions, obs.target_joints, obs.target_root, obs.target_bodies)
-        seen = (*seen, *targets)
-    fail = (
+        observations += (obs.body_positions, obs.target_joints, obs.target_root, obs.target_bodies)
+    dones: tuple[DoneTerm, ...] = (
         DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5})
         if config.done == "bodies"
-        else DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1})
+        else DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1}),
     )
     return TaskConfig(
-        obs=tuple(ObsTerm(fn.__name__, fn) for fn in seen),
+        obs=tuple(t if isinstance(t, ObsTerm) else ObsTerm(t.__name__, t) for t in observations),
         rewards=rewards,
-        dones=(fail,),
+        dones=dones,
         pd=PDTargets(config.action),
         residual=help_,
         help=schedule(config),

@@ -12,7 +12,7 @@ from torch import Tensor
 from poise.env import ImitationEnv
 from poise.env.recovery.clock import RecoveryClock
 from poise.jobs.perpetual.demonstrations import clone_for, find_paths, odds, practised
-from poise.jobs.perpetual.stage_order import Stage, first_recovers, first_stage, following, own_recovery
+from poise.jobs.perpetual.stage_order import Stage, first_recovers, first_stage, own_recovery
 from poise.jobs.warm_start import CLONE_WORLDS, TrainingCallbacks, clone_expert, finetuning
 from poise.learn import (
     CloneConfig,
@@ -61,14 +61,13 @@ def begin_first(
         start = WarmStart(trained.first_actions(env.num_actions).clipped(own.ppo().obs_clip))
         if not config.recovery:
             return stage, start
-        second = following(config, stage, fails=False)
-        assert second is not None
         if stage.kind == "single":
-            return second, start
+            return Stage("single", 2, mixed=True), start
         # What is trained already is the first primitive.
         known = replace(start, policy=columns_of(start.policy, config.lateral))
         if first_recovers(config):
             return stage, known
+        second = Stage("recovery", 2)
         return second, begin_primitive(known, imitation, second)
     sized = replace(own, config=replace(config, ppo=_sized(config, stage)))
     joint = _joint(sized) if stage.kind == "joint" else None

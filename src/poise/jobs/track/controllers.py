@@ -80,6 +80,8 @@ def done_by(
             done = _episode(imitation, config, ahead, "lookahead", show)
         finally:
             ahead.copies.close()
+        if config.count == 1 and not done.failures and loses(tracker, imitation):
+            notes.append("The policy alone loses the motion.")
     else:
         done = _episode(imitation, config, tracker.policy, "policy")
     if config.searches and done.failures:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
+from poise.jobs.track.controllers import Controller
 from poise.jobs.track.tracking import TrackConfig, track
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import write_atomic
@@ -125,12 +126,14 @@ def robustness(
     levels: Sequence[Level] | None = None,
     seed: int = 0,
     tell: Callable[[str], None] = lambda _: None,
+    controller: Controller = "policy",
 ) -> Robustness:
     """Every motion tracked at every level of noise, once; the noise of a motion is that of its name.
 
     Args:
         levels: a ladder, by default that of `robustness_levels`.
         tell: is told of each level.
+        controller: see `TrackConfig`.
 
     Raises:
         PoiseError: no motion, or one that cannot be tracked without noise either.
@@ -143,7 +146,7 @@ def robustness(
         rows: list[tuple[float, ...]] = []
         for motion in motions:
             try:
-                rows.append(_row(tracker, motion, TrackConfig(level.noise, seed)))
+                rows.append(_row(tracker, motion, TrackConfig(level.noise, seed, controller=controller)))
             except PoiseError as problem:
                 if level.strength == 0:
                     raise
