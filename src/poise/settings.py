@@ -19,7 +19,18 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import (
+    Any,
+    Literal,
+    TypeGuard,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 from poise.errors import PoiseError, did_you_mean
 
@@ -37,9 +48,9 @@ class Migration:
     where that is not today's default.
     """
 
-    keys: Mapping[str, str] = field(default_factory=dict)
-    values: Mapping[str, Mapping[Any, Any]] = field(default_factory=dict)
-    absent: Mapping[str, Any] = field(default_factory=dict)
+    keys: Mapping[str, str] = field(default_factory=dict[str, str])
+    values: Mapping[str, Mapping[Any, Any]] = field(default_factory=dict[str, Mapping[Any, Any]])
+    absent: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def __call__(self, data: Mapping[str, Any]) -> dict[str, Any]:
         """The settings under their names of today; `data` stays as it is."""
@@ -72,9 +83,9 @@ def plain(value: Any) -> Any:
     that is not finite."""
     if is_dataclass(value):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
+    if _is_table(value):
         return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
+    if _is_list(value):
         return [plain(v) for v in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -98,9 +109,10 @@ def validate(config: Any) -> None:
     Raises:
         PoiseError: another value, with the nearest one that there is.
     """
-    name = type(config).__name__
+    own = cast("type[Any]", type(config))
+    name = own.__name__
     for f in fields(config):
-        value, known = getattr(config, f.name), _choices(_types(type(config))[f.name])
+        value, known = getattr(config, f.name), _choices(_types(own)[f.name])
         if known and value not in known:
             texts = [str(k) for k in known]
             raise PoiseError(
@@ -183,7 +195,7 @@ def _types(kind: type) -> dict[str, Any]:
 
 
 def _made(kind: Any, data: Any, name: str, where: Path | str | None) -> Any:
-    if not isinstance(data, Mapping):
+    if not _is_table(data):
         what = name or "the settings"
         raise PoiseError(f"{what} must be a table of settings, got {_short(data)}", where)
     types = {f.name: _types(kind)[f.name] for f in fields(kind) if f.init}
@@ -224,8 +236,9 @@ def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
         check_data(kind, value, where, name)
         return value
     if origin is list and isinstance(value, list):
-        return [_value(args[0], v, f"{name}[{i}]", where) for i, v in enumerate(value)]
-    if origin is tuple and isinstance(value, list | tuple):
+        items = enumerate(cast("list[Any]", value))
+        return [_value(args[0], v, f"{name}[{i}]", where) for i, v in items]
+    if origin is tuple and _is_list(value):
         kinds = args[:1] * len(value) if len(args) == 2 and args[1] is ... else args
         if len(kinds) != len(value):
             raise PoiseError(f"{name} must have {len(kinds)} values, got {len(value)}", where)
@@ -237,6 +250,14 @@ def _value(kind: Any, value: Any, name: str, where: Path | str | None) -> Any:
     if not isinstance(value, plain) or (isinstance(value, bool) and plain is not bool):
         raise PoiseError(f"{name} must be {_words(kind)}, got {_short(value)}", where)
     return value
+
+
+def _is_table(value: Any) -> TypeGuard[Mapping[str, Any]]:
+    return isinstance(value, Mapping)
+
+
+def _is_list(value: Any) -> TypeGuard[list[Any] | tuple[Any, ...]]:
+    return isinstance(value, list | tuple)
 
 
 def _short(value: Any) -> str:
@@ -259,11 +280,11 @@ def _holder(data: dict[str, Any], dotted: str) -> tuple[dict[str, Any] | None, s
     *parts, last = dotted.split(".")
     here: Any = data
     for part in parts:
-        here = here.get(part) if isinstance(here, dict) else None
-    return (here if isinstance(here, dict) else None), last
+        here = cast("dict[str, Any]", here).get(part) if isinstance(here, dict) else None
+    return (cast("dict[str, Any]", here) if isinstance(here, dict) else None), last
 
 
 def _without_null(value: Any) -> Any:
-    if isinstance(value, dict):
+    if _is_table(value):
         return {k: NONE if v is None else _without_null(v) for k, v in value.items()}
-    return [_without_null(v) for v in value] if isinstance(value, list) else value
+    return [_without_null(v) for v in value] if _is_list(value) else value

@@ -68,12 +68,11 @@ class Layout:
     def unpacked(self, packed: Tensor) -> Pose:
         """The poses in the rows of `packed (N, W)`, as views of it."""
         parts = packed.split_with_sizes(self._widths, -1)[: len(FIELDS)]
-        return Pose(
-            *(
-                part if len(shape) == 1 else part.unflatten(-1, shape)
-                for part, shape in zip(parts, self._shapes, strict=True)
-            )
-        )
+        shaped: list[Tensor] = [
+            part if len(shape) == 1 else part.unflatten(-1, shape)
+            for part, shape in zip(parts, self._shapes, strict=True)
+        ]
+        return Pose(*shaped)
 
     def place(self, packed: Tensor) -> Place:
         """What the rows of `packed (N, W)` say of their clips, as views of it."""
@@ -204,7 +203,7 @@ class ObsTerm:
 
     name: str
     fn: TermFunction
-    params: Mapping[str, Any] = field(default_factory=dict)
+    params: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,7 @@ class RewardTerm:
     name: str
     fn: TermFunction
     weight: float
-    params: Mapping[str, Any] = field(default_factory=dict)
+    params: Mapping[str, Any] = field(default_factory=dict[str, Any])
     imitation: bool = True
     when: Literal["always", "near", "far"] = "always"
 
@@ -241,7 +240,7 @@ class DoneTerm:
 
     name: str
     fn: TermFunction
-    params: Mapping[str, Any] = field(default_factory=dict)
+    params: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 T = TypeVar("T", ObsTerm, RewardTerm, DoneTerm)

@@ -56,7 +56,8 @@ class GymVectorEnv(VectorEnv):
         """One control step of all worlds: observations, rewards, terminations, truncations, infos."""
         out = self.env.step(_actions(actions))
         terminated, truncated = _ended(out)
-        self.log, infos = dict(out.log), {}
+        self.log = dict(out.log)
+        infos: Info = {}
         over = terminated | truncated
         if over.any():
             last = np.full(self.num_envs, None, dtype=object)
@@ -128,7 +129,7 @@ def _reseed(env: ImitationEnv, seed: int | None) -> None:
 
 
 def _actions(actions: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.array(actions, dtype=np.float32))
+    return torch.as_tensor(np.array(actions, dtype=np.float32))
 
 
 def _array(values: Tensor) -> np.ndarray:

@@ -12,7 +12,7 @@ from poise.env.env import ImitationEnv
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
-    from tensordict import TensorDict  # pyright: ignore[reportMissingImports]
+    from tensordict import TensorDict  # pyright: ignore[reportMissingModuleSource]
 
 #: The observation group that both actor and critic see: `obs_groups={"actor": [GROUP], ...}`.
 GROUP = "policy"

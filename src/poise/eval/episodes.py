@@ -4,11 +4,12 @@ obs = env.reset_to(clip, start)
 simulate(env, policy, obs, steps, Recorder(env, clip, start), ...)
 """
 
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -74,8 +75,10 @@ def start_frames(reference: Reference, most_frames: int = 40_000) -> tuple[Tenso
     """
     cost = sum(int(n) * int(n) // 2 for n in reference.length)
     stride = max(1, round(cost / most_frames + 0.5)) if cost > most_frames else 1
-    clips, frames = [], []
-    for c, n in enumerate(reference.length.tolist()):
+    clips: list[Tensor] = []
+    frames: list[Tensor] = []
+    lengths = cast("list[int]", reference.length.tolist())
+    for c, n in enumerate(lengths):
         picks = torch.arange(0, n - 1, stride)
         clips.append(torch.full_like(picks, c))
         frames.append(picks)
@@ -173,9 +176,8 @@ class Recorder:
         self.tensors = {k: torch.zeros(*many, *size) for k, size in sizes.items()}
         self.reward = {n: torch.zeros(many) for n in [*(t.name for t in env.task.rewards), "total"]}
         # The earliest episode of each clip is kept whole.
-        self._first = {
-            int(c): int((clip == c).nonzero()[start[clip == c].argmin()]) for c in clip.unique()
-        }
+        distinct = cast("Tensor", clip.unique())
+        self._first = {int(c): int((clip == c).nonzero()[start[clip == c].argmin()]) for c in distinct}
         self._qpos: list[Tensor] = []
 
     def see(self, env: ImitationEnv, step: int) -> bool:
@@ -201,7 +203,7 @@ class Recorder:
             # The wrench was applied at the poses before this step: its arm is zero for a root wrench.
             arm = wrench.point.cpu() - out["pos"][:, t - 1, bodies]
             ang, vel = sim.angvel[:, bodies].cpu(), sim.linvel[:, bodies].cpu()
-            out["point_vel"][:, t] = vel + torch.linalg.cross(ang, arm)
+            out["point_vel"][:, t] = vel + torch.cross(ang, arm, dim=-1)
             out["ang_vel"][:, t] = ang
         return t + 1 >= self.total
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_humanoid
+from poise.body.table import BodyRow
 from poise.kin.cycle import Cycle
 from poise.kin.doctor.clean import CleanReport, clean_clip
 from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
@@ -89,7 +90,7 @@ class FitReport:
 
     def sentences(self) -> list[str]:
         """The report in words, one line each."""
-        out = []
+        out: list[str] = []
         for c in self.clips:
             doubt = rate_sentence(c.flights, c.fps)
             out += [f"{c.name}: {doubt}"] if doubt else []
@@ -184,9 +185,11 @@ def widen(
     degrees."""
     low = np.min([q[:, 7:].min(0) for q in motions], 0) - margin
     high = np.max([q[:, 7:].max(0) for q in motions], 0) + margin
-    rows, widened, at = [], [], 0
+    rows: list[BodyRow] = []
+    widened: list[tuple[str, float]] = []
+    at = 0
     for row in table.rows:
-        ranges = []
+        ranges: list[tuple[float, float]] = []
         for name, (a, b) in zip(row.hinge_names(), row.ranges, strict=True):
             grown = max(a - low[at], high[at] - b, 0.0)
             if grown > 0:
@@ -212,7 +215,7 @@ def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str,
                 continue
             deep = data.contact.dist < -OVERLAP_M
             for g1, g2 in data.contact.geom[deep]:
-                a, b = model.geom_bodyid[g1], model.geom_bodyid[g2]
+                a, b = int(model.geom_bodyid[g1]), int(model.geom_bodyid[g2])
                 if a and b:
                     found.add((humanoid.bodies[a - 1], humanoid.bodies[b - 1]))
     return tuple(sorted(found))

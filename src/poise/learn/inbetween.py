@@ -102,7 +102,8 @@ class InbetweenTrainer:
         self.metadata, self.seed = dict(metadata or {}), seed
         self.generator = make_generator(seed, "in-between windows")
         self.averaged = copy.deepcopy(objective.modules()["net"]).requires_grad_(False)
-        self.step, self.seconds = 0, 0.0
+        self.step = 0
+        self.seconds: float = 0.0
 
     @property
     def done(self) -> bool:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -46,7 +46,7 @@ class InbetweenModel:
     fps: float
     longest: int
     past: int = 10
-    meta: Mapping[str, Any] = field(default_factory=dict)
+    meta: Mapping[str, Any] = field(default_factory=dict[str, Any])
     example: tuple[State, list[Any]] | None = None
 
     @property
@@ -127,6 +127,7 @@ def _check_sizes(sizes: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
     """Refuses sizes that its weights cannot have, before a network of them is made."""
     held = sum(v.numel() for v in tensors.values())
     for name, value in dataclasses.asdict(sizes).items():
-        for number in value if isinstance(value, list | tuple) else (value,):
+        numbers = cast("Sequence[Any]", value) if isinstance(value, list | tuple) else (value,)
+        for number in numbers:
             if isinstance(number, int) and not 0 <= number <= held:
                 raise PoiseError(f"its weights are not those of a network with {name} = {value}", path)

@@ -129,6 +129,7 @@ class Trainer:
         )
         self.episodes = Episodes(env.num_envs, torch.device(env.device))
         self.iteration = 0
+        self.seconds: float
         self.samples, self.seconds = (start.samples, start.seconds) if start else (0, 0.0)
         # Length, reward and failure share of the last episodes that ended.
         self._ended = (math.nan, math.nan, math.nan)

@@ -271,7 +271,7 @@ def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Resid
 
 
 #: What to expect of the default settings (see `benchmarks/first_light.json`).
-RECIPE = {
+RECIPE: dict[str, Any] = {
     "name": "residual-force",
     "config": ResidualForce,
     "build": build,

@@ -96,7 +96,8 @@ def fill_keyframes(
         feet = foot_joints(own.skeleton)
         warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
     filler = _Filler(own, model, filling, keys, rig, feet)
-    clips, made = [], 0
+    clips: list[Clip] = []
+    made = 0
     for sample in range(filling.samples):
         noise = None
         if sample:

@@ -1,6 +1,9 @@
 """A stream as a goal: frames arrive one by one, late, twice, torn or never."""
 
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
+
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -58,7 +61,8 @@ class StreamGoal(BufferedGoal):
                 "the stream",
             )
         qpos = qpos.expand(len(ids), width)
-        good = qpos.isfinite().all(-1) & (qpos[:, 3:7].norm(dim=-1) > 1e-6)
+        norm = cast("Tensor", qpos[:, 3:7].norm(dim=-1))
+        good = qpos.isfinite().all(-1) & (norm > 1e-6)
         if not bool(good.all()):
             self._note(ids[~good], "sent a frame that is no pose, which is left out")
             ids, qpos = ids[good], qpos[good]
@@ -69,7 +73,7 @@ class StreamGoal(BufferedGoal):
         )
         known = self.count[ids]
         before = self.qpos[ids, (known - 1) % SIZE]
-        apart = (qpos[:, :3] - before[:, :3]).norm(dim=-1)
+        apart = cast("Tensor", (qpos[:, :3] - before[:, :3]).norm(dim=-1))
         jumped = (known > 0) & (apart * self.rate_hz > JUMP)
         if bool(jumped.any()):
             far = f"{float(apart[jumped].max()):.1f}"

@@ -48,7 +48,7 @@ class Inbetweened(Result):
         return Shown(self.clip, self.source, None, self.notes, self.keyframes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
-        paths = {}
+        paths: dict[str, Path] = {}
         for k, clip in enumerate(self.clips):
             name = "filled" if len(self.clips) == 1 else f"filled-{k}"
             paths[name] = folder / f"{name}{home_suffix(clip)}"

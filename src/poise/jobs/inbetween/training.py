@@ -11,6 +11,7 @@ A run folder holds `frames.safetensors` (the packed library), `run.safetensors` 
 `checkpoint.safetensors`, the log, and at the end `model.safetensors`.
 """
 
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 import copy
@@ -19,7 +20,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 
@@ -169,7 +170,7 @@ def prepare(bank: FrameBank, config: Inbetween, notes: tuple[str, ...] = ()) -> 
 def frame_data(bank: FrameBank, layout: Layout, std: torch.Tensor, rule: Contacts) -> FrameData:
     """A bank as float32 tensors with contact labels per clip."""
     points = bank.positions()[:, list(bank.feet)]
-    parts = points.split(torch.diff(bank.first).tolist())
+    parts = cast("tuple[torch.Tensor, ...]", points.split(torch.diff(bank.first).tolist()))
     if rule == "floor":
         labels = standing_labels(parts, bank.fps)
     else:
@@ -312,4 +313,4 @@ def small(config: Inbetween) -> Inbetween:
 
 
 #: Expected figures: see `benchmarks/inbetween.md`, which `benchmarks/inbetween.py` writes.
-RECIPE = {"name": "inbetween", "config": Inbetween, "build": prepare, "expected": {}}
+RECIPE: dict[str, Any] = {"name": "inbetween", "config": Inbetween, "build": prepare, "expected": {}}

@@ -166,7 +166,7 @@ def write_robustness(result: Robustness, folder: Path) -> dict[str, Path]:
     for rung in result.rungs:
         ladders.setdefault(rung.name.rpartition(" x")[0] or "all", []).append(rung)
     clean = [r for r in ladders.get("all", ()) if r.strength == 0]
-    series = []
+    series: list[tuple[str, list[float], list[float]]] = []
     for name, rungs in ladders.items():
         line = rungs if name == "all" else [*clean, *rungs]
         series.append((name, [r.strength for r in line], [100 * r.succ for r in line]))

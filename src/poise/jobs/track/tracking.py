@@ -192,7 +192,7 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     clip, reference = imitation.library.clips[0], imitation.reference
     names = [f"{clip.name}-{k + 1}" for k in range(count)]
     moves = np.pad(places(count), ((0, 0), (0, 1)))
-    motions = []
+    motions: list[np.ndarray] = []
     for move in moves:
         qpos = reference.qpos.numpy().copy()
         qpos[:, :3] += move

@@ -1,10 +1,12 @@
 """What inverse kinematics must know of a humanoid: which point is which, and its shape at rest."""
 
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -80,7 +82,8 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
     rest = Kinematics(table)(zero)
     rest_rot = quat_to_matrix(rest.quat[0])
     places = [*rest.pos[0]]
-    points, toes = [r.name for r in rows], {}
+    points = [r.name for r in rows]
+    toes: dict[int, int] = {}
     by_joint = {r.joint: i for i, r in enumerate(rows)}
     for _, joint in find_anatomy(skeleton).toes:
         foot = by_joint.get(skeleton.parents[joint])
@@ -180,10 +183,10 @@ def _normal(
     lower = normalize(rest[arm.end] - rest[arm.lower])
     up, forward = trunk[:, 1], trunk[:, 2]
     towards = -forward if arm.leg else forward
-    usual = torch.linalg.cross(upper, towards)
-    if float(usual.norm()) < 0.3:
+    usual = torch.cross(upper, towards, dim=-1)
+    if float(cast("Tensor", usual.norm())) < 0.3:
         # The bone points that way itself: a seated thigh bends down, an arm held forward bends up.
-        usual = torch.linalg.cross(upper, -up if arm.leg else up)
+        usual = torch.cross(upper, -up if arm.leg else up, dim=-1)
     usual = normalize(usual)
     row = table.rows[arm.lower]
     if len(row.order) == 1:
@@ -194,8 +197,8 @@ def _normal(
         towards_one_side = abs(low + high) > 0.5 * (high - low)
         sign = math.copysign(1.0, low + high if towards_one_side else along)
         return normalize(square_to(sign * axis, upper))
-    bend = torch.linalg.cross(upper, lower)
-    angle = math.atan2(float(bend.norm()), float(upper @ lower))
+    bend = torch.cross(upper, lower, dim=-1)
+    angle = math.atan2(float(cast("Tensor", bend.norm())), float(upper @ lower))
     if angle > REST_BEND:
         return normalize(bend)
     if len(row.order) == 3:
@@ -203,5 +206,5 @@ def _normal(
         if abs(float(middle @ usual)) > 0.7 and abs(float(first @ upper)) < 0.3:
             # A middle hinge would lock at 90 degrees. The first one bends the limb down, which in a
             # T-pose is what Eqs. 10 and 13 say.
-            usual = first if float(first @ torch.linalg.cross(upper, -up)) >= 0 else -first
+            usual = first if float(first @ torch.cross(upper, -up, dim=-1)) >= 0 else -first
     return normalize(square_to(usual, upper))

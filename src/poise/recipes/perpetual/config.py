@@ -232,7 +232,7 @@ class Perpetual:
             cls().ppo, std=0.055, policy_lr=1e-4, gamma=0.97, horizon=32, minibatch=8192, epochs=3,
             obs_clip=WIDE,
         )  # fmt: skip
-        own = {
+        own: dict[str, Any] = {
             "ppo": ppo, "convergence": ConvergenceConfig(patience=12), "style": None, "num_envs": 2048,
             "adaptive_over": "library", "mining": MiningConfig(rule="uniform"),
         }  # fmt: skip

@@ -13,12 +13,15 @@ world takes the body of the clip when it begins an episode of it (`env.body_assi
     imitation = shaped(build(library, config), BodyShapes(count=8), lambda body: task(config, body))
 """
 
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
+from torch import Tensor
 
 from poise.body import BodyTable, Humanoid, make_humanoid
 from poise.body.presets import Strength
@@ -110,7 +113,8 @@ def shaped(
     skeletons = [base.skeleton, *(scaled_skeleton(base.skeleton, base.table, s) for s in sizes[1:])]
     clips, motions = list(imitation.library.clips), _motions(imitation.reference)
     weights, body = list(imitation.library.weights), [0] * len(clips)
-    cyclic, example = imitation.reference.cyclic.tolist(), clips[0]
+    cyclic = cast("list[bool]", imitation.reference.cyclic.tolist())
+    example = clips[0]
     chosen = shapes.bodies_of(len(clips))
     for k in range(1, shapes.count):
         there = example.replaced(skeleton=skeletons[k])
@@ -140,7 +144,7 @@ def shaped(
 def scaled_table(table: BodyTable, sizes: Sequence[float]) -> BodyTable:
     """The body with each part `sizes` times as large, one number per group of `GROUPS`."""
     own = [_size_of(r.kind, sizes) for r in table.rows]
-    rows = []
+    rows: list[BodyRow] = []
     for row, size in zip(table.rows, own, strict=True):
         # Where a body hangs is a length of the one above it.
         above = own[row.parent] if row.parent >= 0 else 1.0
@@ -197,7 +201,8 @@ def _leg(rows: Sequence[BodyRow]) -> float:
 
 
 def _motions(reference: Reference) -> list[np.ndarray]:
-    return [q.numpy().copy() for q in reference.qpos.split(reference.length.tolist())]
+    parts = cast("tuple[Tensor, ...]", reference.qpos.split(reference.length.tolist()))
+    return [q.numpy().copy() for q in parts]
 
 
 def _on_body(

@@ -26,6 +26,7 @@ every stage there is no help.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -144,4 +145,4 @@ def build(library: Clips, config: Perpetual | None = None, table: BodyTable | No
 
 
 #: Expected figures: see `benchmarks/perpetual.md`.
-RECIPE = {"name": "perpetual", "config": Perpetual, "build": build, "expected": {}}
+RECIPE: dict[str, Any] = {"name": "perpetual", "config": Perpetual, "build": build, "expected": {}}
