@@ -66,9 +66,9 @@ class LookaheadConfig:
     noise_range: tuple[float, float] = (0.03, 0.3)
     warm: float = 0.5
     smoothing: tuple[float, ...] = (0.0, 0.5, 0.7, 0.9, 0.97)
-    jerk_price: float = 0.25
-    slide_price: float = 6.0
-    slack: float = 3.0
+    jerk_price: float = 0.5
+    slide_price: float = 12.0
+    slack: float = 1.5
     discount: float = 0.97
     seed: int = 0
 
