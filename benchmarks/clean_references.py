@@ -107,10 +107,10 @@ def compare(clip: Clip) -> dict:
     return {
         "before": _rounded(before),
         "after": _rounded(after),
-        "turned_back": sum(f.frames for f in report.clean[0].flips),
-        "slowed": sum(s.frames for s in report.clean[0].speeds),
-        "fall": clear_fall(report.flights[0]),
-        "likely_fps": likely_rate(report.flights[0], clip.fps),
+        "turned_back": sum(f.stop - f.start + 1 for f in report.clips[0].clean.flips),
+        "slowed": sum(s.stop - s.start + 1 for s in report.clips[0].clean.speeds),
+        "fall": clear_fall(report.clips[0].flights),
+        "likely_fps": likely_rate(report.clips[0].flights, clip.fps),
         "fps": clip.fps,
         "frames": clip.frames,
     }

@@ -19,9 +19,9 @@ from tyro.conf import Positional, arg
 from poise.cli.console import say, say_json, table, tell
 from poise.cli.main import guarded
 from poise.cli.options import Device, check_device
-from poise.cli.output import run_folder
 from poise.cli.parse import parse
 from poise.errors import PoiseError
+from poise.jobs.run_file import run_folder
 
 if TYPE_CHECKING:
     from poise.recipes.imitation import Imitation

@@ -18,7 +18,7 @@ from pathlib import Path
 from tracker import SIXTY
 
 from poise.body import BodyConfig
-from poise.cli.train_perpetual import training as shown
+from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.result import RESULT

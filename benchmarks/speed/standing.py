@@ -114,7 +114,7 @@ def measure(clip: Clip, seconds: float = 10.0, config: BodyConfig | None = None)
         "fitted_sink_mm": _sink_mm(humanoid, motions[0]),
         "sink_mm": _sink_mm(humanoid, replay),
         "lifted_mm": round(float((replay - motions[0])[:, 2].mean()) * 1000, 1),
-        "joints_mm": round(report.joint_error_mm[0], 2),
+        "joints_mm": round(report.clips[0].joint_error_mm, 2),
     }
 
 
