@@ -49,14 +49,15 @@ def test_info_convert_and_doctor(folder: Path, tmp_path: Path, answered, capsys)
 
 def test_track_says_which_were_lost(folder: Path, tmp_path: Path, answered, capsys) -> None:
     policy, out = toy_run(tmp_path / "run"), tmp_path / "out"
-    found = answered("track", folder, "--policy", policy, "-o", out, code=2)
+    argv = ["track", str(folder), "--policy", str(policy), "-o", str(out), "--controller", "policy"]
+    found = answered(*argv, code=2)
     assert states(found) == {"walk": LOST, "stand": 0, "broken": 2}
     assert (out / "walk/score.json").exists() and (out / "deep-stand/report.html").exists()
     assert not (out / "broken").exists()
     (folder / "broken.bvh").unlink()
     (folder / "deep/stand.txt").unlink()
     capsys.readouterr()
-    assert main(["track", str(folder), "--policy", str(policy), "-o", str(out), "--force"]) == LOST
+    assert main([*argv, "--force"]) == LOST
     said = capsys.readouterr().out
     assert "error mm" in said and "lost" in said and "walk" in said
 

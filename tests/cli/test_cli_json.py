@@ -46,7 +46,8 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
     few = ("--iterations", "1", "--envs", "16", "--threads", "1")
     if verb == "track":
         policy = toy_run(out / "policy")
-        return [short, "--policy", policy, "-o", out / "o", "--save-policy", out / "p.safetensors"], 3
+        more = ["--save-policy", out / "p.safetensors", "--controller", "policy"]
+        return [short, "--policy", policy, "-o", out / "o", *more], 3
     given: dict[str, list[Any]] = {
         "info": [short],
         "convert": [short, out / "o.bvh"],
