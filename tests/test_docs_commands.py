@@ -49,11 +49,11 @@ def _shortened(line: str) -> list[str]:
     if "--search" in argv:
         argv += ["--characters", "8"]
     if argv[0] == "imitate" and "--print-config" not in argv:
-        argv += TINY
+        argv += [*TINY, "--no-expert"]
         if "--resume" in argv:
             argv[argv.index("--iterations") + 1] = "3"
     if argv[:2] == ["train", "perpetual"]:
-        argv += [*TINY, "--single", "--no-expert", "--no-style", "--no-recovery"]
+        argv += [*TINY, "--no-expert", "--single", "--no-style", "--no-recovery"]
     if argv[:2] == ["train", "inbetween"]:
         argv += ["--iterations", "1", "--threads", "1"]
     if "--preset" in argv:
