@@ -44,8 +44,9 @@ demo: $(VENV)/.installed
 	@echo "The simulated motion:     demo/simulated.bvh"
 	@echo "The score card:           demo/score.json"
 
+# Two at once: fixtures of a file are made once.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -217,7 +217,8 @@ class Lookahead:
         begun, c = time.perf_counter(), self.config
         drawn = self._drawn(world.choice)
         cost, price = self._simulate(self._env.snapshot(torch.tensor([i])), drawn, world.past)
-        allowed = cost <= cost.min() + c.slack
+        allowed = cost.isfinite() & (cost <= cost.min() + c.slack)
+        # Where all lose the motion the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
         self.seconds.append(time.perf_counter() - begun)
         return _Choice(drawn[best], float(self._keep[best]))
