@@ -16,7 +16,8 @@ from poise.errors import PoiseError
 from poise.eval import Recording, run_episodes, score_rollouts
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation
-from poise.jobs.track import Keeper, TrackConfig, imitation_of, track, write
+from poise.jobs.track import Keeper, TrackConfig, imitation_of, look_ahead, track, write
+from poise.jobs.track.controllers import NO_CRITIC
 from poise.jobs.track.placement import home, place
 from poise.jobs.track.points import points_of
 from poise.jobs.tracker import Tracker
@@ -26,6 +27,7 @@ from poise.motion.io.raw import ReadOptions as Options
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Jitter
 from poise.motion.points.fit import JOINT_PLACES
+from poise.plan import LookaheadConfig
 from poise.spatial import quat_mul
 from toy_human import swing
 from toy_policy import toy_run, walk
@@ -214,6 +216,17 @@ def test_it_agrees_with_an_evaluation_of_the_run(tracker: Tracker) -> None:
     zero = torch.zeros(1, dtype=torch.long)
     rollouts, _ = run_episodes(make, tracker.policy, zero, zero, cycles=1)
     assert score_rollouts(rollouts).mpjpe_mm == tracked.evaluation.card.mpjpe_mm
+
+
+def test_a_policy_without_its_critic_acts_without_lookahead(tracker: Tracker) -> None:
+    blind = replace(tracker, value=None)
+    done = track(walk(0, 20), blind, TrackConfig(count=2))
+    assert done.controller == "policy" and NO_CRITIC in done.notes
+    with pytest.raises(PoiseError, match="without its critic"):
+        look_ahead(blind, done.imitation, LookaheadConfig())
+    with pytest.raises(PoiseError, match="Did you mean 'policy'"):
+        track(walk(0, 20), tracker, controller="polcy")
+    assert LookaheadConfig().budget == 192.0
 
 
 def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:

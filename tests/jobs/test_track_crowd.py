@@ -15,6 +15,7 @@ from poise.jobs.track.crowd import APART_M, Crowd, crowd_model, places
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
+from poise.plan import LookaheadConfig
 from poise.sim import CpuBackend
 from toy_human import swing
 from toy_policy import toy_run, walk
@@ -88,6 +89,27 @@ def test_each_tracks_as_if_alone(tracker: Tracker) -> None:
     assert many.evaluation.card.episodes == 3
     assert many.imitation.library.names == ("walk-1", "walk-2", "walk-3")
     assert [t for _, t in many.failures] == [t for _, t in alone.failures] * 3
+
+
+def test_each_looks_ahead_in_copies_of_itself_alone(tracker: Tracker) -> None:
+    few = LookaheadConfig(candidates=12, horizon=4)
+    config = TrackConfig(controller="lookahead", count=2, lookahead=few, threads=1)
+    done = track(walk(0, 20), tracker, config)
+    assert done.controller == "lookahead" and len(done.evaluation.recordings) == 2
+    task = done.imitation
+    crowd = Crowd(task.humanoid, task.config.sim, 2)
+    env = task.env(1, None, False, 1, help_scale=0.0, guard=False, backend=crowd)
+    copies = task.bare(rewards=True).env(3, auto_reset=False, threads=1, help_scale=0.0, guard=False)
+    env.reset_to(torch.arange(2), torch.tensor([0, 5]))
+    obs = copies.restore(env.snapshot(torch.tensor([1])))
+    state = crowd.state.qpos[1], crowd.state.qvel[1]
+    for k in range(3):
+        assert torch.equal(copies.backend.state.qpos[k], state[0])
+        assert torch.equal(copies.backend.state.qvel[k], state[1])
+    assert copies.clip.tolist() == [1, 1, 1] and copies.frame.tolist() == [5, 5, 5]
+    torch.testing.assert_close(obs[0], env.observe()[1], atol=1e-5, rtol=1e-4)
+    env.close()
+    copies.close()
 
 
 def test_a_crowd_of_another_skeleton_is_delivered(tracker: Tracker, tmp_path: Path) -> None:

@@ -141,8 +141,9 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             tracker = open_run(o.policy).tracker
     search = SamplingConfig(o.characters, rounds=o.rounds)
     config = TrackConfig(
-        noise, o.seed, o.reset_on_fail, o.recover, o.reading.smooth, o.count, o.controller, ahead,
-        search, o.threads,
+        noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
+        smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
+        search=search, threads=o.threads,
     )  # fmt: skip
     with claimed(out):
         # What is to be learned is the motion alone.
@@ -162,15 +163,8 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     say(said)
     if lost:
         say(advice(o, tracked))
-    word = (
-        "lost"
-        if lost
-        else "found"
-        if tracked.controller == "search"
-        else "came back"
-        if tracked.losses
-        else "tracked"
-    )
+    word = "came back" if tracked.losses else "found" if tracked.controller == "search" else "tracked"
+    word = "lost" if lost else word
     failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
     result = {
         "outcome": word,
@@ -246,7 +240,7 @@ def advice(options: Options, tracked: Tracked) -> str:
         return f"The same command with more minutes goes on learning: --learn {2 * o.learn:g}."
     if tracked.found is not None:
         return f"Try --characters {2 * o.characters}; or {learns}"
-    if o.count == 1 and o.controller != "auto":
+    if o.count == 1 and o.controller != "auto" and not (o.recover or o.reset_on_fail):
         return f"With --controller auto many characters search what is lost; {learns}"
     return "W" + learns[1:]
 

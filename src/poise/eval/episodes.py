@@ -7,7 +7,7 @@ simulate(env, policy, obs, steps, Recorder(env, clip, start), ...)
 # pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -99,6 +99,7 @@ def run_episodes(
     start: Tensor,
     limit: float = 0.0,
     cycles: int = 2,
+    observers: Sequence[Observer] = (),
 ) -> tuple[RolloutSet, list[Recording]]:
     """Every episode simulated to the end of its clip (cyclic clips: `cycles` rounds), failed or not.
 
@@ -106,6 +107,7 @@ def run_episodes(
         make_env: gives an environment of N worlds without automatic reset, which is closed in the end.
         policy: acts on raw observations, deterministically.
         clip, start: `(E,)` clip index and first frame. limit: the help budget, N and N m.
+        observers: watch beside the recorder.
 
     Returns:
         the padded rollouts (frame 0 is the start itself, before any action) and, for each clip's
@@ -118,7 +120,7 @@ def run_episodes(
     try:
         obs = env.reset_to(clip, start)
         recorder = Recorder(env, clip, start, cycles)
-        simulate(env, policy, obs, recorder.total - 1, recorder)
+        simulate(env, policy, obs, recorder.total - 1, recorder, *observers)
     finally:
         env.close()
     return recorder.rollouts(limit), recorder.recordings()

@@ -32,6 +32,7 @@ from poise.errors import PoiseError
 from poise.kin.solids import shapes_of
 from poise.metrics import mpjpe_global
 from poise.plan.prices import Roughness
+from poise.plan.sampling import draw_offsets
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4
@@ -226,13 +227,9 @@ class Lookahead:
     def _drawn(self, last: _Choice | None) -> Tensor:
         """`(K, H, A)` offsets: none, those planned before, and random ones about either."""
         c, n = self.config, len(self.config.smoothing)
-        low, high = c.noise_range
-        size = low * (high / low) ** torch.rand(c.candidates, 1, generator=self._rng)
-        noise = size * torch.randn(c.candidates, self.num_actions, generator=self._rng)
+        noise = draw_offsets(c.candidates, self.copies, c.noise_range, self._rng)
         about = torch.rand(c.candidates, generator=self._rng) < c.warm
         noise[: 2 * n], about[:n], about[n : 2 * n] = 0.0, False, True
-        # What is not a joint, the residual, is the policy's own.
-        noise[:, self.copies.hinges :] = 0.0
         out = noise[:, None] * self._shape[:, None]
         if last is not None:
             rest = last.offsets[c.hold_steps :]

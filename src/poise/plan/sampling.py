@@ -121,6 +121,21 @@ class _Choice:
     parent: Tensor
 
 
+def draw_offsets(
+    count: int, env: ImitationEnv, noise_range: tuple[float, float], rng: torch.Generator
+) -> Tensor:
+    """`(count, A)` rad, random offsets of an environment's joint targets; none of what is no joint.
+
+    noise_range: (low, high) rad, between which the deviation of each row is drawn, evenly in its
+        logarithm.
+    """
+    low, high = noise_range
+    size = low * (high / low) ** torch.rand(count, 1, generator=rng)
+    out = size * torch.randn(count, env.num_actions, generator=rng)
+    out[:, env.hinges :] = 0.0
+    return out
+
+
 class SamplingControl:
     """Tries one clip of an environment's reference from its first frame to its last.
 
@@ -238,13 +253,8 @@ class SamplingControl:
 
     def _drawn(self, count: int) -> Tensor:
         """`(N, A)` rad; none for the first try from each state."""
-        c = self.config
-        spread = torch.rand(count, 1, generator=self.rng)
-        low, high = c.noise_range
-        size = low * (high / low) ** spread
-        size[: self.states] = 0.0
-        out = self.scale * size * torch.randn(count, self.env.num_actions, generator=self.rng)
-        out[:, self.env.hinges :] = 0.0
+        out = self.scale * draw_offsets(count, self.env, self.config.noise_range, self.rng)
+        out[: self.states] = 0.0
         return out
 
     def _result(self, path: list[_Choice], now: _Kept, reached: int) -> SamplingResult:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
@@ -20,7 +21,6 @@ from poise.jobs.tracker import Tracker
 from poise.metrics import mpjpe_global, success_rule
 from poise.plan import Lookahead, LookaheadConfig, SamplingResult
 from poise.recipes.imitation import Imitation
-from poise.settings import changed
 
 if TYPE_CHECKING:
     from poise.jobs.track.tracking import TrackConfig
@@ -85,7 +85,7 @@ def done_by(
     else:
         done = _episode(imitation, config, tracker.policy, "policy")
     if config.searches and done.failures:
-        how = changed(config.search, {"seed": config.seed})
+        how = replace(config.search, seed=config.seed)
         told = show and (lambda made, steps: show("searching", made, steps))
         found = look_for(tracker, imitation, how, 0, config.threads, told)
         notes.append(sentence(found, how, imitation.reference.rate_hz))
@@ -113,7 +113,7 @@ def look_ahead(
     copies = imitation.bare(rewards=True).env(
         config.candidates, auto_reset=False, threads=threads, help_scale=0.0, guard=False
     )
-    return Lookahead(copies, tracker.policy, tracker.value, changed(config, {"seed": seed}))
+    return Lookahead(copies, tracker.policy, tracker.value, replace(config, seed=seed))
 
 
 def loses(tracker: Tracker, imitation: Imitation) -> bool:
@@ -133,11 +133,12 @@ def _episode(
     env = task.env(1, None, False, 1, help_scale=0.0, guard=crowd is None, backend=crowd)
     if isinstance(acts, Lookahead):
         acts.watch(env)
-    if show is not None:
-        acts = _Shown(acts, env, "looking ahead", int(task.reference.length[0]) - 1, show)
     keeper = Keeper(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
-    rollouts, recordings = run_episodes(lambda _: env, keeper or acts, every, starts, cycles=1)
+    told = () if show is None else (_Told("looking ahead", int(task.reference.length[0]) - 1, show),)
+    rollouts, recordings = run_episodes(
+        lambda _: env, keeper or acts, every, starts, cycles=1, observers=told
+    )
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
     mended = keeper.fallen if keeper is not None else ()
@@ -145,19 +146,16 @@ def _episode(
     return Done(rollouts, recordings, judged, frames, controller)
 
 
-class _Shown:
-    """A controller that tells how far it is."""
+class _Told:
+    """Tells how many control steps of an episode are done."""
 
-    def __init__(self, acts: Acts, env: ImitationEnv, what: str, steps: int, show: Show):
-        self.acts, self.what, self.steps, self.show, self.made = acts, what, steps, show, 0
-        self.num_obs = getattr(acts, "num_obs", env.num_obs)
-        self.num_actions = getattr(acts, "num_actions", env.num_actions)
+    def __init__(self, what: str, steps: int, show: Show):
+        self.what, self.steps, self.show = what, steps, show
 
-    def act(self, obs: Tensor) -> Tensor:
-        """What the controller does."""
-        self.show(self.what, self.made, self.steps)
-        self.made += 1
-        return self.acts.act(obs)
+    def see(self, env: ImitationEnv, step: int) -> bool:
+        """Tells of control step `step`; it never needs more of them."""
+        self.show(self.what, step, self.steps)
+        return True
 
 
 class Keeper:

@@ -36,7 +36,7 @@ from poise.motion.noise import Noise, perturb_clip, perturb_points
 from poise.plan import LookaheadConfig, SamplingConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
-from poise.settings import changed
+from poise.settings import changed, validate
 
 #: Characters in one world.
 MOST = 64
@@ -73,6 +73,7 @@ class TrackConfig:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        validate(self)
         if not 1 <= self.count <= MOST:
             raise PoiseError(f"there can be 1 to {MOST} characters, got {self.count}")
         if self.recover and (self.reset_on_fail or self.count > 1):
