@@ -54,7 +54,7 @@ class Options:
     characters: Annotated[int, arg(metavar="N")] = 512
     """Characters that search at once; more find harder motions."""
     rounds: Annotated[int, arg(metavar="N")] = 1
-    """How often is searched; later rounds stay about what was found, and come nearer."""
+    """How often the motion is searched; later rounds stay about what was found, and come nearer."""
     learn: Annotated[float, arg(metavar="MINUTES")] = 0.0
     """If the policy loses the motion, train it on that motion first, for so many minutes at most. What
     it learned is kept in learned/ of the folder; the same command goes on where it was stopped."""
