@@ -152,9 +152,9 @@ def sentence(found: SamplingResult, config: SamplingConfig, rate_hz: float) -> s
     """What the search came to."""
     much = f"{config.characters} characters looked for it, {found.tries:,} control steps, without help"
     if found.whole:
-        return f"The policy alone loses the motion; {much}, and found it to its end."
+        return f"The motion was lost; {much}, and found it to its end."
     at = found.reached / rate_hz
-    return f"The policy alone loses the motion; {much}, and came as far as {at:.1f} s."
+    return f"The motion was lost; {much}, and came as far as {at:.1f} s."
 
 
 def replay(found: SamplingResult, policy: Acts) -> Replay:
