@@ -36,6 +36,8 @@ from poise.plan.sampling import draw_offsets
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4
+#: Budget from which on the horizon is longer, and the longer one in control steps.
+FAR = (400.0, 16)
 #: Frames before a prediction that its jerk needs.
 PAST = 3
 
@@ -105,12 +107,13 @@ class LookaheadConfig:
 
     def with_budget(self, steps: float) -> LookaheadConfig:
         """The same with as many candidates as so many simulated control steps for each that is made
-        allow.
+        allow; from `FAR` on they look farther ahead, which is worth more then than further candidates.
 
         Raises:
             PoiseError: too few.
         """
-        return replace(self, candidates=int(steps * self.hold_steps / self.horizon))
+        horizon = max(self.horizon, FAR[1]) if steps >= FAR[0] else self.horizon
+        return replace(self, candidates=int(steps * self.hold_steps / horizon), horizon=horizon)
 
 
 class _Choice(NamedTuple):
