@@ -76,6 +76,11 @@ def clear_fall(flights: Sequence[Flight]) -> float | None:
     return float(np.median(falls)) if falls else None
 
 
+def usual_rate(fps: float) -> float:
+    """The rate (Hz) that files have nearest to `fps`."""
+    return min(RATES, key=lambda r: abs(math.log(r / fps)))
+
+
 def likely_rate(flights: Sequence[Flight], fps: float) -> float | None:
     """The frame rate (Hz) at which bodies would fall with g, where the stated one is far off.
 
@@ -85,8 +90,7 @@ def likely_rate(flights: Sequence[Flight], fps: float) -> float | None:
     fall = clear_fall(flights)
     if fall is None or GRAVITY / DOUBT < fall < DOUBT * GRAVITY:
         return None
-    rate = fps / math.sqrt(fall / GRAVITY)
-    return min(RATES, key=lambda r: abs(math.log(r / rate)))
+    return usual_rate(fps / math.sqrt(fall / GRAVITY))
 
 
 def rate_sentence(flights: Sequence[Flight], fps: float) -> str | None:
