@@ -26,7 +26,7 @@ STILL = 0.25
 REST = 0.5
 #: A seated body has level thighs: knees lower than hips by at most this share of the thigh.
 LEVEL = 0.7
-#: A body that holds something reaches for it: the wrist is this share of the arm's length from the shoulder.
+#: A hand that holds something reaches out: this share of the arm's length from the shoulder.
 REACH = 0.7
 #: What holds in this share of a spell's frames holds in the spell.
 MOSTLY = 0.6
