@@ -164,7 +164,8 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     if lost:
         say(advice(o, tracked))
     word = "came back" if tracked.losses else "found" if tracked.controller == "search" else "tracked"
-    word = "lost" if lost else word
+    survived = o.count == 1 and tracked.losses is None and tracked.card.survived
+    word = "lost" if lost else "not tracked" if survived else word
     failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
     result = {
         "outcome": word,
@@ -175,7 +176,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     }
     saved = {"policy": o.save_policy} if o.save_policy else {}
     told = (*tracked.notes, *done.notes)
-    code = LOST if lost else 0
+    code = LOST if lost or survived else 0
     return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
 
 
@@ -246,7 +247,9 @@ def advice(options: Options, tracked: Tracked) -> str:
 
 
 def outcome(tracked: Tracked, reset: bool) -> str:
-    """Where the character failed, in one sentence."""
+    """Where the character failed, in a sentence, and what was missing."""
+    from poise.jobs.track.missing import shortfalls
+
     reference, times = tracked.imitation.reference, tracked.failed_s
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
     off = f"{tracked.card.mpjpe_global_mm:.0f} mm off on average"
@@ -257,6 +260,9 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if tracked.losses is not None:
         return tracked.losses.sentence()
+    more = " ".join(("", *shortfalls(tracked.card)))
+    if not times and tracked.card.survived:
+        return f"Not tracked: within 0.5 m for all {seconds:.1f} s, {off}.{more}"
     if not times and tracked.controller == "search":
         return f"Found by a search to its end, {seconds:.1f} s, without help, {off}."
     if not times:
@@ -264,8 +270,8 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"Tracked {by} to its end, {seconds:.1f} s, without help, {off}."
     if not reset:
         return (
-            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; "
-            "what follows is not tracking. --reset-on-fail puts it back and goes on."
+            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; what "
+            f"follows is not tracking.{more} --reset-on-fail puts it back and goes on."
         )
     named = ", ".join(f"{t:.1f}" for t in times[:NAMED]) + (", ..." if len(times) > NAMED else "")
     return (

@@ -225,6 +225,7 @@ class Recorder:
             fps=ref.rate_hz,
             mass=humanoid.mass,
             feet=humanoid.feet,
+            head=humanoid.head,
             shapes=shapes_of(humanoid.table, torch.float32),
             limit_n=limit,
             limit_nm=limit,

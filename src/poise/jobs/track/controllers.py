@@ -135,7 +135,7 @@ def _episode(
         acts.watch(env)
     keeper = Keeper(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
-    told = () if show is None else (_Told("looking ahead", int(task.reference.length[0]) - 1, show),)
+    told = () if show is None else (Told("looking ahead", int(task.reference.length[0]) - 1, show),)
     rollouts, recordings = run_episodes(
         lambda _: env, keeper or acts, every, starts, cycles=1, observers=told
     )
@@ -146,7 +146,7 @@ def _episode(
     return Done(rollouts, recordings, judged, frames, controller)
 
 
-class _Told:
+class Told:
     """Tells how many control steps of an episode are done."""
 
     def __init__(self, what: str, steps: int, show: Show):

@@ -11,6 +11,7 @@ from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, deliver, finished, simulated_clip
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
+from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.placement import Placed, home
 from poise.jobs.track.recovering import Losses
 from poise.jobs.tracker import Tracker
@@ -118,6 +119,7 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
         f"The character failed at {seconds:.1f} s" + (f" (character {k + 1})." if count > 1 else ".")
         for k, seconds in t.failures
     )
+    said += shortfalls(t.evaluation.card) if count == 1 else ()
     done = deliver(t.imitation, t.evaluation, out, {}, inner, hold, placed.source, said)
     if not other:
         return done

@@ -22,8 +22,10 @@ from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track.controllers import RULE, Controller, Show, done_by
 from poise.jobs.track.crowd import places
+from poise.jobs.track.missing import needs_of
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.points import fitted, follow, points_of
+from poise.jobs.track.rates import rate_notes
 from poise.jobs.track.recovering import with_returns
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
@@ -145,10 +147,15 @@ def track(
         placed, imitation, replayed, losses = back
     done, said = done_by(tracker, imitation, config, replayed, progress)
     notes += said
+    notes += rate_notes(
+        tracker, given, placed.report.clips[0].flights,
+        lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
+    )  # fmt: skip
     rollouts, frames = done.rollouts, done.failures
     about, rate = tracker.about, imitation.reference.rate_hz
     suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
     card = scored(rollouts, imitation, about, RULE, tracker.config.method + suffix)
+    card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation)))
     clean = None
     if config.noise:
         seen = rollouts.pos[0], goals
