@@ -5,8 +5,8 @@
 RUN is the run's folder, FOLDER the library that it was trained on, of which the clips that were held out
 are read again. Nothing helps. Parts (all by default; what a part lacks, such as FOLDER, leaves it out):
 
-    table     success and errors on held-out clips and on the library, by source too, beside those of doing
-              nothing and the paper's rows
+    table     success and errors on held-out clips and on the library, by source too, beside those of
+              doing nothing and the paper's rows
     search    the same where what the policy loses is searched, by --characters at once
     recovery  1,000 trials each fallen, far and both, against a body that stands at ease
     owners    the composer against every primitive, clip by clip

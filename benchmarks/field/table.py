@@ -41,7 +41,8 @@ def field_table(
     """The field's table of one evaluation; a large one may come in parts, one at a time.
 
     A failed episode counts up to and including the frame that broke the rule (the published code goes on
-    with a restarted run instead), in the "uncut" views to its end. An episode's first frame was set, not tracked, so it does not count.
+    with a restarted run instead), in the "uncut" views to its end. An episode's first frame was set, not
+    tracked, so it does not count.
     "By clip" is the mean over clips of each clip's mean over the frames of its episodes.
 
     Args:
