@@ -36,6 +36,8 @@ from poise.plan.sampling import draw_offsets
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4
+#: Budget from which on the horizon is longer, and the longer one in control steps.
+FAR = (400.0, 16)
 #: Frames before a prediction that its jerk needs.
 PAST = 3
 
@@ -54,6 +56,8 @@ class LookaheadConfig:
         warm: share of the copies with offsets about those that the last decision had planned to go on
             with; the others have theirs about none.
         smoothing: shares of the last action that actions keep; the copies take them in turns.
+        corrections: shares of the policy's own action that the copies add their offsets to; they take
+            them in turns, too. Less of it is less jerk, where the policy corrects more than it must.
         jerk_price: cost of a control step as jerky as the goal, see `Roughness.price`.
         slide_price: cost of 1 m/s with which soles slide more than the goal's, in a control step.
         slack: how much more than the best one a copy may cost in tracking alone, and still be chosen.
@@ -67,6 +71,7 @@ class LookaheadConfig:
     noise_range: tuple[float, float] = (0.03, 0.3)
     warm: float = 0.5
     smoothing: tuple[float, ...] = (0.0, 0.5, 0.7, 0.9, 0.97)
+    corrections: tuple[float, ...] = (1.0, 0.7, 0.4, 0.1)
     jerk_price: float = 0.5
     slide_price: float = 12.0
     slack: float = 1.5
@@ -89,6 +94,9 @@ class LookaheadConfig:
         if not self.smoothing or not all(0 <= s < 1 for s in self.smoothing):
             what = f"shares of smoothing must lie in 0 to below 1, got {self.smoothing}"
             raise PoiseError(what, "LookaheadConfig")
+        if self.corrections[:1] != (1.0,) or not all(0 <= c <= 1 for c in self.corrections):
+            what = f"corrections must begin with 1 and lie in 0 to 1, got {self.corrections}"
+            raise PoiseError(what, "LookaheadConfig")
         if min(self.jerk_price, self.slide_price, self.slack) < 0:
             raise PoiseError("prices and slack must be at least 0", "LookaheadConfig")
 
@@ -99,12 +107,13 @@ class LookaheadConfig:
 
     def with_budget(self, steps: float) -> LookaheadConfig:
         """The same with as many candidates as so many simulated control steps for each that is made
-        allow.
+        allow; from `FAR` on they look farther ahead, which is worth more then than further candidates.
 
         Raises:
             PoiseError: too few.
         """
-        return replace(self, candidates=int(steps * self.hold_steps / self.horizon))
+        horizon = max(self.horizon, FAR[1]) if steps >= FAR[0] else self.horizon
+        return replace(self, candidates=int(steps * self.hold_steps / horizon), horizon=horizon)
 
 
 class _Choice(NamedTuple):
@@ -113,10 +122,12 @@ class _Choice(NamedTuple):
     Attributes:
         offsets: `(H, A)` rad, by control step from now on.
         smoothing: share of the last action that actions keep.
+        correction: share of the policy's own action.
     """
 
     offsets: Tensor
     smoothing: float
+    correction: float
 
 
 @dataclass(eq=False)
@@ -164,7 +175,10 @@ class Lookahead:
         humanoid = copies.goal.humanoid
         self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
         shares = torch.tensor(c.smoothing)
-        self._keep = shares[torch.arange(c.candidates) % len(shares)].unsqueeze(1)
+        turn = torch.arange(c.candidates)
+        self._keep = shares[turn % len(shares)].unsqueeze(1)
+        much = torch.tensor(c.corrections)
+        self._much = much[turn // len(shares) % len(much)].unsqueeze(1)
         # Held, then fading to nothing at the horizon.
         left = torch.arange(1, c.horizon + 1) - c.hold_steps
         self._shape = 1.0 - left.clamp_min(0) / max(1, c.horizon - c.hold_steps)
@@ -200,7 +214,8 @@ class Lookahead:
         if env is None:
             raise PoiseError("a lookahead acts in an environment", hint="Call watch(env) first")
         pos, fresh = env.pose().pos, (env.age == 0).tolist()
-        offsets, keep = torch.zeros(len(obs), env.num_actions), torch.zeros(len(obs), 1)
+        offsets = torch.zeros(len(obs), env.num_actions)
+        keep, much = torch.zeros(len(obs), 1), torch.ones(len(obs), 1)
         for i, world in enumerate(self._worlds):
             if fresh[i]:
                 world.choice, world.past = None, []
@@ -208,9 +223,10 @@ class Lookahead:
                 world.choice, world.step = self._decide(i, world), 0
             offsets[i] = world.choice.offsets[world.step]
             keep[i] = 0.0 if fresh[i] else world.choice.smoothing
+            much[i] = world.choice.correction
             world.step += 1
             world.past = [*world.past, pos[i].clone()][-PAST:]
-        return torch.lerp(self.policy.act(obs) + offsets, env.action, keep)
+        return torch.lerp(much * self.policy.act(obs) + offsets, env.action, keep)
 
     def _decide(self, i: int, world: _World) -> _Choice:
         """What world i does next."""
@@ -222,7 +238,7 @@ class Lookahead:
         # Where all lose the motion the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
         self.seconds.append(time.perf_counter() - begun)
-        return _Choice(drawn[best], float(self._keep[best]))
+        return _Choice(drawn[best], float(self._keep[best]), float(self._much[best]))
 
     def _drawn(self, last: _Choice | None) -> Tensor:
         """`(K, H, A)` offsets: none, those planned before, and random ones about either."""
@@ -251,7 +267,7 @@ class Lookahead:
             # The last frame of a clip is a goal that is reached.
             if bool((env.goal.layout.place(env.goal.now()).end > 0).all()):
                 break
-            action = torch.lerp(self.policy.act(obs) + offsets[:, h], env.action, keep)
+            action = torch.lerp(self._much * self.policy.act(obs) + offsets[:, h], env.action, keep)
             keep = self._keep
             obs = env.step(action).final_obs
             pose = env.pose()
