@@ -10,9 +10,9 @@ four styles), bandai-test (those), bandai-all, cmu and dances; "library" and "he
 LIBRARY that the policy learned from, and those of the subjects that were held out. --conditions are what
 goes wrong (`lookahead_sets.CONDITIONS`; "all": each of them).
 
-FILE grows clip by clip: what it holds is not measured again, so that a run that was stopped goes on and
-other sets, budgets and conditions come beside. Next to it lie FILE.md, all tables, and the budget curve
-(`lookahead_text.py`).
+FILE grows clip by clip: what it holds is not measured again but for --again, so that a run that was
+stopped goes on, and other sets, budgets and conditions come beside. Figures of another policy, or of
+other settings of lookahead, are measured anew. Next to it lie FILE.md, all tables, and the budget curve.
 """
 
 from __future__ import annotations
@@ -51,38 +51,40 @@ class Job(NamedTuple):
 
 
 class Results:
-    """The rows of a file, and what they were measured with."""
+    """The rows of a file; a new one takes the place of the one with its key."""
 
-    def __init__(self, path: Path, again: bool):
+    def __init__(self, path: Path):
         self.path = path
-        self.about = {
-            "policy": hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:16],
-            "lookahead": json.loads(json.dumps(asdict(LookaheadConfig()))),
-        }
-        self.commands: list[str] = []
-        self.rows: list[dict[str, Any]] = []
-        if path.exists() and not again:
-            old = json.loads(path.read_text())
-            if {k: old.get(k) for k in self.about} != self.about:
-                hint = "Measure it --again, or write another file"
-                raise PoiseError("holds figures of another policy or of other settings", path, hint)
-            self.commands, self.rows = old["commands"], old["rows"]
+        old = json.loads(path.read_text()) if path.exists() else {}
+        self.commands: list[str] = old.get("commands", [])
+        self.rows: list[dict[str, Any]] = old.get("rows", [])
 
-    def done(self) -> set[tuple[Any, ...]]:
-        """Keys of all rows."""
-        return {tuple(row[k] for k in KEY) for row in self.rows}
+    def has(self, job: Job) -> bool:
+        """Whether a job was measured with this policy and these settings."""
+        made = made_with(job.key[2])
+        return any(_key(row) == job.key and row["made_with"] == made for row in self.rows)
 
     def add(self, row: dict[str, Any]) -> None:
         """One row more, in the file at once."""
-        self.rows.append(row)
+        self.rows = [r for r in self.rows if _key(r) != _key(row)] + [row]
         self.save()
 
     def save(self) -> None:
         """The file, with a line for each row."""
-        head = {"commands": self.commands, "machine": platform.machine(), **self.about}
+        head = {"commands": self.commands, "machine": platform.machine()}
         text = json.dumps(head, indent=1, allow_nan=False).rstrip("}").rstrip()
         lines = ",\n".join(f"  {json.dumps(r, allow_nan=False)}" for r in self.rows)
         write_atomic(self.path, f'{text},\n "rows": [\n{lines}\n ]\n}}\n'.encode())
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[k] for k in KEY)
+
+
+def made_with(controller: str) -> str:
+    """A hash of what decides the figures of a controller: the policy, and the settings of lookahead."""
+    settings = json.dumps(asdict(LookaheadConfig())) if controller == "lookahead" else ""
+    return hashlib.sha256(SHIPPED.read_bytes() + settings.encode()).hexdigest()[:16]
 
 
 def jobs_of(a: argparse.Namespace) -> Iterator[Job]:
@@ -106,13 +108,12 @@ def jobs_of(a: argparse.Namespace) -> Iterator[Job]:
 def main(argv: list[str] | None = None) -> None:
     """Measures, row by row, and writes the tables."""
     a = arguments().parse_args(argv)
-    results = Results(a.json, a.again)
-    have = results.done()
-    jobs = [job for job in jobs_of(a) if job.key not in have]
+    results = Results(a.json)
+    jobs = [job for job in jobs_of(a) if a.again or not results.has(job)]
     words = [w.rpartition("/")[2] if w.startswith(("/", "~")) else w for w in argv or sys.argv[1:]]
     command = "python benchmarks/lookahead.py " + " ".join(f'"{w}"' if " " in w else w for w in words)
     results.commands += [] if command in results.commands else [command]
-    print(f"{len(jobs)} to measure, {len(have)} rows are there", flush=True)
+    print(f"{len(jobs)} to measure, {len(results.rows)} rows are there", flush=True)
     running: dict[Future[dict[str, Any]], Job] = {}
     with ProcessPoolExecutor(a.workers) as pool:
         for job in jobs:
@@ -122,7 +123,8 @@ def main(argv: list[str] | None = None) -> None:
         while running:
             for one in wait(running, return_when=FIRST_COMPLETED).done:
                 job = running.pop(one)
-                row = dict(zip(KEY, job.key, strict=True)) | one.result()
+                row = dict(zip(KEY, job.key, strict=True)) | {"made_with": made_with(job.key[2])}
+                row |= one.result()
                 results.add(row)
                 whole = sum(e["whole"] for e in row["episodes"])
                 print(*job.key[:5], f"{whole} of {len(row['episodes'])}", sep=", ", flush=True)
@@ -145,7 +147,7 @@ def arguments() -> argparse.ArgumentParser:
     p.add_argument("--starts", type=int, default=1, metavar="N")
     p.add_argument("--workers", type=int, default=2)
     p.add_argument("--cache", type=Path, help="a folder for the library that is read")
-    p.add_argument("--again", action="store_true", help="measure what FILE holds anew")
+    p.add_argument("--again", action="store_true", help="measure also what FILE holds")
     return p
 
 

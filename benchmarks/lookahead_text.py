@@ -197,6 +197,9 @@ def tables(rows: Sequence[Row], image: str = "") -> str:
     for title, lines in parts:
         if lines:
             out += [f"**{title}.**", "", *lines, ""]
+    made = [r["made_with"] for r in rows if r["controller"] == "lookahead"]
+    if few := len(made) - max((made.count(m) for m in set(made)), default=0):
+        out += [f"Of lookahead's {len(made)} rows {few} are of other settings than most.", ""]
     if image and budget(rows):
         out += [f"![Budget curve]({image})", ""]
     return "\n".join(out).rstrip() + "\n"

@@ -127,7 +127,14 @@ def row(clip: str, controller: str, whole: tuple[bool, ...], budget: str = "", *
         }
         for k, w in enumerate(whole)
     ]  # fmt: skip
-    known = {"set": "cmu", "clip": clip, "controller": controller, "budget": budget, "condition": "none"}
+    known = {
+        "set": "cmu",
+        "clip": clip,
+        "controller": controller,
+        "budget": budget,
+        "condition": "none",
+        "made_with": "this",
+    }
     return known | {"starts": len(whole), "episodes": episodes} | more
 
 
@@ -196,7 +203,13 @@ def test_a_benchmark_that_was_stopped_goes_on(tmp_path: Path, capsys: pytest.Cap
     ahead = next(r for r in rows if r["controller"] == "lookahead" and r["condition"] == "none")
     assert 0 < ahead["steps_per_step"] <= 10 and min(ahead["decision_ms"]) > 0
     assert "What goes wrong" in out.with_suffix(".md").read_text()
-    changed = json.loads(out.read_text()) | {"policy": "another"}
-    out.write_text(json.dumps(changed))
-    with pytest.raises(PoiseError, match="another policy or of other settings"):
-        main(given)
+    # What other settings of lookahead gave is measured anew, in its place.
+    found = json.loads(out.read_text())
+    ahead = next(r for r in found["rows"] if r["controller"] == "lookahead")
+    ahead["made_with"] = "others"
+    out.write_text(json.dumps(found))
+    assert "Of lookahead's 2 rows 1 are of other settings" in tables(found["rows"])
+    main([*given, "--budgets", "10x4", "--starts", "2"])
+    assert "1 to measure, 6 rows" in capsys.readouterr().out
+    again = json.loads(out.read_text())["rows"]
+    assert len(again) == 6 and len({r["made_with"] for r in again}) == 2
