@@ -123,7 +123,8 @@ def main(argv: list[str] | None = None) -> None:
         while running:
             for one in wait(running, return_when=FIRST_COMPLETED).done:
                 job = running.pop(one)
-                row = dict(zip(KEY, job.key, strict=True)) | {"made_with": made_with(job.key[2])}
+                row: dict[str, Any] = dict(zip(KEY, job.key, strict=True))
+                row["made_with"] = made_with(job.key[2])
                 row |= one.result()
                 results.add(row)
                 whole = sum(e["whole"] for e in row["episodes"])

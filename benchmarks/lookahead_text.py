@@ -163,24 +163,21 @@ def budget_table(rows: Sequence[Row]) -> list[str]:
 
 
 def curve(rows: Sequence[Row], path: Path) -> bool:
-    """The budget curve: success, and error, jerk and slide as shares of the policy's."""
+    """The budget curve: success, and error of all frames, jerk and slide as shares of the policy's."""
     found = budget(rows)
     if not found:
         return False
     x = [steps(g) for _, g in found]
     lines = {
-        "done whole, %": [100.0 * success(g)[0] for _, g in found],
-        "error of all frames": [mean(g, "error_uncut_mm") for _, g in found],
+        "error": [mean(g, "error_uncut_mm") for _, g in found],
         "jerk": [median(g, jerk_ratio) for _, g in found],
         "slide": [median(g, "slide") for _, g in found],
     }
-    for name in list(lines)[1:]:
-        first = lines[name][0]
-        lines[name] = [100.0 * v / first if first else math.nan for v in lines[name]]
-    series = [(n if "%" in n else f"{n}, % of the policy's", x, y) for n, y in lines.items()]
-    line_plot(
-        series, "What looking ahead buys", "simulated steps for each that is made", "%", path, zero=True
-    )
+    series = [("done whole", x, [100.0 * success(g)[0] for _, g in found])]
+    for name, y in lines.items():
+        series.append((name, x, [100.0 * v / y[0] if y[0] else math.nan for v in y]))
+    title = "Looking ahead: error, jerk and slide beside the policy's"
+    line_plot(series, title, "simulated steps for each that is made", "%", path, zero=True)
     return True
 
 
