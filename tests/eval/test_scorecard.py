@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.eval.card import read_score, table, write_score
+from poise.eval import table
+from poise.eval.card import read_score, write_score
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.scorecard import PLAUSIBILITY, TRACKING, score_rollouts
 from poise.metrics import KINDS, Shapes
@@ -19,7 +20,8 @@ KEYS = [
     "succ", "succ_rule", "mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame2",
     "foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk", "reward", "help", "seconds",
     "samples", "seed", "version", "clip", "method", "episodes", "frames", "mpjpe_succ_mm",
-    "tracked", "needs", "reference", "per_clip", "weighting", "variants", "delivered",
+    "tracked", "needs", "reference", "per_clip", "weighting", "variants", "nothing", "starts", "spread",
+    "delivered",
 ]  # fmt: skip
 HELP_KEYS = [
     "limit_n", "limit_nm", "force_mean_n", "force_p95_n", "torque_mean_nm", "torque_p95_nm",
@@ -70,7 +72,8 @@ def test_keys_are_stable():
     assert [list(entry) for entry in d["per_clip"]] == [CLIP_KEYS, CLIP_KEYS]
     assert list(d["reward"]) == ["total", "pose"]
     assert list(d["reference"]) == ["foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk"]
-    assert list(d["variants"]) == ["frame", "episode", "succ_frame", "succ_episode"]
+    weighted = ["frame", "episode", "succ_frame", "succ_episode", "uncut_frame", "uncut_episode"]
+    assert list(d["variants"]) == weighted
 
 
 def test_hand_computed_figures_frame_and_episode_weighted():
@@ -114,6 +117,27 @@ def test_a_failed_episode_counts_until_it_fails():
     assert (run["clip"], run["succ"]) == ("run", 1.0) and math.isnan(run["first_fail_s"])
     strict = score_rollouts(replace(r, pos=pos), rule="any_25cm")
     assert strict.succ_rule == "any_25cm"
+    # Over all frames the one after the failure counts too, and the table says so.
+    uncut = (10 * 10 + 2 * 100 + 2 * 700) / 14
+    assert card.variants["uncut_frame"]["mpjpe_global_mm"] == pytest.approx(uncut)
+    shown = {row[0]: row[1] for row in table(card)}
+    assert shown["Joint error, global, all frames"] == pytest.approx(uncut)
+
+
+def test_perturbed_starts_have_a_spread():
+    r = rollouts()
+    exact = score_rollouts(r)
+    assert (exact.starts, exact.spread) == (1, {})
+    pos = r.pos.clone()
+    pos[1, 2:, :, 0] += 0.6
+    card = score_rollouts(replace(r, pos=pos, trial=torch.tensor([0, 1])))
+    assert card.starts == 2 and card.succ == 0.5
+    # One start succeeds and the other one fails; 10 mm and a mean of 300 mm.
+    assert card.spread["succ"] == pytest.approx(0.5**0.5)
+    assert card.spread["mpjpe_global_mm"] == pytest.approx((300 - 10) / 2**0.5)
+    assert "Success, spread over 2 starts" in [row[0] for row in table(card)]
+    beside = replace(card, nothing={"succ": 0.25})
+    assert ("Success, doing nothing", 25.0, "%", "") in table(beside)
 
 
 def test_an_episode_that_stops_early_does_not_succeed():

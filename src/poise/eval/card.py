@@ -40,7 +40,10 @@ class ScoreCard:
 
     NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
     `kin.doctor.needs`. `variants` holds the tracking figures under each
-    weighting ("frame", "episode") and for successes alone ("succ_frame", "succ_episode").
+    weighting ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all
+    frames, those after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success
+    and tracking figures of action 0 from the same starts, `spread` their standard deviations over
+    `starts` perturbed starts; empty where that was not measured.
     """
 
     succ: float
@@ -70,6 +73,9 @@ class ScoreCard:
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
     variants: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    nothing: Mapping[str, float] = field(default_factory=dict)
+    starts: int = 1
+    spread: Mapping[str, float] = field(default_factory=dict)
     delivered: tuple[Mapping[str, Any], ...] = ()
 
     @property
@@ -202,11 +208,13 @@ _ROWS = (
 def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
     """Rows (label, value, unit, verdict) for the command line and the report, most important first.
 
-    Each plausibility row is followed by the reference's own figure, which gets no verdict.
+    Each row is followed by what stands beside it, without a verdict: the error over all frames, the
+    spread over perturbed starts, what doing nothing comes to, the reference's own figure.
     """
     t = THRESHOLDS
     rows: list[tuple[str, float, str, Verdict]] = [
-        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ))
+        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
+        *_beside(card, "succ", "Success", "%", 100.0),
     ]
     if math.isfinite(card.tracked):
         rows.append(Row("Tracked", 100.0 * card.tracked, "%", t["tracked"].verdict(card.tracked)))
@@ -217,7 +225,10 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
             ratio = value / reference if reference > 0 else math.nan
             rows.append(Row(label, value, unit, t["jerk_ratio"].verdict(ratio)))
         else:
-            rows.append(Row(label, value, unit, t[key].verdict(value)))
+            rows += [
+                Row(label, value, unit, t[key].verdict(value)),
+                *_beside(card, key, label, unit),
+            ]
         if math.isfinite(reference):
             rows.append(Row(f"{label}, reference", reference, unit, ""))
     aid = card.help
@@ -231,3 +242,16 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
         Row("Reward per step", card.reward.get("total", math.nan), "", ""),
     ]
     return rows
+
+
+def _beside(card: ScoreCard, key: str, label: str, unit: str, times: float = 1.0) -> list[Row]:
+    """What stands beside a figure of tracking, as far as it was measured."""
+    uncut = card.variants.get(f"uncut_{card.weighting}", {}).get(key, math.nan)
+    # Without a failure all frames count anyway.
+    uncut = math.nan if card.succ == 1.0 else uncut
+    found = (
+        ("all frames", uncut),
+        (f"spread over {card.starts} starts", card.spread.get(key, math.nan)),
+        ("doing nothing", card.nothing.get(key, math.nan)),
+    )
+    return [Row(f"{label}, {w}", times * v, unit, "") for w, v in found if math.isfinite(v)]
