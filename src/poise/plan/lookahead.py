@@ -275,7 +275,7 @@ class Lookahead:
         keep, factor = self._keep if past else torch.zeros_like(self._keep), 1.0
         for h in range(c.horizon):
             # The last frame of a clip is a goal that is reached.
-            if bool((env.goal.layout.place(env.goal.now()).end > 0).all()):
+            if bool((env.goal.layout.place(env.goal.now()).end > 0).any()):
                 break
             action = torch.lerp(self._much * self.policy.act(obs) + offsets[:, h], env.action, keep)
             keep = self._keep
