@@ -27,6 +27,7 @@ from poise.learn import Policy
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
+from poise.sim import UnstableError
 from toy_human import swing
 
 
@@ -214,3 +215,26 @@ def test_a_run_is_scored_beside_doing_nothing_over_perturbed_starts():
     assert card.spread["mpjpe_mm"] > 0 and not score(imitation, nothing, {}).spread
     with pytest.raises(PoiseError, match="at least 1 start, got 0"):
         score(imitation, nothing, {}, starts=0)
+
+
+def test_an_episode_that_goes_bad_ends_there_and_has_failed():
+    imitation = build(swing(speed=1.0), ResidualForce(method="deepmimic"))
+    calm = torch.zeros(len(imitation.humanoid.hinges))
+
+    class Wild(Always):
+        steps = 0
+
+        def act(self, obs: torch.Tensor) -> torch.Tensor:
+            self.steps += 1
+            return super().act(obs) if self.steps < 4 else torch.full_like(super().act(obs), torch.nan)
+
+    def of(worlds: int):
+        zero = torch.zeros(worlds, dtype=torch.long)
+        return run_episodes(lambda n: imitation.env(n, auto_reset=False), Wild(calm), zero, zero)[0]
+
+    rollouts = of(1)
+    assert int(rollouts.valid.sum()) == 4 and rollouts.pos.isfinite().all()
+    card = score_rollouts(rollouts)
+    assert card.succ == 0.0
+    with pytest.raises(UnstableError, match="control step 3"):
+        of(2)

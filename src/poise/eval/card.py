@@ -38,7 +38,8 @@ class Help:
 class ScoreCard:
     """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.
 
-    NaN means "not measured" and becomes null. `variants` holds the tracking figures under each
+    NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
+    `kin.doctor.needs`. `variants` holds the tracking figures under each
     weighting ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all
     frames, those after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success
     and tracking figures of action 0 from the same starts, `spread` their standard deviations over
@@ -66,6 +67,8 @@ class ScoreCard:
     episodes: int = 0
     frames: int = 0
     mpjpe_succ_mm: float = NAN
+    tracked: float = NAN
+    needs: tuple[Mapping[str, Any], ...] = ()
     reference: Mapping[str, float] = field(default_factory=dict)
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
@@ -74,6 +77,11 @@ class ScoreCard:
     starts: int = 1
     spread: Mapping[str, float] = field(default_factory=dict)
     delivered: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def survived(self) -> bool:
+        """Whether all episodes succeed by the rule, and yet not all are tracked."""
+        return self.succ == 1.0 and self.tracked < 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values with the keys in field order; what is not finite becomes None."""
@@ -159,6 +167,7 @@ class Threshold:
 THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
     {
         "succ": Threshold(0.95, 0.80, more=True),
+        "tracked": Threshold(0.95, 0.80, more=True),
         "mpjpe_mm": Threshold(40.0, 80.0),
         "mpjpe_global_mm": Threshold(60.0, 120.0),
         "vel_mm_per_frame": Threshold(10.0, 20.0),
@@ -207,6 +216,8 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
         Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
         *_beside(card, "succ", "Success", "%", 100.0),
     ]
+    if math.isfinite(card.tracked):
+        rows.append(Row("Tracked", 100.0 * card.tracked, "%", t["tracked"].verdict(card.tracked)))
     for key, label, unit in _ROWS:
         value = getattr(card, key)
         reference = card.reference.get(key, math.nan)

@@ -19,6 +19,7 @@ from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval.rolloutset import RolloutSet
 from poise.kin.solids import shapes_of
+from poise.sim import UnstableError
 from poise.spatial import quat_mul, rotvec_to_quat
 
 #: Frames of a part of rollouts: 110 MB of 20 bodies.
@@ -145,6 +146,9 @@ def run_episodes(
 ) -> tuple[RolloutSet, list[Recording]]:
     """Every episode simulated to the end of its clip (cyclic clips: `cycles` rounds), failed or not.
 
+    A single episode whose simulation goes bad, because the motion throws the body about, ends there and
+    has failed.
+
     Args:
         make_env: gives an environment of N worlds without automatic reset, which is closed in the end.
         policy: acts on raw observations, deterministically.
@@ -166,7 +170,11 @@ def run_episodes(
         if trial is not None:
             obs = perturb(env, clip, start, trial)
         recorder = Recorder(env, clip, start, cycles, trial)
-        simulate(env, policy, obs, recorder.total - 1, recorder, *observers)
+        try:
+            simulate(env, policy, obs, recorder.total - 1, recorder, *observers)
+        except UnstableError:
+            if len(clip) > 1:
+                raise
     finally:
         env.close()
     return recorder.rollouts(limit), recorder.recordings()
@@ -269,11 +277,12 @@ class Recorder:
         """All episodes, padded. limit: the help budget that they had, N and N m."""
         ref, humanoid = self.reference, self.reference.humanoid
         kept: dict[str, Any] = self.tensors
+        lengths = self.lengths.clamp_max(len(self._qpos))
         return RolloutSet(
             **kept,
-            alive=torch.arange(self.total) < self.lengths[:, None],
-            lengths=self.lengths,
-            reached_end=torch.ones(len(self.clip), dtype=torch.bool),
+            alive=torch.arange(self.total) < lengths[:, None],
+            lengths=lengths,
+            reached_end=lengths == self.lengths,
             reward=self.reward,
             clip=self.clip,
             start=self.start,
@@ -281,6 +290,7 @@ class Recorder:
             fps=ref.rate_hz,
             mass=humanoid.mass,
             feet=humanoid.feet,
+            head=humanoid.head,
             shapes=shapes_of(humanoid.table, torch.float32),
             limit_n=limit,
             limit_nm=limit,

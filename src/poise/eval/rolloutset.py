@@ -28,7 +28,8 @@ class RolloutSet:
     reward: `(E, T)` per term, with "total" among them; empty when no reward was computed.
     clip, start: `(E,)` int, index of the clip and first frame in it. clip_names: one per index.
     fps: frames per second of all tensors. mass: kg.
-    feet: body indices of the feet. shapes: the character's geoms; None skips the contact figures.
+    feet: body indices of the feet. head: that of the head, None where none is told.
+    shapes: the character's geoms; None skips the contact figures.
     limit_n, limit_nm: the help budget per wrench, N and N m; `inf` where it is unlimited.
     ref_min_height: `(E,)` m, lowest root height of the whole reference (rule "rfc_height").
     rule_bodies: bodies the success rule looks at; None for all.
@@ -58,6 +59,7 @@ class RolloutSet:
     shapes: Shapes | None = None
     clip_names: tuple[str, ...] = ()
     root: int = 0
+    head: int | None = None
     ref_min_height: Tensor | None = None
     rule_bodies: tuple[int, ...] | None = None
     trial: Tensor | None = None

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.eval.card import NAN, Help, ScoreCard, Weighting
+from poise.eval.posture import Posture, posture
 from poise.eval.rolloutset import RolloutSet, Sums, judge
 from poise.metrics import (
     HelpAudit,
@@ -77,6 +78,7 @@ class _Part(NamedTuple):
     of_reference: dict[str, Sums]
     reward: dict[str, Sums]
     force: Sums
+    posture: Posture
     uncut: dict[str, Sums]
     won: Tensor
     failed_at: Tensor
@@ -95,6 +97,7 @@ def _part(r: RolloutSet, chosen: SuccessRule) -> _Part:
         _plausibility(r.ref_pos, r.ref_quat, mask, r.fps, r.shapes, r.feet),
         {n: Sums.of(v, mask) for n, v in r.reward.items()},
         Sums.of(r.force.norm(dim=-1).sum(-1), mask),
+        posture(r, won, mask),
         _tracking(r, uncut),
         won,
         failed_at,
@@ -116,6 +119,8 @@ def _joined(parts: Sequence[_Part]) -> _Part:
             return Sums.cat(values)
         if isinstance(one, dict):
             return {k: cat([v[k] for v in values]) for k in one}
+        if isinstance(one, Posture):
+            return Posture(*(cat(x) for x in zip(*values, strict=True)))
         if isinstance(one, tuple):
             return tuple(cat(x) for x in zip(*values, strict=True))
         return torch.cat(list(values))
@@ -135,14 +140,21 @@ def _per_clip(
     entries = []
     for index in sorted(set(p.clip.tolist())):
         rows = p.clip == index
-        lost = rows & (p.failed_at >= 0)
-        seconds = float((p.start[lost] + p.failed_at[lost]).min()) / fps if bool(lost.any()) else NAN
+
+        def first(at: Tensor, rows: Tensor = rows) -> float:
+            """Seconds into the clip of the earliest of the frames `at (E,)`, NaN for -1 in all."""
+            lost = rows & (at >= 0)
+            return float((p.start[lost] + at[lost]).min()) / fps if bool(lost.any()) else NAN
+
         entry: dict[str, Any] = {
             "clip": name(int(index)),
             "episodes": int(rows.sum()),
             "frames": int(p.frames[rows].sum()),
             "succ": float(p.won[rows].double().mean()),
-            "first_fail_s": seconds,
+            "first_fail_s": first(p.failed_at),
+            "tracked": float(p.posture.tracked[rows].mean()),
+            "fallen_s": first(p.posture.fallen_at),
+            "off_feet_s": first(p.posture.off_feet_at),
         }
         for key in (*TRACKING, *PLAUSIBILITY):
             entry[key] = p.figures[key].mean(rows, weighting) if key in p.figures else NAN
@@ -219,6 +231,7 @@ def score_rollouts(
         method=method,
         episodes=len(p.won),
         frames=int(p.frames.sum()),
+        tracked=float(p.posture.tracked.mean()),
         mpjpe_succ_mm=variants["succ_" + weighting]["mpjpe_mm"],
         reference=means(p.of_reference, PLAUSIBILITY),
         per_clip=_per_clip(p, named, fps, weighting),

@@ -9,8 +9,9 @@ the policy plus an offset of its own, is simulated some steps ahead, and costs
 
     c = - sum_h gamma^h r_h - gamma^H V(o_H) + prices,
 
-with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`). What
-the best of them began with is done. Nothing is trained, nothing helps, and the goal is seen no farther
+with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`); each
+control step in which the motion is lost costs more than all of that. What the best of them began with
+is done. Nothing is trained, nothing helps, and the goal is seen no farther
 than it tells: a clip its frames, a stream or a generator what it knows.
 """
 
@@ -38,6 +39,8 @@ from poise.plan.sampling import draw_offsets
 FEWEST = 4
 #: Budget from which on the horizon is longer, and the longer one in control steps.
 FAR = (400.0, 16)
+#: Share of the slack that is always left; what each control step costs in which a copy is lost.
+LEAST, LOSS = 0.05, 100.0
 #: Frames before a prediction that its jerk needs.
 PAST = 3
 
@@ -60,7 +63,10 @@ class LookaheadConfig:
             them in turns, too. Less of it is less jerk, where the policy corrects more than it must.
         jerk_price: cost of a control step as jerky as the goal, see `Roughness.price`.
         slide_price: cost of 1 m/s with which soles slide more than the goal's, in a control step.
-        slack: how much more than the best one a copy may cost in tracking alone, and still be chosen.
+        slack: how much more than the best one a copy may cost in tracking alone, and still be chosen,
+            where the character is on its goal.
+        strict_m: mean distance (m) from the goal at which there is next to no slack left, so that
+            tracking alone decides; between them it falls evenly.
         discount: gamma.
         seed: seed of all draws.
     """
@@ -75,6 +81,7 @@ class LookaheadConfig:
     jerk_price: float = 0.5
     slide_price: float = 12.0
     slack: float = 1.5
+    strict_m: float = 0.25
     discount: float = 0.97
     seed: int = 0
 
@@ -97,8 +104,9 @@ class LookaheadConfig:
         if self.corrections[:1] != (1.0,) or not all(0 <= c <= 1 for c in self.corrections):
             what = f"corrections must begin with 1 and lie in 0 to 1, got {self.corrections}"
             raise PoiseError(what, "LookaheadConfig")
-        if min(self.jerk_price, self.slide_price, self.slack) < 0:
-            raise PoiseError("prices and slack must be at least 0", "LookaheadConfig")
+        if min(self.jerk_price, self.slide_price, self.slack) < 0 or self.strict_m <= 0:
+            what = "prices and slack must be at least 0, strict_m above"
+            raise PoiseError(what, "LookaheadConfig")
 
     @property
     def budget(self) -> float:
@@ -234,8 +242,10 @@ class Lookahead:
         begun, c = time.perf_counter(), self.config
         drawn = self._drawn(world.choice)
         cost, price = self._simulate(self._env.snapshot(torch.tensor([i])), drawn, world.past)
-        allowed = cost.isfinite() & (cost <= cost.min() + c.slack)
-        # Where all lose the motion the policy acts alone.
+        off = self._env.pose().pos[i] - self._env.goal_pose().pos[i]
+        left = 1.0 - float(off.norm(dim=-1).mean()) / c.strict_m
+        allowed = cost.isfinite() & (cost <= cost.min() + c.slack * max(LEAST, left))
+        # Where all went bad the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
         self.seconds.append(time.perf_counter() - begun)
         return _Choice(drawn[best], float(self._keep[best]), float(self._much[best]))
@@ -265,7 +275,7 @@ class Lookahead:
         keep, factor = self._keep if past else torch.zeros_like(self._keep), 1.0
         for h in range(c.horizon):
             # The last frame of a clip is a goal that is reached.
-            if bool((env.goal.layout.place(env.goal.now()).end > 0).all()):
+            if bool((env.goal.layout.place(env.goal.now()).end > 0).any()):
                 break
             action = torch.lerp(self._much * self.policy.act(obs) + offsets[:, h], env.action, keep)
             keep = self._keep
@@ -278,7 +288,7 @@ class Lookahead:
             ref_quat.append(aim.quat[:1].clone())
             off = mpjpe_global(pose.pos, aim.pos) / 1000.0
             lost |= ~(off <= LOST)
-            cost, factor = cost - factor * env.imitation, factor * c.discount
+            cost, factor = cost - factor * env.imitation + LOSS * lost, factor * c.discount
         cost = cost - factor * self.value(obs)
         self.steps += c.candidates * (len(pos) - 1)
         rough, source = (
@@ -289,5 +299,4 @@ class Lookahead:
             for p, q, was in ((pos, quat, past), (ref_pos, ref_quat, []))
         )  # fmt: skip
         price = rough.price(source, c.jerk_price, c.slide_price)
-        whole = ~lost & cost.isfinite() & price.isfinite()
-        return torch.where(whole, cost, torch.inf), price
+        return torch.where(cost.isfinite() & price.isfinite(), cost, torch.inf), price
