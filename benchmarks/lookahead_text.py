@@ -52,7 +52,12 @@ def sets(rows: Sequence[Row]) -> list[str]:
               "sole contacts / source", "stands as source", "penetration, source, mm",
               "floating, source, mm")]  # fmt: skip
     for (name, starts), own in groups(plain, "set", "starts").items():
-        for (_, _), g in groups(own, "controller", "budget").items():
+        tried = groups(own, "controller", "budget")
+        most = max((len(g) for (who, _), g in tried.items() if who == "lookahead"), default=0)
+        for (controller, _), g in tried.items():
+            # Budgets that few clips were tried with have a table of their own.
+            if controller == "lookahead" and len(g) < most:
+                continue
             who = named(g[0])
             near.append((
                 f"{len(g)} of {name}", str(starts), who, _share(*success(g)), _percent(mean(g, "part")),
@@ -105,6 +110,7 @@ def sources(rows: Sequence[Row]) -> list[str]:
 
 def robustness(rows: Sequence[Row]) -> list[str]:
     """Success under every condition, of the clips that were tried under all of them."""
+    rows = [r for r in rows if r["controller"] != "nothing"]
     tried = groups(rows, "condition")
     if len(tried) < 2:
         return []
