@@ -146,8 +146,8 @@ def run_episodes(
 ) -> tuple[RolloutSet, list[Recording]]:
     """Every episode simulated to the end of its clip (cyclic clips: `cycles` rounds), failed or not.
 
-    A single episode whose simulation goes bad, because the motion throws the body about, ends there and
-    has failed.
+    Where the simulation of a single episode goes bad, because the motion throws the body about, the
+    episode ends and has failed.
 
     Args:
         make_env: gives an environment of N worlds without automatic reset, which is closed in the end.
