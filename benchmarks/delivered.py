@@ -7,8 +7,8 @@ Each clip goes through `poise.track` as it comes, with lookahead and with a sear
 Joints are compared on the skeleton that came in, after retargeting to the body and back and with
 standing feet held, at 30 Hz; slide is that of the character's soles. "estimators" are files of real
 pose estimators (the folder "noisy"). "noise 1 cm" adds noise of 1 cm to the joints' places of four
-clips, which then come in as keypoints, "video" what a video estimator does to four clips: the motion is
-compared with its truth. Sets are those of `lookahead.py`; FILE grows clip by clip.
+generated motions, which then come in as keypoints, "video" what a video estimator does to four clips of
+CMU: the motion is compared with its truth. Sets are those of `lookahead.py`; FILE grows clip by clip.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from poise.plan import LookaheadConfig
 
 #: Hz, at which motions are compared; cut-off (Hz) of the low-pass on what has noise.
 RATE, CUTOFF = 30.0, 4.0
-#: Clips that noise is put on, besides those of the set "cmu" from the first on.
-GENERATED = "other/text_to_motion/mdm_results_pred.npy"
+#: Outputs of a motion diffusion model, and which of them noise of 1 cm is put on.
+GENERATED, TAKES = "other/text_to_motion/mdm_results_pred.npy", (0, 8, 16, 24)
 NOISY = ("noise 1 cm", "video")
 #: Figures of which tables have medians.
 FIGURES = (
@@ -58,8 +58,10 @@ def sources(a: argparse.Namespace, name: str) -> dict[str, Path | Clip]:
         return {f.stem: f for f in found}
     if name in NOISY:
         few = list(clips_of("cmu", a.data, None, a.json.parent).items())[::16]
-        made = [("mdm", a.data / GENERATED)] if name == NOISY[0] else []
-        return dict([*made, *few][:4])
+        if name == NOISY[0]:
+            made = a.data / GENERATED
+            return {f"mdm {k}": read_clip(made, take=str(k), allow_pickle=True) for k in TAKES}
+        return dict(few[:4])
     return clips_of(name, a.data, a.clips, a.cache or a.json.parent / "cache")
 
 
@@ -83,15 +85,11 @@ def measured(name: str, source: Path | Clip, kind: str, budget: float) -> dict[s
     torch.set_num_threads(1)
     how = {"threads": 1, "lookahead": LookaheadConfig().with_budget(budget)}
     try:
-        clip = (
-            source
-            if isinstance(source, Clip)
-            else read_clip(source, allow_pickle=source.suffix == ".npy")
-        )
+        clip = source if isinstance(source, Clip) else read_clip(source)
         begun = time.perf_counter()
         if kind in NOISY:
             return {"clip": name} | noisy(clip, kind, how)
-        motion = clip if isinstance(source, Clip) or source.suffix == ".npy" else read_motion(source)
+        motion = clip if isinstance(source, Clip) else read_motion(source)
         done = track(motion, **how)
         spent = time.perf_counter() - begun
         truth, made = joints(done.placed.source), joints(done.clip)
@@ -101,7 +99,7 @@ def measured(name: str, source: Path | Clip, kind: str, budget: float) -> dict[s
     figures = next(iter(done.card.delivered))
     return {
         "clip": name, "controller": done.controller, "whole": done.card.succ,
-        "failed_s": list(done.failed_s), **found, "jerk_ratio": found["jerk"] / of["jerk"],
+        "tracked": done.card.tracked, "needs": list(done.card.needs), "failed_s": list(done.failed_s), **found, "jerk_ratio": found["jerk"] / of["jerk"],
         "slide": figures["delivered"]["foot_slide_mm_per_s"],
         "simulated_slide": figures["simulated"]["foot_slide_mm_per_s"],
         "source_slide": figures["source"]["foot_slide_mm_per_s"],
@@ -144,6 +142,7 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return out
     whole = [r for r in done if r["whole"] == 1.0]
     out["whole"] = len(whole)
+    out["tracked"] = sum(r.get("tracked", r["whole"]) == 1.0 for r in done)
     for by in ("lookahead", "search", "policy"):
         out[by] = sum(r["controller"] == by for r in whole)
     if "input_jerk" in done[0]:
