@@ -99,7 +99,8 @@ def measured(name: str, source: Path | Clip, kind: str, budget: float) -> dict[s
     figures = next(iter(done.card.delivered))
     return {
         "clip": name, "controller": done.controller, "whole": done.card.succ,
-        "tracked": done.card.tracked, "needs": list(done.card.needs), "failed_s": list(done.failed_s), **found, "jerk_ratio": found["jerk"] / of["jerk"],
+        "tracked": done.card.tracked, "needs": [dict(n) for n in done.card.needs],
+        "failed_s": list(done.failed_s), **found, "jerk_ratio": found["jerk"] / of["jerk"],
         "slide": figures["delivered"]["foot_slide_mm_per_s"],
         "simulated_slide": figures["simulated"]["foot_slide_mm_per_s"],
         "source_slide": figures["source"]["foot_slide_mm_per_s"],
