@@ -120,7 +120,7 @@ def test_stable_pd_moves_like_servos_with_damped_joints(imitation):
 
 def test_physics_scores_one_policy_on_every_kind(tmp_path: Path):
     config = ResidualForce(num_envs=16, ppo=SMALL)
-    made = begin(tmp_path, ClipLibrary.of(swing(0.4)), config)
+    made = begin(tmp_path, ClipLibrary.of(swing(1.2)), config)
     train(made, tmp_path, Until(iterations=1), threads=1, tensorboard=False)
     rows = bench_physics(tmp_path, stable_pd=True, starts=3)
     assert [(r["physics"], r["rate_hz"]) for r in rows] == [
