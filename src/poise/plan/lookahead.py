@@ -228,7 +228,9 @@ class Lookahead:
             if fresh[i]:
                 world.choice, world.past = None, []
             if world.choice is None or world.step == self.config.hold_steps:
-                world.choice, world.step = self._decide(i, world), 0
+                # Worlds decide in turns, so that no control step waits for all of them.
+                world.step = i % self.config.hold_steps if world.choice is None else 0
+                world.choice = self._decide(i, world)
             offsets[i] = world.choice.offsets[world.step]
             keep[i] = 0.0 if fresh[i] else world.choice.smoothing
             much[i] = world.choice.correction
