@@ -30,7 +30,7 @@ from poise.jobs.perpetual.run import begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
 from poise.learn import AmpConfig, Until
 from poise.motion import ClipLibrary
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.residual_force import ResidualForce
 
 #: Every row adds what its name says to the one before; the last three stand for themselves.
@@ -120,7 +120,9 @@ def main() -> None:
         if k % a.workers == a.worker and not a.collect:
             print(f"{name}, seed {seed}")
             one(a, name, seed)
-    perpetual_rows.write(a.out, a.samples, Path(__file__).with_name("perpetual_rows.json"))
+    kept = a.out / "nothing.json"
+    null = perpetual_rows.null_of(lambda: build(library_at(a), settings("relaxed", 0)), kept)
+    perpetual_rows.write(a.out, a.samples, null, Path(__file__).with_name("perpetual_rows.json"))
     named = " ".join(f"{n}-{s}={a.out}/{n}-{s}" for n, s in jobs if n not in UHC)
     print(f"python benchmarks/perpetual.py --runs {named} --parts table noise recovery owners curves")
 

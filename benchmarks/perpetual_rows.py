@@ -4,14 +4,15 @@
 
 Measures every finished run of `perpetual_ablations.py` once, all clips from their first frames without
 help (but for "uhc-helped"), beside "nothing", which is action 0. A row is above the one that it is
-compared with by `RULE`, or that is "not shown". The runs of `perpetual_ablations.json` are judged
-likewise, on noisy input too.
+compared with, or above nothing, by `RULE`, or that is "not shown". The runs that are kept in
+`perpetual_ablations.json` are judged likewise, on noisy input too.
 """
 
 from __future__ import annotations
 
 import json
 import statistics
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ AGAINST = {
 }  # fmt: skip
 RULE = (
     "A difference of the share of each clip until it fails is shown where it is more than twice the "
-    "mean spread of the rows that have two seeds; without such rows nothing is shown."
+    "mean spread of the rows of its table that have two seeds; without such rows nothing is shown."
 )
 #: What the paper compares and no setting does.
 LEFT_OUT = "Not measured: top-1 mixture of experts (no setting; `means` is the code's mixture)."
@@ -69,7 +70,7 @@ def measured(task: Imitation, policy: Policy | None, helped: bool = False) -> di
     rows = {c.clip: c for c in table.clips}
     steps = dict(zip(task.reference.names, (task.reference.length - 1).tolist(), strict=True))
     return {
-        "clips": len(rows),
+        "steps": steps,
         "done": [n for n, c in rows.items() if not c.failed],
         "until": statistics.fmean(min(1.0, c.frames / steps[n]) for n, c in rows.items()),
         "g_mpjpe": table.views["all_frame"].g_mpjpe,
@@ -89,7 +90,7 @@ def row_of(folder: Path, samples: int) -> dict[str, Any] | None:
         return None
     run = open_run(folder)
     row = measured(run.task, run.policy, folder.name.startswith("uhc-helped"))
-    row |= {"samples": seen, "nothing": measured(run.task, None)}
+    row["samples"] = seen
     stages = sorted(folder.glob("primitive-*.safetensors"))
     if stages:
         # What later networks still do of the clips that the first primitive did.
@@ -100,17 +101,25 @@ def row_of(folder: Path, samples: int) -> dict[str, Any] | None:
     return row
 
 
-def judged(until: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
-    """Each row's difference to the one that it is compared with, and whether it is shown."""
+def judged(until: dict[str, list[float]], null: float | None = None) -> dict[str, dict[str, Any]]:
+    """Each row's difference to the one that it is compared with and to nothing, and what is shown."""
     spreads = [max(v) - min(v) for v in until.values() if len(v) > 1]
     spread = statistics.fmean(spreads) if spreads else None
+
+    def verdict(gap: float) -> str:
+        shown = spread is not None and abs(gap) > 2 * spread
+        return "not shown" if not shown else "above" if gap > 0 else "below"
+
     out: dict[str, dict[str, Any]] = {}
-    for name, other in AGAINST.items():
-        if name in until and other in until:
-            gap = statistics.fmean(until[name]) - statistics.fmean(until[other])
-            shown = spread is not None and abs(gap) > 2 * spread
-            out[name] = {"against": other, "difference": round(gap, 4), "seed_spread": spread}
-            out[name]["verdict"] = "not shown" if not shown else "above" if gap > 0 else "below"
+    for name, values in until.items():
+        own, other = statistics.fmean(values), AGAINST.get(name)
+        row: dict[str, Any] = {"seed_spread": spread}
+        if other in until:
+            gap = own - statistics.fmean(until[other])
+            row |= {"against": other, "difference": round(gap, 4), "verdict": verdict(gap)}
+        if null is not None:
+            row |= {"to_nothing": round(own - null, 4), "verdict_nothing": verdict(own - null)}
+        out[name] = row
     return out
 
 
@@ -121,13 +130,18 @@ def _by_name(rows: dict[str, dict[str, Any]], key: str) -> dict[str, list[Any]]:
     return out
 
 
-def noisy(path: Path) -> dict[str, dict[str, list[float]]]:
-    """strength -> row -> share until failure of each seed, of the runs in `perpetual_ablations.json`."""
-    out: dict[str, dict[str, list[float]]] = {}
+def earlier(path: Path, steps: dict[str, int]) -> dict[str, dict[str, Any]]:
+    """The runs in `perpetual_ablations.json` as rows."""
+    out: dict[str, dict[str, Any]] = {}
     for name, run in json.loads(path.read_text())["runs"].items() if path.exists() else ():
-        row = name.removesuffix("-1")
-        for rung in run["noise"]["rungs"]:
-            out.setdefault(rung["name"], {}).setdefault(row, []).append(rung["tracked"])
+        library = run["table"]["library"]
+        shares = [min(1.0, c["frames"] / steps[c["clip"]]) for c in library["clips"]]
+        out[name if name.endswith("-1") else f"{name}-0"] = {
+            "done": [c["clip"] for c in library["clips"] if not c["failed"]],
+            "until": statistics.fmean(shares), "samples": run["about"]["samples"], "force_n": 0.0,
+            **{k: library["views"]["all_frame"][k] for k in ("g_mpjpe", "acc")},
+            "noise": {rung["name"]: rung["tracked"] for rung in run["noise"]["rungs"]},
+        }  # fmt: skip
     return out
 
 
@@ -135,10 +149,19 @@ def _percent(values: list[float]) -> str:
     return ", ".join(f"{100 * v:.0f}" for v in values)
 
 
-def _said(verdict: dict[str, Any] | None) -> list[str]:
-    if verdict is None:
-        return ["", "", ""]
-    return [verdict["against"], f"{100 * verdict['difference']:+.1f}", verdict["verdict"]]
+def _said(verdict: dict[str, Any]) -> list[str]:
+    """Cells of one row's judgement."""
+    cells = []
+    for other, gap, said in (
+        ("against", "difference", "verdict"),
+        ("", "to_nothing", "verdict_nothing"),
+    ):
+        if gap in verdict:
+            told = (verdict.get(other, ""), f"{100 * verdict[gap]:+.1f}", verdict[said])
+            cells.append(" ".join(told).strip())
+        else:
+            cells.append("")
+    return cells
 
 
 def _row(*cells: object) -> str:
@@ -149,53 +172,73 @@ def _head(*names: str) -> list[str]:
     return [_row(*names), "|---" * len(names) + "|"]
 
 
-def markdown(command: str, rows: dict[str, dict[str, Any]], earlier: dict[str, Any]) -> str:
-    """All tables."""
-    lines = ["# What the parts of the controller are worth", "", f"`{command}`", "", RULE, LEFT_OUT, ""]
-    judgement = ("against", "difference", "")
-    if rows:
-        until = _by_name(rows, "until")
-        verdicts, first = judged(until), next(iter(rows.values()))
-        until["nothing"] = [first["nothing"]["until"]]
-        lines += [
-            f"{first['clips']} clips, {first['samples']:,} control steps each, seeds by commas.",
-            "",
-        ]
-        figures = {"g_mpjpe": "g-MPJPE, mm", "acc": "acc, mm/frame²", "force_n": "help, N"}
-        lines += _head("run", "clips done", "until it fails, %", *figures.values(), *judgement)
-        for name, values in until.items():
-            own = [r for n, r in rows.items() if n.rpartition("-")[0] == name] or [first["nothing"]]
-            done = ", ".join(str(len(r["done"])) for r in own)
-            shown = [", ".join(f"{r[k]:.1f}" for r in own) for k in figures]
-            lines.append(_row(name, done, _percent(values), *shown, *_said(verdicts.get(name))))
-        stages = {n: r["first_stage"] for n, r in rows.items() if "first_stage" in r}
-        if stages:
-            lines += [
-                "",
-                "Of the clips that the first primitive did, how many each primitive does when its",
-            ]
-            lines += ["stage ends, and at last the composer:", "", *_head("run", "clips")]
-            lines += [_row(n, ", ".join(map(str, s))) for n, s in stages.items()]
-    for strength, table in earlier.items():
-        verdicts = judged(table)
-        lines += ["", f"## Runs of `perpetual_ablations.json`, noise: {strength}", ""]
-        lines += _head("run", "until it fails, %", *judgement)
-        lines += [_row(n, _percent(v), *_said(verdicts.get(n))) for n, v in table.items()]
+def _table(rows: dict[str, dict[str, Any]], null: dict[str, Any]) -> list[str]:
+    """Runs of equal samples beside nothing."""
+    until = _by_name(rows, "until")
+    verdicts = judged(until, null["until"])
+    figures = {"g_mpjpe": "g-MPJPE, mm", "acc": "acc, mm/frame²", "force_n": "help, N"}
+    lines = _head(
+        "run", "clips done", "until it fails, %", *figures.values(), "difference to", "to nothing"
+    )
+    for name, values in until.items():
+        own = [r for n, r in rows.items() if n.rpartition("-")[0] == name]
+        done = ", ".join(str(len(r["done"])) for r in own)
+        shown = [", ".join(f"{r[k]:.1f}" for r in own) for k in figures]
+        lines.append(_row(name, done, _percent(values), *shown, *_said(verdicts[name])))
+    shown = [f"{null[k]:.1f}" for k in figures]
+    return [*lines, _row("nothing", len(null["done"]), _percent([null["until"]]), *shown, "", "")]
+
+
+def markdown(command: str, rows: dict[str, Any], before: dict[str, Any], null: dict[str, Any]) -> str:
+    """All tables. rows: of runs at hand. before: of those that are kept in the other file."""
+    lines = ["# What the parts of the controller are worth", "", f"`{command}`", "", RULE, LEFT_OUT]
+    lines += [f"{len(null['steps'])} clips, seeds by commas; percent and points of the clip."]
+    for title, table in (("Runs", rows), ("Runs of `perpetual_ablations.json`", before)):
+        if table:
+            samples = next(iter(table.values()))["samples"]
+            lines += ["", f"## {title}, {samples:,} control steps each", "", *_table(table, null)]
+    stages = {n: r["first_stage"] for n, r in rows.items() if "first_stage" in r}
+    if stages:
+        lines += ["", "Of the clips that the first primitive did, how many each primitive does when its"]
+        lines += ["stage ends, and at last the composer:", "", *_head("run", "clips")]
+        lines += [_row(n, ", ".join(map(str, s))) for n, s in stages.items()]
+    for strength, until in noisy(before).items():
+        verdicts = judged(until)
+        lines += ["", f"## The same, noise: {strength}", ""]
+        lines += _head("run", "until it fails, %", "difference to")
+        lines += [_row(n, _percent(v), _said(verdicts[n])[0]) for n, v in until.items()]
     return "\n".join(lines) + "\n"
 
 
-def write(folder: Path, samples: int, out: Path) -> None:
+def noisy(before: dict[str, dict[str, Any]]) -> dict[str, dict[str, list[float]]]:
+    """strength -> row -> share until failure of each seed."""
+    noises = _by_name(before, "noise")
+    strengths = dict.fromkeys(s for runs in noises.values() for run in runs for s in run)
+    return {s: {n: [run[s] for run in runs] for n, runs in noises.items()} for s in strengths}
+
+
+def null_of(task: Callable[[], Imitation], kept: Path) -> dict[str, Any]:
+    """What doing nothing comes to, measured once."""
+    if not kept.exists():
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps(measured(task(), None)))
+    return json.loads(kept.read_text())
+
+
+def write(folder: Path, samples: int, null: dict[str, Any], out: Path) -> None:
     """JSON and tables of all finished runs in a folder."""
     found = {p.name: row_of(p, samples) for p in sorted(folder.iterdir()) if (p / LATEST).exists()}
     rows = {n: r for n, r in found.items() if r is not None}
-    earlier = noisy(Path(__file__).with_name("perpetual_ablations.json"))
-    command = (
-        "python benchmarks/perpetual_ablations.py --library FOLDER --onto FILE -o RUNS "
-        f"--samples {samples} --only {' '.join(dict.fromkeys(n.rpartition('-')[0] for n in rows))}"
-    )
+    before = earlier(Path(__file__).with_name("perpetual_ablations.json"), null["steps"])
+    command = "python benchmarks/perpetual_ablations.py --library FOLDER --onto FILE -o RUNS "
+    command += f"--samples {samples}"
+    if rows:
+        command += f" --only {' '.join(dict.fromkeys(n.rpartition('-')[0] for n in rows))}"
     data = {
-        "command": command, "rule": RULE, "verdicts": judged(_by_name(rows, "until")),
-        "noise": {s: {"tracked": t, "verdicts": judged(t)} for s, t in earlier.items()}, "runs": rows,
+        "command": command, "rule": RULE, "nothing": null,
+        "verdicts": judged(_by_name(rows, "until"), null["until"]), "runs": rows,
+        "earlier": {"verdicts": judged(_by_name(before, "until"), null["until"]), "runs": before},
+        "noise": {s: judged(until) for s, until in noisy(before).items()},
     }  # fmt: skip
     out.write_text(json.dumps(data, indent=1) + "\n")
-    out.with_suffix(".md").write_text(markdown(command, rows, earlier))
+    out.with_suffix(".md").write_text(markdown(command, rows, before, null))

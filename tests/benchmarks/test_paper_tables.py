@@ -46,6 +46,18 @@ def test_scaled_gains_stand_apart(tmp_path):
 def test_a_row_is_above_another_only_beyond_the_spread_of_seeds():
     assert judged({"plain": [0.5], "relaxed": [0.9]})["relaxed"]["verdict"] == "not shown"
     until = {"plain": [0.5, 0.52], "relaxed": [0.6, 0.62], "style": [0.6], "uhc": [0.5]}
-    verdicts = {name: v["verdict"] for name, v in judged(until).items()}
-    assert verdicts == {"relaxed": "above", "style": "not shown", "uhc": "below"}
-    assert "| relaxed | 60, 62 | plain | +10.0 | above |" in markdown("command", {}, {"clean": until})
+    found = judged(until, null=0.49)
+    verdicts = {name: v.get("verdict") for name, v in found.items()}
+    assert verdicts == {"plain": None, "relaxed": "above", "style": "not shown", "uhc": "below"}
+    assert [v["verdict_nothing"] for v in found.values()] == ["not shown", "above", "above", "not shown"]
+
+
+def test_tables_name_what_each_row_is_compared_with():
+    null = {"steps": {"a": 10}, "done": [], "until": 0.3, "g_mpjpe": 100.0, "acc": 5.0, "force_n": 0.0}
+    rows = {f"plain-{k}": null | {"samples": 5, "until": 0.5 + k / 50} for k in range(2)}
+    rows["relaxed-0"] = rows["plain-0"] | {"until": 0.6, "done": ["a"]}
+    noisy = {n: r | {"noise": {"clean": r["until"]}} for n, r in rows.items()}
+    text = markdown("command", rows, noisy, null)
+    assert "| relaxed | 1 | 60 | 100.0 | 5.0 | 0.0 | plain +9.0 above | +30.0 above |" in text
+    assert "| plain | 0, 0 | 50, 52 | 100.0, 100.0 | 5.0, 5.0 | 0.0, 0.0 |  | +21.0 above |" in text
+    assert "| relaxed | 60 | plain +9.0 above |" in text and "| nothing | 0 | 30 |" in text
