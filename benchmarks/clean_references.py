@@ -65,8 +65,8 @@ def floor(qpos: np.ndarray, table: BodyTable) -> dict[str, float]:
     feet = [i for i, row in enumerate(table.rows) if row.kind == "foot"]
     low = lows.min(1)
     air = np.zeros(len(low), dtype=bool)
-    height = centre_of_mass(table, state.pos, state.quat)[:, 2].numpy()
-    for flight in find_flights(low, height, RATE):
+    com = centre_of_mass(table, state.pos, state.quat).numpy()
+    for flight in find_flights(low, com, RATE):
         air[flight.start : flight.stop + 1] = True
     soles, bodies = np.maximum(-lows[:, feet].min(1), 0.0), np.maximum(-low, 0.0)
     hover = np.maximum(low[~air], 0.0) if not air.all() else np.zeros(1)

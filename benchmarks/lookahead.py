@@ -1,183 +1,159 @@
-"""The policy that comes with Poise, alone and with lookahead, on unseen clips, without help.
+"""The policy that comes with Poise, alone and with lookahead, on sets of clips, without help.
 
-    python benchmarks/lookahead.py --data FOLDER --json FILE [--set bandai cmu dances] [--every N]
-        [--controllers nothing policy lookahead] [--budgets 192] [--starts 1] [--workers 2]
+    python benchmarks/lookahead.py --data FOLDER --clips LIBRARY --json FILE [--set bandai cmu ...]
+        [--every N] [--controllers nothing policy lookahead] [--budgets 64x12 192]
+        [--conditions none pushes ...] [--starts 8] [--workers 2]
 
 "nothing" is the null: action 0, which aims at the motion's own joint angles. With --starts N every clip
-is begun N times, each from joint angles that are off by 1 mrad, and figures are means over these.
+is begun N times, with joints that are off by 1 mrad (`eval.perturb`). Sets of FOLDER are bandai (without
+four styles), bandai-test (those), bandai-all, cmu and dances; "library" and "held-out" are the clips of
+LIBRARY that the policy learned from, and those of the subjects that were held out. --conditions are what
+goes wrong (`lookahead_sets.CONDITIONS`; "all": each of them).
+
+FILE grows clip by clip: what it holds is not measured again but for --again, so that a run that was
+stopped goes on, and other sets, budgets and conditions come beside. Figures of another policy, or of
+other settings of lookahead, are measured anew. Next to it lie FILE.md, all tables, and the budget curve.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
-import math
 import platform
-import statistics
-import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+import sys
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
+from lookahead_figures import KEY
+from lookahead_measure import measured
+from lookahead_sets import CONDITIONS, FILES, LIBRARIES, budgets_of, clips_of
+from lookahead_text import write
 
-from poise.env import Acts
-from poise.eval import score_rollouts
-from poise.eval.episodes import Recorder, simulate
-from poise.eval.rolloutset import RolloutSet, judge
-from poise.jobs.open import open_run
-from poise.jobs.track import imitation_of, look_ahead
-from poise.jobs.track.placement import place
+from poise.errors import PoiseError
+from poise.jobs.tracker import SHIPPED
 from poise.learn.checkpoint import write_atomic
-from poise.metrics import foot_contacts, foot_points, mpjpe_global, success_rule
-from poise.motion import read_clip
-from poise.plan import Lookahead, LookaheadConfig
+from poise.motion import Clip
+from poise.plan import LookaheadConfig
 
-#: Joint angles of perturbed starts are off by so much, rad.
-OFF = 1e-3
-#: Clips of each set: a pattern in the folder of data, and words that are left out.
-SETS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "bandai": ("other/bandai_bvh/*.bvh", ("_old_", "_giant_", "_tired_", "_elderly_")),
-    "bandai-test": ("other/bandai_bvh/*.bvh", ()),
-    "cmu": ("cmu_amc/*/*.amc", ("/01/", "/02/", "/rfc/", "/usc/")),
-    "dances": ("cmu_bvh/acrnn_salsa/*.bvh", tuple(f"/{k:02d}.bvh" for k in (*range(1, 8), 9, 10, 12))),
-}
-#: Words of the styles that are kept for the last test.
-KEPT = SETS["bandai"][1]
-#: Figures of which a table has the median of the clips that were done whole.
-FIGURES = (
-    "error_mm", "root_error_mm", "jerk_ratio", "slide", "source_slide", "stance_ratio",
-    "seconds_per_second",
-)  # fmt: skip
+CONTROLLERS = ("nothing", "policy", "lookahead")
 
 
-class Nothing:
-    """Action 0."""
+class Job(NamedTuple):
+    """One clip with one controller; `key` is what its row is known by."""
 
-    def __init__(self, actions: int):
-        self.actions = actions
-
-    def act(self, obs: Tensor) -> Tensor:
-        return torch.zeros(len(obs), self.actions)
+    key: tuple[Any, ...]
+    source: Path | Clip
+    config: LookaheadConfig
 
 
-def clips_of(name: str, data: Path, every: int) -> list[Path]:
-    pattern, without = SETS[name]
-    files = [f for f in sorted(data.glob(pattern)) if not any(w in f.as_posix() for w in without)]
-    if name == "bandai-test":
-        files = [f for f in files if any(w in f.as_posix() for w in KEPT)]
-    return files[::every]
+class Results:
+    """The rows of a file; a new one takes the place of the one with its key."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        old = json.loads(path.read_text()) if path.exists() else {}
+        self.commands: list[str] = old.get("commands", [])
+        self.rows: list[dict[str, Any]] = old.get("rows", [])
+
+    def has(self, job: Job) -> bool:
+        """Whether a job was measured with this policy and these settings."""
+        made = made_with(job.key[2])
+        return any(_key(row) == job.key and row["made_with"] == made for row in self.rows)
+
+    def add(self, row: dict[str, Any]) -> None:
+        """One row more, in the file at once."""
+        self.rows = [r for r in self.rows if _key(r) != _key(row)] + [row]
+        self.save()
+
+    def save(self) -> None:
+        """The file, with a line for each row."""
+        head = {"commands": self.commands, "machine": platform.machine()}
+        text = json.dumps(head, indent=1, allow_nan=False).rstrip("}").rstrip()
+        lines = ",\n".join(f"  {json.dumps(r, allow_nan=False)}" for r in self.rows)
+        write_atomic(self.path, f'{text},\n "rows": [\n{lines}\n ]\n}}\n'.encode())
 
 
-def stance(rollouts: RolloutSet) -> float:
-    """Contacts of sole points with the ground beside those of the reference."""
-    counts, shapes = [], rollouts.shapes
-    assert shapes is not None
-    for pos, quat in ((rollouts.pos, rollouts.quat), (rollouts.ref_pos, rollouts.ref_quat)):
-        points = foot_points(pos[0], quat[0], shapes, rollouts.feet)
-        counts.append(float(foot_contacts(points, rollouts.fps)[1].sum()))
-    return counts[0] / counts[1] if counts[1] else math.nan
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[k] for k in KEY)
 
 
-def measured(path: Path, controller: str, budget: float, starts: int) -> dict[str, Any]:
-    """One clip with one controller, means over its starts."""
-    torch.set_num_threads(1)
-    tracker = open_run(None).tracker
-    task = imitation_of(tracker, [place(read_clip(path), tracker)])
-    rows, times = [], list[float]()
-    for k in range(starts):
-        env = task.env(1, None, False, 1, help_scale=0.0, guard=False)
-        acts: Acts = Nothing(env.num_actions) if controller == "nothing" else tracker.policy
-        if controller == "lookahead":
-            acts = look_ahead(tracker, task, LookaheadConfig().with_budget(budget), 1, k)
-        zero = torch.zeros(1, dtype=torch.long)
-        obs = env.reset_to(zero, zero)
-        if starts > 1:
-            qpos, qvel = env.backend.state.qpos.clone(), env.backend.state.qvel.clone()
-            rng = torch.Generator().manual_seed(k)
-            qpos[:, 7:] += OFF * torch.randn(qpos[:, 7:].shape, generator=rng, dtype=qpos.dtype)
-            env.backend.write(None, qpos, qvel)
-            obs = env.observe()
-        if isinstance(acts, Lookahead):
-            acts.watch(env)
-        recorder = Recorder(env, zero, zero, 1)
-        begun = time.perf_counter()
-        simulate(env, acts, obs, recorder.total - 1, recorder)
-        spent = time.perf_counter() - begun
-        rollouts = recorder.rollouts()
-        if isinstance(acts, Lookahead):
-            times += acts.seconds
-            acts.copies.close()
-        env.close()
-        card = score_rollouts(rollouts, method=controller, seed=k)
-        fail = int(judge(rollouts, success_rule("phc")).failed_at[0])
-        length = rollouts.pos.shape[1]
-        all_frames = float(mpjpe_global(rollouts.pos, rollouts.ref_pos).mean())
-        source = card.reference
-        rows.append({
-            "whole": card.succ, "tracked": 1.0 if fail < 0 else fail / length,
-            "error_mm": card.mpjpe_global_mm, "all_frames_error_mm": all_frames,
-            "root_error_mm": card.mpjpe_mm, "acc": card.acc_mm_per_frame2, "vel": card.vel_mm_per_frame,
-            "jerk_ratio": card.jerk / source["jerk"], "slide": card.foot_slide_mm_per_s,
-            "source_slide": source["foot_slide_mm_per_s"], "stance_ratio": stance(rollouts),
-            "penetration": card.penetration_mm, "floating": card.float_mm,
-            "seconds_per_second": spent / (length / rollouts.fps),
-        })  # fmt: skip
-    out: dict[str, Any] = {"clip": path.stem, "controller": controller, "budget": budget}
-    out |= {k: round(statistics.fmean(r[k] for r in rows), 3) for k in rows[0]}
-    if times:
-        order = sorted(times)
-        out["decision_ms"] = round(1000 * order[len(order) // 2], 1)
-        out["decision_p99_ms"] = round(1000 * order[int(0.99 * (len(order) - 1))], 1)
-    return out
+def made_with(controller: str) -> str:
+    """A hash of what decides the figures of a controller: the policy, and the settings of lookahead."""
+    settings = json.dumps(asdict(LookaheadConfig())) if controller == "lookahead" else ""
+    return hashlib.sha256(SHIPPED.read_bytes() + settings.encode()).hexdigest()[:16]
 
 
-def table(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What a set came to: share of clips done whole, medians of those."""
-    whole = [r for r in rows if r["whole"] >= 0.999] or list(rows)
-    out = {"clips": len(rows), "succ": statistics.fmean(r["whole"] for r in rows)}
-    out["tracked"] = statistics.fmean(r["tracked"] for r in rows)
-    out |= {k: statistics.median(r[k] for r in whole) for k in FIGURES}
-    clean = [r["slide"] <= max(r["source_slide"], 40.0) for r in whole]
-    out["slide_as_source"] = statistics.fmean(clean)
-    out["all_frames_error_mm"] = statistics.fmean(r["all_frames_error_mm"] for r in rows)
-    return {k: round(v, 3) for k, v in out.items()}
+def jobs_of(a: argparse.Namespace) -> Iterator[Job]:
+    """What is to be measured: shorter sets of controllers first, so that tables grow evenly."""
+    budgets = budgets_of(a.budgets)
+    wanted = list(CONDITIONS) if "all" in a.conditions else a.conditions
+    for name in a.set:
+        clips = clips_of(name, a.data, a.clips, a.cache or a.json.parent / "cache")
+        for clip in sorted(clips)[:: a.every]:
+            for condition in wanted:
+                for controller in a.controllers:
+                    # A planner's model is nothing to who does not plan.
+                    if CONDITIONS[condition].of_planner and controller != "lookahead":
+                        continue
+                    for budget in budgets if controller == "lookahead" else [""]:
+                        config = budgets.get(budget, LookaheadConfig())
+                        key = (name, clip, controller, budget, condition, a.starts)
+                        yield Job(key, clips[clip], config)
 
 
-def work(args: argparse.Namespace) -> Iterator[tuple[str, Path, str, float]]:
-    for name in args.set:
-        for path in clips_of(name, args.data, args.every):
-            for controller in args.controllers:
-                for budget in args.budgets if controller == "lookahead" else (0.0,):
-                    yield name, path, controller, budget
+def main(argv: list[str] | None = None) -> None:
+    """Measures, row by row, and writes the tables."""
+    a = arguments().parse_args(argv)
+    results = Results(a.json)
+    jobs = [job for job in jobs_of(a) if a.again or not results.has(job)]
+    words = [w.rpartition("/")[2] if w.startswith(("/", "~")) else w for w in argv or sys.argv[1:]]
+    command = "python benchmarks/lookahead.py " + " ".join(f'"{w}"' if " " in w else w for w in words)
+    results.commands += [] if command in results.commands else [command]
+    print(f"{len(jobs)} to measure, {len(results.rows)} rows are there", flush=True)
+    running: dict[Future[dict[str, Any]], Job] = {}
+    with ProcessPoolExecutor(a.workers) as pool:
+        for job in jobs:
+            _, clip, controller, _, condition, starts = job.key
+            what = (clip, job.source, controller, job.config, CONDITIONS[condition], starts)
+            running[pool.submit(measured, *what)] = job
+        while running:
+            for one in wait(running, return_when=FIRST_COMPLETED).done:
+                job = running.pop(one)
+                row: dict[str, Any] = dict(zip(KEY, job.key, strict=True))
+                row["made_with"] = made_with(job.key[2])
+                row |= one.result()
+                results.add(row)
+                whole = sum(e["whole"] for e in row["episodes"])
+                print(*job.key[:5], f"{whole} of {len(row['episodes'])}", sep=", ", flush=True)
+    results.save()
+    for path in write(results.rows, results.commands, a.json):
+        print(path)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--set", nargs="+", choices=SETS, default=["bandai", "cmu", "dances"])
-    parser.add_argument("--every", type=int, default=1, help="take every N-th clip")
-    parser.add_argument("--controllers", nargs="+", default=["nothing", "policy", "lookahead"])
-    parser.add_argument("--budgets", nargs="+", type=float, default=[192.0])
-    parser.add_argument("--starts", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=2)
-    args = parser.parse_args()
-    jobs = list(work(args))
-    rows: dict[str, list[dict[str, Any]]] = {}
-    command = f"python benchmarks/lookahead.py --set {' '.join(args.set)} --every {args.every}"
-    command += f" --starts {args.starts} --budgets {' '.join(f'{b:g}' for b in args.budgets)}"
-    with ProcessPoolExecutor(args.workers) as pool:
-        running = [pool.submit(measured, path, c, b, args.starts) for _, path, c, b in jobs]
-        for (name, _, c, b), one in zip(jobs, running, strict=True):
-            rows.setdefault(f"{name}, {c}" + (f" {b:g}" if b else ""), []).append(one.result())
-            found = {key: table(done) for key, done in rows.items()}
-            out = {"command": command, "machine": f"{platform.machine()}, {args.workers} processes"}
-            data = out | {"tables": found, "clips": rows}
-            write_atomic(args.json, json.dumps(data, indent=1).encode())
+def arguments() -> argparse.ArgumentParser:
+    """The options."""
+    p = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    p.add_argument("--data", type=Path, metavar="FOLDER")
+    p.add_argument("--clips", type=Path, metavar="LIBRARY", help="of the sets library and held-out")
+    p.add_argument("--json", type=Path, required=True, metavar="FILE")
+    p.add_argument("--set", nargs="+", choices=(*FILES, *LIBRARIES), default=["bandai", "cmu", "dances"])
+    p.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th clip")
+    p.add_argument("--controllers", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
+    p.add_argument("--budgets", nargs="+", default=["192"], metavar="BUDGET")
+    p.add_argument("--conditions", nargs="+", choices=(*CONDITIONS, "all"), default=["none"])
+    p.add_argument("--starts", type=int, default=1, metavar="N")
+    p.add_argument("--workers", type=int, default=2)
+    p.add_argument("--cache", type=Path, help="a folder for the library that is read")
+    p.add_argument("--again", action="store_true", help="measure also what FILE holds")
+    return p
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except PoiseError as problem:
+        sys.exit(str(problem))

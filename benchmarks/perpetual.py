@@ -5,7 +5,8 @@
 RUN is the run's folder, FOLDER the library that it was trained on, of which the clips that were held out
 are read again. Nothing helps. Parts (all by default; what a part lacks, such as FOLDER, leaves it out):
 
-    table     success and errors on held-out clips and on the library, beside the paper's rows
+    table     success and errors on held-out clips and on the library, by source too, beside those of
+              doing nothing and the paper's rows
     search    the same where what the policy loses is searched, by --characters at once
     recovery  1,000 trials each fallen, far and both, against a body that stands at ease
     owners    the composer against every primitive, clip by clip
@@ -48,7 +49,9 @@ from perpetual_search import searched
 from perpetual_text import report
 from speed import machine
 
+from poise.env import Acts
 from poise.errors import PoiseError
+from poise.eval import Nothing
 from poise.learn.checkpoint import write_atomic
 from poise.motion import ClipLibrary
 from poise.plan import SamplingConfig
@@ -85,15 +88,24 @@ class Measurement:
             clips, out["notes"] = self.held()
             out["held_out_subjects"] = subjects(clips.names)
             task = library_task(run, clips)
-            out["held_out"] = table(task, run.policy, "held-out clips", run.name, threads).to_dict()
+            for key, policy, method in self._methods("held_out"):
+                out[key] = table(task, policy, "held-out clips", method, threads).to_dict()
         own, made = recorded(run.imitation.library.names)
-        how = run.imitation, run.policy
-        library = table(*how, "training library", run.name, threads, own)
+        for key, policy, method in self._methods("library"):
+            of = table(run.imitation, policy, "training library", method, threads, own)
+            out[key] = of.to_dict()
+            if method == run.name and not made and (bodies := by_body(run.imitation, of)):
+                out["bodies"] = bodies
         if made:
             said = "the same mirrored and backwards"
-            out["library_made"] = table(*how, said, run.name, threads, made).to_dict()
-        bodies = [] if made else by_body(run.imitation, library)
-        return out | {"library": library.to_dict()} | ({"bodies": bodies} if bodies else {})
+            whole = table(run.imitation, run.policy, said, run.name, threads, made)
+            out["library_made"] = whole.to_dict()
+        return out
+
+    def _methods(self, key: str) -> tuple[tuple[str, Acts, str], ...]:
+        """The run's policy and the null that it must beat, with their keys and names."""
+        nothing = Nothing(self.run.policy.num_actions)
+        return (key, self.run.policy, self.run.name), (f"{key}_nothing", nothing, "nothing")
 
     def _search(self) -> dict[str, Any]:
         run, a, out = self.run, self.a, {}

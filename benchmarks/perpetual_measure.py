@@ -16,7 +16,7 @@ from field.table import field_table
 from speed.stance import relaxed_stance
 from torch import Tensor
 
-from poise.env import ImitationEnv, Reference
+from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval import ClipResults
 from poise.eval.episodes import run_episodes
@@ -183,7 +183,7 @@ def recorded(names: Sequence[str]) -> tuple[list[int], list[int]]:
 
 def table(
     task: Imitation,
-    policy: PolicyBundle,
+    policy: Acts,
     data: str,
     method: str,
     threads: int,

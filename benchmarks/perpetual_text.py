@@ -7,6 +7,7 @@ from typing import Any
 
 from field.card import FieldTable, markdown
 from field.paper import PHC_RECOVERY, paper_rows
+from field.sources import source_table
 from perpetual_curves import at_samples
 
 #: What must be said beside every comparison with the paper.
@@ -99,10 +100,11 @@ def side_by_side(runs: Mapping[str, Any]) -> str:
 
 
 def _table(part: Mapping[str, Any]) -> list[str]:
-    kinds = ("held_out", "library", "library_made")
+    kinds = ("held_out", "held_out_nothing", "library", "library_nothing", "library_made")
     tables = [FieldTable.from_dict(part[k]) for k in kinds if part.get(k)]
     paper = paper_rows("AMASS-Train", "AMASS-Test")
     out = ["### Tracking, without help", "", markdown(tables, paper, WORST).rstrip(), "", DIFFERENCE]
+    out += ["", "By source, errors by clip:", "", source_table(tables)]
     if part.get("held_out_subjects"):
         out += ["", f"Held out: {', '.join(part['held_out_subjects'])}."]
     if part.get("bodies"):

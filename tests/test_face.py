@@ -68,7 +68,8 @@ def test_imitate_gives_the_numbers_of_the_command(
     # What was saved opens again.
     again = poise.open_run(tmp_path / "python")
     assert again.recipe == "residual-force" and again.config == imitated.task.config
-    assert figures(again.score()) | {"delivered": 0} == figures(imitated.card) | {"delivered": 0}
+    apart = {"delivered": 0, "nothing": 0}
+    assert figures(again.score()) | apart == figures(imitated.card) | apart
 
 
 def test_what_it_shows(imitated: poise.Imitated, tmp_path: Path) -> None:

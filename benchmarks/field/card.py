@@ -13,12 +13,14 @@ from field.paper import PHC_ROWS, PaperRow
 from poise.errors import PoiseError
 from poise.learn.checkpoint import write_atomic
 
-View = Literal["all_frame", "all_clip", "succ_frame", "succ_clip"]
+View = Literal["all_frame", "all_clip", "succ_frame", "succ_clip", "uncut_frame", "uncut_clip"]
 VIEWS: Mapping[View, str] = {
     "all_frame": "all clips, by frame",
     "all_clip": "all clips, by clip",
     "succ_frame": "successful clips, by frame",
     "succ_clip": "successful clips, by clip",
+    "uncut_frame": "all frames, after failures too, by frame",
+    "uncut_clip": "all frames, after failures too, by clip",
 }
 FIGURES = ("g_mpjpe", "mpjpe", "pa_mpjpe", "acc", "vel")
 
@@ -55,7 +57,8 @@ class FieldTable:
     """An evaluation as the field reports it.
 
     method, data: what was evaluated on what. rule: of success. succ: share of episodes that succeed.
-    views: errors over all or successful episodes, weighted by frame or by clip. clips: worst first.
+    views: errors over all or successful episodes, weighted by frame or by clip; tables of before know no
+    uncut ones. clips: worst first.
     fps: of the control; other rates than 30 are rescaled, not resampled.
     """
 
@@ -81,7 +84,7 @@ class FieldTable:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FieldTable:
         """What `to_dict` gave."""
-        views: dict[View, Errors] = {k: _errors(data["views"][k]) for k in VIEWS}
+        views: dict[View, Errors] = {k: _errors(data["views"][k]) for k in VIEWS if k in data["views"]}
         clips = tuple(
             ClipErrors(
                 **{k: _number(v) for k, v in c.items() if k != "errors"}, errors=_errors(c["errors"])
@@ -116,15 +119,14 @@ def markdown(
     ]
     lines = [_line(head), _line(["---"] * 4 + ["---:"] * 6)]
     for t in tables:
-        for view, words in VIEWS.items():
-            e = t.views[view]
+        for view, e in t.views.items():
             lines.append(
                 _line(
                     [
                         t.method,
                         t.data,
                         len(t.clips),
-                        words,
+                        VIEWS[view],
                         100 * t.succ,
                         *(getattr(e, n) for n in FIGURES),
                     ]

@@ -41,7 +41,8 @@ def field_table(
     """The field's table of one evaluation; a large one may come in parts, one at a time.
 
     A failed episode counts up to and including the frame that broke the rule (the published code goes on
-    with a restarted run instead). An episode's first frame was set, not tracked, so it does not count.
+    with a restarted run instead), in the "uncut" views to its end. An episode's first frame was set, not
+    tracked, so it does not count.
     "By clip" is the mean over clips of each clip's mean over the frames of its episodes.
 
     Args:
@@ -62,13 +63,10 @@ def field_table(
     won, count, failed_at, start = (
         torch.cat([getattr(p, k) for p in gathered]) for k in ("won", "frames", "failed_at", "start")
     )
-    sums = {
-        k: Sums(
-            torch.cat([p.sums[k].total for p in gathered]),
-            torch.cat([p.sums[k].count for p in gathered]),
-        )
-        for k in FIGURES
-    }
+    sums, uncut = (
+        {k: Sums.cat([getattr(p, which)[k] for p in gathered]) for k in FIGURES}
+        for which in ("sums", "uncut")
+    )
     fps = gathered[0].fps
     rows = {n: torch.tensor([m == n for m in names]) for n in dict.fromkeys(names)}
     clips = [_clip(n, r, won, count, failed_at, start, sums, fps) for n, r in rows.items()]
@@ -78,6 +76,8 @@ def field_table(
         "all_clip": _over_clips(sums, everyone, list(rows.values())),
         "succ_frame": _mean(sums, won),
         "succ_clip": _over_clips(sums, won, list(rows.values())),
+        "uncut_frame": _mean(uncut, everyone),
+        "uncut_clip": _over_clips(uncut, everyone, list(rows.values())),
     }
     ranked = sorted(clips, key=lambda c: (-c.failed / c.episodes, -_or(c.errors.g_mpjpe, math.inf)))
     return FieldTable(
@@ -88,7 +88,8 @@ def field_table(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What one set of rollouts adds: per episode `(E,)` and per figure."""
+    """What one set of rollouts adds: per episode `(E,)` and per figure, over frames that count and
+    uncut."""
 
     names: list[str]
     won: Tensor
@@ -96,33 +97,43 @@ class _Part:
     failed_at: Tensor
     start: Tensor
     sums: dict[str, Sums]
+    uncut: dict[str, Sums]
     fps: float
 
     @staticmethod
     def of(r: RolloutSet, rule: SuccessRule, bodies: Sequence[int] | None) -> _Part:
         judged = judge(r, rule)
-        mask = judged.mask.clone()
-        mask[:, 0] = False
+        mask, uncut = judged.mask.clone(), judged.uncut.clone()
+        mask[:, 0] = uncut[:, 0] = False
         picked = list(range(r.pos.shape[2]) if bodies is None else bodies)
         if r.root not in picked:
             raise PoiseError(f"the bodies of a tracking table must hold the root, body {r.root}")
         ref = r.ref_pos[:, :, picked].double()
         # Frames that do not count may hold anything, on which Procrustes would stop.
-        pos = torch.where(mask[..., None, None], r.pos[:, :, picked].double(), ref)
+        pos = torch.where(uncut[..., None, None], r.pos[:, :, picked].double(), ref)
+        # Each with how many frames more it takes.
         values = {
-            "g_mpjpe": (mpjpe_global(pos, ref), mask),
-            "mpjpe": (mpjpe_root(pos, ref, picked.index(r.root)), mask),
-            "pa_mpjpe": (mpjpe_pa(pos, ref), mask),
-            "acc": (acceleration_error(pos, ref, r.fps), span_mask(mask, 2)),
-            "vel": (velocity_error(pos, ref, r.fps), span_mask(mask, 1)),
+            "g_mpjpe": (mpjpe_global(pos, ref), 0),
+            "mpjpe": (mpjpe_root(pos, ref, picked.index(r.root)), 0),
+            "pa_mpjpe": (mpjpe_pa(pos, ref), 0),
+            "acc": (acceleration_error(pos, ref, r.fps), 2),
+            "vel": (velocity_error(pos, ref, r.fps), 1),
         }
+
+        def over(frames: Tensor) -> dict[str, Sums]:
+            return {
+                k: Sums.of(v, span_mask(frames, more) if more else frames)
+                for k, (v, more) in values.items()
+            }
+
         return _Part(
             [r.clip_name(int(i)) for i in r.clip],
             judged.won,
             mask.sum(1),
             judged.failed_at,
             r.start,
-            {k: Sums.of(*v) for k, v in values.items()},
+            over(mask),
+            over(uncut),
             r.fps,
         )
 

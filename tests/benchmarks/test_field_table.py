@@ -11,6 +11,7 @@ import pytest
 import torch
 from field.card import FIGURES, FieldTable, markdown, read_field_table, write_field_table
 from field.paper import PHC_RECOVERY, PHC_ROWS, paper_rows
+from field.sources import source_of, source_table
 from field.table import field_table
 
 from poise.errors import PoiseError
@@ -234,3 +235,44 @@ def test_what_cannot_be_tabulated() -> None:
         field_table(two)
     with pytest.raises(PoiseError, match="no success rule"):
         field_table(two[0], rule="pch")
+
+
+def test_errors_over_all_frames_stand_beside_those_until_the_failure() -> None:
+    pos, ref = still([5])
+    pos[0, 1:, :, 0] += 0.1
+    pos[0, 3:, :, 0] += 0.5
+    table = field_table(rollouts(pos, ref, [5], ["a"]))
+    # 100, 100 and 600 mm; then one frame more of 600.
+    assert table.succ == 0 and table.views["all_frame"].g_mpjpe == pytest.approx(800 / 3)
+    assert table.views["uncut_frame"].g_mpjpe == pytest.approx(1400 / 4)
+    # Tables of before know nothing of it.
+    data = table.to_dict()
+    del data["views"]["uncut_frame"], data["views"]["uncut_clip"]
+    old = FieldTable.from_dict(data)
+    assert "uncut_frame" not in old.views and "after failures" not in markdown(old)
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("cmu_expmaps-train_walking_13_extra", "CMU, walks published for prediction"),
+        ("cmu_expmaps-test_running_1", "CMU, runs, jumps and ball games published for prediction"),
+        ("deepmimic-humanoid3d_dance_a", "DeepMimic"),
+        ("bandai_bvh-dataset_2_walk_active_015", "Bandai"),
+        ("held_out-cmu_amc-rfc-05_06", "CMU, dances"),
+        ("cmu_amc-02-02_05", "CMU, other"),
+    ],
+)
+def test_clips_have_a_source(name: str, source: str) -> None:
+    assert source_of(name) == source
+
+
+def test_a_table_by_source() -> None:
+    pos, ref = still([5, 5, 5])
+    pos[0, 1:, :, 0] += 0.01
+    pos[1, 1:, :, 0] += 0.03
+    pos[2, 1:, :, 0] += 0.6
+    names = ["deepmimic-a", "deepmimic-b", "bandai-c"]
+    lines = source_table([field_table(rollouts(pos, ref, [5, 5, 5], names))]).splitlines()
+    assert lines[2].startswith("|  |  | DeepMimic | 2 | 100.0 | 20.0 |")
+    assert lines[3].startswith("|  |  | Bandai | 1 | 0.0 | 600.0 |")

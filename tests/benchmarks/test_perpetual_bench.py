@@ -96,6 +96,7 @@ def test_every_part_of_one_run(run: Path, clips: Path, tmp_path: Path, capsys) -
     opened = measure.Run.open("toy", run)
     results = evaluate_clips(opened.imitation, opened.policy, threads=1)
     assert parts["table"]["library"]["succ"] == pytest.approx(results.rate)
+    assert {parts["table"][f"{k}_nothing"]["method"] for k in ("library", "held_out")} == {"nothing"}
     # What is searched is all that is lost alone; the toy falls everywhere.
     for part, count in ((parts["search"]["held_out"], 1), (parts["search"]["library"], 2)):
         rows = part["per_clip"]

@@ -13,7 +13,7 @@ from tiny_clips import deepmimic, put
 from poise.cli.answer import LOST
 from poise.cli.main import main
 from poise.jobs.open import open_run
-from poise.motion import read_clip, trim, write_clip
+from poise.motion import read_clip, shifted, trim, write_clip
 from toy_policy import WALK, toy_run
 
 #: Without lookahead and search, with which even this policy comes far.
@@ -240,3 +240,40 @@ def test_motions_that_cannot_be_tracked(
     shutil.copy(file, damaged)
     damaged.write_bytes(damaged.read_bytes()[:-100])
     refused("track", WALK, "--policy", damaged, "-o", out, words=("damaged",))
+
+
+def test_clips_one_after_another(
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    later, clip = tmp_path / "later.bvh", read_clip(short)
+    to = clip.root_pos[-1] - clip.root_pos[0] + np.array([0.5, 0.8, 0.0])
+    write_clip(shifted(clip, to), later)
+    out = tmp_path / "out.bvh"
+    argv = ["track", str(short), str(later), "-o", str(out), "--controller", "policy"]
+    assert main([*argv, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["inputs"] == [str(short), str(later)] and told["result"]["outcome"] == "tracked"
+    first, second = told["result"]["clips"]
+    assert first["done"] and second["done"] and second["clip"] == "later" and 0 < second["after"] < 10
+    assert "2 of 2 clips done one after another" in told["result"]["sentence"]
+    assert read_clip(out).seconds == pytest.approx(second["ends"], abs=0.05)
+    assert main([*argv, "--force"]) == 0
+    assert f"later: reached {second['after']:.1f} s after the clip before" in capsys.readouterr().out
+
+
+def test_several_clips_that_are_refused(file: Path, short: Path, tmp_path: Path, refused) -> None:
+    two, out = (short, short), ("-o", tmp_path / "out")
+    refused("track", *out, words=("needs a motion file",))
+    refused("track", short, tmp_path / "absent.bvh", *out, words=("absent.bvh",))
+    refused("track", short, tmp_path, *out, words=("is a folder", "Name its files"))
+    refused("track", *two, *out, "--learn", "1", words=("--learn is for a single clip",))
+    refused("track", *two, *out, "--count", "2", words=("several characters are for a single clip",))
+    refused("track", *two, *out, "--noise", "jitter:1", words=("noise is for a single clip",))
+    refused("track", *two, *out, "--reset-on-fail", words=("putting a character back is for",))
+    refused("track", *two, *out, "--controller", "search", words=("a search is for a single clip",))
+    refused("track", *two, "-o", short, words=("written over itself",))
+    refused("track", *two, *out, "--policy", file, words=("go from one clip to the next", "one clip"))
+    pickled = tmp_path / "motion.npy"
+    np.save(pickled, np.array({"a": 1}, dtype=object), allow_pickle=True)
+    refused("track", short, pickled, *out, words=("pickled",))
+    assert not (tmp_path / "out").exists()

@@ -12,16 +12,29 @@ import torch
 from poise.control import ExplicitResidual
 from poise.env import Reference
 from poise.errors import PoiseError
-from poise.eval import run_episodes, run_in_batches, score_rollouts, simulate, start_frames
+from poise.eval import (
+    Nothing,
+    perturb,
+    run_episodes,
+    run_in_batches,
+    score_rollouts,
+    simulate,
+    start_frames,
+)
+from poise.eval.episodes import OFF_RAD
+from poise.jobs.runs import score
+from poise.learn import Policy
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
+from poise.sim import UnstableError
 from toy_human import swing
 
 
 def of_lengths(*lengths: int) -> Reference:
     """All that `start_frames` reads of a reference."""
-    return cast(Reference, SimpleNamespace(length=torch.tensor(lengths)))
+    cyclic = torch.zeros(len(lengths), dtype=torch.bool)
+    return cast(Reference, SimpleNamespace(length=torch.tensor(lengths), cyclic=cyclic, rate_hz=30.0))
 
 
 class Always:
@@ -34,16 +47,23 @@ class Always:
         return self.action.expand(len(obs), -1)
 
 
-def test_short_clips_start_at_every_frame():
-    clip, start = start_frames(of_lengths(31, 3))
-    assert clip.tolist() == [0] * 30 + [1] * 2
-    assert start.tolist() == [*range(30), 0, 1]
+def test_starts_within_a_second_of_the_end_do_not_count():
+    # 61 frames at 30 Hz last 2 s; a clip that is shorter than 1 s begins at its first frame alone.
+    clip, start = start_frames(of_lengths(61, 3))
+    assert clip.tolist() == [0] * 31 + [1]
+    assert start.tolist() == [*range(31), 0]
+
+
+def test_a_cycle_has_a_second_to_come_from_everywhere():
+    cycle = of_lengths(31)
+    cycle.cyclic[:] = True
+    assert start_frames(cycle)[1].tolist() == [*range(30)]
 
 
 def test_the_last_clip_that_needs_no_thinning():
     # 283 frames cost 283 * 283 / 2 = 40 044 steps, 282 cost 39 762.
-    assert len(start_frames(of_lengths(282))[0]) == 281
-    assert len(start_frames(of_lengths(283))[0]) == 141
+    assert len(start_frames(of_lengths(282))[0]) == 252
+    assert len(start_frames(of_lengths(283))[0]) == 127
 
 
 @pytest.mark.parametrize("lengths", [(900,), (300, 40, 700), (50,) * 60])
@@ -162,3 +182,59 @@ def test_observers_watch_one_simulation_until_all_have_seen_enough():
     simulate(env, policy, env.reset_to(clip, start), 3, one, ever)
     assert len(ever.seen) == 4
     env.close()
+
+
+def test_perturbed_starts_are_drawn_world_by_world():
+    imitation = build(swing(2.0), ResidualForce(method="deepmimic"))
+    clip, start = torch.zeros(3, dtype=torch.long), torch.tensor([0, 5, 5])
+
+    def first(rows: list[int], trial: list[int]) -> torch.Tensor:
+        env = imitation.env(len(rows), auto_reset=False, threads=1)
+        exact = env.reset_to(clip[rows], start[rows]).clone()
+        seen = perturb(env, clip[rows], start[rows], torch.tensor(trial))
+        assert seen.shape == exact.shape and bool((seen != exact).any(1).all())
+        qpos = env.backend.state.qpos.clone()
+        env.close()
+        return qpos
+
+    three = first([0, 1, 2], [0, 0, 1])
+    off = three[:, 7:] - imitation.reference.qpos[start, 7:]
+    assert 0.7 * OFF_RAD < float(off.std()) < 1.4 * OFF_RAD
+    assert torch.equal(three[:, :3], imitation.reference.qpos[start, :3].to(three))
+    assert not torch.equal(three[1], three[2])
+    # Which worlds are beside it changes nothing.
+    assert torch.equal(first([1], [0])[0], three[1])
+
+
+def test_a_run_is_scored_beside_doing_nothing_over_perturbed_starts():
+    imitation = build(swing(1.1), ResidualForce(method="deepmimic"))
+    nothing = cast(Policy, Nothing(len(imitation.humanoid.hinges)))
+    card = score(imitation, nothing, {}, starts=3)
+    assert card.starts == 3 and card.episodes == 3 * 4
+    assert card.nothing["succ"] == card.succ and card.nothing["mpjpe_mm"] == card.mpjpe_mm
+    assert card.spread["mpjpe_mm"] > 0 and not score(imitation, nothing, {}).spread
+    with pytest.raises(PoiseError, match="at least 1 start, got 0"):
+        score(imitation, nothing, {}, starts=0)
+
+
+def test_an_episode_that_goes_bad_ends_there_and_has_failed():
+    imitation = build(swing(speed=1.0), ResidualForce(method="deepmimic"))
+    calm = torch.zeros(len(imitation.humanoid.hinges))
+
+    class Wild(Always):
+        steps = 0
+
+        def act(self, obs: torch.Tensor) -> torch.Tensor:
+            self.steps += 1
+            return super().act(obs) if self.steps < 4 else torch.full_like(super().act(obs), torch.nan)
+
+    def of(worlds: int):
+        zero = torch.zeros(worlds, dtype=torch.long)
+        return run_episodes(lambda n: imitation.env(n, auto_reset=False), Wild(calm), zero, zero)[0]
+
+    rollouts = of(1)
+    assert int(rollouts.valid.sum()) == 4 and rollouts.pos.isfinite().all()
+    card = score_rollouts(rollouts)
+    assert card.succ == 0.0
+    with pytest.raises(UnstableError, match="control step 3"):
+        of(2)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.eval import table
 from poise.eval.card import read_score, write_score
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.scorecard import PLAUSIBILITY, TRACKING, score_rollouts
@@ -19,13 +20,16 @@ KEYS = [
     "succ", "succ_rule", "mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame2",
     "foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk", "reward", "help", "seconds",
     "samples", "seed", "version", "clip", "method", "episodes", "frames", "mpjpe_succ_mm",
-    "reference", "per_clip", "weighting", "variants", "delivered",
+    "tracked", "needs", "reference", "per_clip", "weighting", "variants", "nothing", "starts", "spread",
+    "delivered",
 ]  # fmt: skip
 HELP_KEYS = [
     "limit_n", "limit_nm", "force_mean_n", "force_p95_n", "torque_mean_nm", "torque_p95_nm",
     "work_j_per_s", "share_of_body_weight",
 ]  # fmt: skip
-TOLD = ["clip", "episodes", "frames", "succ", "first_fail_s"]
+TOLD = [
+    "clip", "episodes", "frames", "succ", "first_fail_s", "tracked", "fallen_s", "off_feet_s",
+]  # fmt: skip
 CLIP_KEYS = [*TOLD, *TRACKING, *PLAUSIBILITY, "force_mean_n"]
 
 BALL = 0.05
@@ -68,7 +72,8 @@ def test_keys_are_stable():
     assert [list(entry) for entry in d["per_clip"]] == [CLIP_KEYS, CLIP_KEYS]
     assert list(d["reward"]) == ["total", "pose"]
     assert list(d["reference"]) == ["foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk"]
-    assert list(d["variants"]) == ["frame", "episode", "succ_frame", "succ_episode"]
+    weighted = ["frame", "episode", "succ_frame", "succ_episode", "uncut_frame", "uncut_episode"]
+    assert list(d["variants"]) == weighted
 
 
 def test_hand_computed_figures_frame_and_episode_weighted():
@@ -112,6 +117,27 @@ def test_a_failed_episode_counts_until_it_fails():
     assert (run["clip"], run["succ"]) == ("run", 1.0) and math.isnan(run["first_fail_s"])
     strict = score_rollouts(replace(r, pos=pos), rule="any_25cm")
     assert strict.succ_rule == "any_25cm"
+    # Over all frames the one after the failure counts too, and the table says so.
+    uncut = (10 * 10 + 2 * 100 + 2 * 700) / 14
+    assert card.variants["uncut_frame"]["mpjpe_global_mm"] == pytest.approx(uncut)
+    shown = {row[0]: row[1] for row in table(card)}
+    assert shown["Joint error, global, all frames"] == pytest.approx(uncut)
+
+
+def test_perturbed_starts_have_a_spread():
+    r = rollouts()
+    exact = score_rollouts(r)
+    assert (exact.starts, exact.spread) == (1, {})
+    pos = r.pos.clone()
+    pos[1, 2:, :, 0] += 0.6
+    card = score_rollouts(replace(r, pos=pos, trial=torch.tensor([0, 1])))
+    assert card.starts == 2 and card.succ == 0.5
+    # One start succeeds and the other one fails; 10 mm and a mean of 300 mm.
+    assert card.spread["succ"] == pytest.approx(0.5**0.5)
+    assert card.spread["mpjpe_global_mm"] == pytest.approx((300 - 10) / 2**0.5)
+    assert "Success, spread over 2 starts" in [row[0] for row in table(card)]
+    beside = replace(card, nothing={"succ": 0.25})
+    assert ("Success, doing nothing", 25.0, "%", "") in table(beside)
 
 
 def test_an_episode_that_stops_early_does_not_succeed():
@@ -270,3 +296,60 @@ def test_parts_of_an_evaluation_score_as_the_whole():
     assert same(one, other)
     with pytest.raises(PoiseError, match="no rollouts to score"):
         score_rollouts([])
+
+
+def with_head(frames: int = 60, **changes):
+    """Two episodes of root, foot and head that stand, the second begins at frame 30."""
+    ref = torch.zeros(2, frames, 3, 3, dtype=torch.float64)
+    ref[..., 2] = torch.tensor([0.9, BALL, 1.6])
+    quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(2, frames, 3, 4)
+    zero = torch.zeros(2, frames, 1, 3, dtype=torch.float64)
+    return rollouts(
+        pos=changes.pop("pos", ref.clone()), quat=quat, ref_pos=ref, ref_quat=quat,
+        alive=torch.ones(2, frames, dtype=torch.bool), lengths=torch.tensor([frames, frames]),
+        force=zero, torque=zero, point_vel=zero, ang_vel=zero, reward={}, head=2, **changes,
+    )  # fmt: skip
+
+
+def test_survived_is_not_tracked():
+    assert score_rollouts(with_head()).tracked == 1.0
+    assert math.isnan(score_rollouts(rollouts()).tracked)
+    pos = with_head().ref_pos.clone()
+    # Down from frame 20 on, its bodies 0.43 m off on average.
+    pos[0, 20:, 0, 2], pos[0, 20:, 2, 2] = 0.5, 0.7
+    card = score_rollouts(with_head(pos=pos))
+    assert (card.succ, card.tracked, card.survived) == (1.0, 0.5, True)
+    fallen, other = sorted(card.per_clip, key=lambda c: c["tracked"])
+    assert (fallen["tracked"], fallen["fallen_s"]) == (0.0, pytest.approx(20 / 30))
+    assert other["tracked"] == 1.0 and math.isnan(other["fallen_s"]) and math.isnan(fallen["off_feet_s"])
+    # A stumble of 0.4 s is none; a second in the air is.
+    pos = with_head().ref_pos.clone()
+    pos[0, 20:32, 2, 2] = 0.7
+    pos[1, 10:40, 1, 2] += 0.2
+    card = score_rollouts(with_head(pos=pos))
+    assert (card.succ, card.tracked) == (1.0, 0.5)
+    (off,) = [c for c in card.per_clip if c["tracked"] == 0.0]
+    # Seconds of the clip: this episode begins at its frame 30.
+    assert off["off_feet_s"] == pytest.approx(40 / 30) and math.isnan(off["fallen_s"])
+
+
+def test_what_is_lost_is_not_tracked_and_parts_are_the_whole():
+    pos = with_head().ref_pos.clone()
+    pos[1, 30:, :, 0] += 2.0
+    made = with_head(pos=pos)
+    card = score_rollouts(made)
+    assert (card.succ, card.tracked, card.survived) == (0.5, 0.5, False)
+    again = score_rollouts(iter([made]))
+    assert again.tracked == card.tracked
+    label, value, unit, verdict = table(card)[1]
+    assert (label, value, unit, verdict) == ("Tracked", 50.0, "%", "poor")
+
+
+def test_a_card_without_the_new_keys_is_read(tmp_path):
+    path = write_score(score_rollouts(with_head()), tmp_path / "score.json")
+    old = json.loads(path.read_text())
+    del old["tracked"], old["needs"]
+    path.write_text(json.dumps(old))
+    card = read_score(path)
+    assert math.isnan(card.tracked) and card.needs == () and not card.survived
+    assert "Tracked" not in [row[0] for row in table(card)]

@@ -188,7 +188,7 @@ def test_a_policy_that_fails_nothing_is_done(
 
 def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:
     """With a policy that hardly stands, so that it is lost; what comes out holds together."""
-    config = TrackConfig(recover=True)
+    config = TrackConfig(recover=True, controller="policy")
     with pytest.raises(PoiseError, match="has not learned to come back"):
         track(swing(4.0, name="long"), tracker, config)
     made = build(lively(), tiny(recovery=True, **PLAIN))

@@ -1,12 +1,15 @@
-"""A goal leads characters that have lost the reference back to it, and no others."""
+"""A goal leads characters that have lost the reference back to it, and no others; and from one clip to
+the next."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv
+from poise.env import ImitationEnv, Reference
 from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
@@ -86,13 +89,69 @@ def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imita
     env.set_goal(goal)
     assert goal.doing.tolist() == [RETURNS] and not goal.lost
     world, doing = Puppets(env, goal), []
-    # Pushed off the motion, it waits for rest and begins another from where it is.
+    # Pushed off the motion, it begins another from where it is.
     world.aside = torch.tensor([[0.0, 2.0]])
     first = int(goal._first)
     for _ in range(4):
         env.step(torch.zeros(1, env.num_actions))
         doing.append(int(goal.doing))
-    assert doing[:2] == [FALLS, RETURNS] and not goal.lost
+    # It still stands, and needs no rest.
+    assert doing == [RETURNS] * 4 and not goal.lost
     # The table holds the new motion alone.
     assert first == 0 and len(goal._packed) == int(goal._length) + int(goal._first)
+    env.close()
+
+
+def test_clips_are_done_one_after_another(made: Imitation) -> None:
+    own = made.reference
+    moved = own.qpos.clone()
+    # The second clip begins 2 m aside of the first one's end, the third where the second ends.
+    spans = [slice(int(a), int(a + n)) for a, n in zip(own.start, own.length, strict=True)][:3]
+    for before, now, away in ((0, 1, (1.0, 2.0)), (1, 2, (0.0, 0.0))):
+        gap = moved[spans[before].stop - 1, :2] - moved[spans[now].start, :2]
+        moved[spans[now], :2] += gap + torch.tensor(away)
+    still = moved[spans[1].stop - 1].repeat(20, 1)
+    motions = [moved[spans[0]].numpy(), moved[spans[1]].numpy(), still.numpy()]
+    chain = replace(made, reference=Reference(own.humanoid, motions, own.rate_hz, ["a", "b", "c"]))
+    env = chain.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
+    zero = torch.zeros(1, dtype=torch.long)
+    env.reset_to(zero, zero)
+    assert made.recovery_clips is not None
+    goal = LedGoal(env.goal.clips, made.recovery_clips, chained=True)
+    env.set_goal(goal)
+    Puppets(env, goal)
+    seen, ends = [], [len(m) - 1 for m in motions]
+    for _ in range(600):
+        seen.append((int(goal.doing), int(env.clip), int(goal.frame)))
+        if seen[-1] == (TRACKS, 2, ends[2]):
+            break
+        env.step(torch.zeros(1, env.num_actions))
+    kinds = [k for k, before in zip(seen[1:], seen, strict=False) if k[:2] != before[:2]]
+    assert kinds[0] == (RETURNS, 1, 0) and kinds[1] == (TRACKS, 1, 0)
+    # What is at hand begins at once, and each clip is done frame by frame.
+    assert kinds[2] == (TRACKS, 2, 0) and len(kinds) == 3 and not goal.lost
+    assert [f for k, c, f in seen if (k, c) == (TRACKS, 1)] == list(range(ends[1]))
+    # A copy that plans nothing stays at the end of its clip.
+    env.set_goal(env.goal.clips)
+    env.reset_to(zero, zero + ends[0] - 1)
+    goal = LedGoal(env.goal.clips, made.recovery_clips, chained=True, plans=False)
+    env.set_goal(goal)
+    Puppets(env, goal)
+    for _ in range(3):
+        env.step(torch.zeros(1, env.num_actions))
+    assert goal.doing.tolist() == [TRACKS] and env.clip.tolist() == [0]
+    env.close()
+
+
+def test_a_clip_that_is_not_come_back_to_goes_on(made: Imitation) -> None:
+    env = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
+    zero = torch.zeros(1, dtype=torch.long)
+    env.reset_to(zero, zero)
+    assert made.recovery_clips is not None
+    goal = LedGoal(env.goal.clips, made.recovery_clips, chained=True, returns=False)
+    env.set_goal(goal)
+    world = Puppets(env, goal)
+    world.aside = torch.tensor([[2.0, 0.0]])
+    env.step(torch.zeros(1, env.num_actions))
+    assert goal.doing.tolist() == [TRACKS] and goal.frame.tolist() == [1]
     env.close()

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from poise.env import Reference
 from poise.eval.recovery import KINDS
@@ -13,9 +15,11 @@ from poise.jobs.library.files import subject_of
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.track import TrackConfig, imitation_of, track
+from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import SHIPPED, Tracker
 from poise.motion import read_clip
+from toy_human import human, swing, turn
 from toy_policy import WALK
 
 
@@ -68,3 +72,22 @@ def test_who_is_thrown_off_a_motion_goes_on_with_it(tracker: Tracker) -> None:
 def test_a_held_out_take_is_followed_for_a_while(tracker: Tracker, data_dir: Path) -> None:
     tracked = track(read_clip(data_dir / "cmu_bvh/ad/14_14.bvh"), tracker, controller="policy")
     assert not tracked.failures or tracked.failures[0][1] > 1.0
+
+
+def test_a_chair_that_is_not_there_is_named(tracker: Tracker) -> None:
+    """A body that stands, and sits down on nothing."""
+    clip, names = swing(4.0, 30.0), human().names
+    share = np.clip((np.arange(clip.frames) - 30) / 30, 0.0, 1.0)
+    angle = share * share * (3 - 2 * share) * np.pi / 2
+    rot, path = np.zeros_like(clip.rot), np.zeros((clip.frames, 3))
+    rot[..., 0] = 1.0
+    for joint, sign in (("UpLeg", -1.0), ("Leg", 1.0)):
+        for side in ("Left", "Right"):
+            rot[:, names.index(side + joint)] = turn("Y", torch.tensor(sign * angle)).numpy()
+    path[:, 0], path[:, 2] = -0.42 * np.sin(angle), 0.9 - 0.42 * (1 - np.cos(angle))
+    tracked = track(clip.replaced(rot=rot, root_pos=path), tracker, controller="policy")
+    card = tracked.evaluation.card
+    assert card.tracked == 0.0
+    (need,) = card.needs
+    assert need["what"] == "a seat" and 1.0 < need["start_s"] < 2.0 and need["stop_s"] > 3.8
+    assert "It needs a seat from 1.4 to 4.0 s." in shortfalls(card)

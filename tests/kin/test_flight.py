@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
-from poise.kin import Kinematics, clip_to_qpos, fit_ground, fit_humanoid
+from poise.kin import Kinematics, clip_to_qpos, examine, find_guesses, fit_ground, fit_humanoid
 from poise.kin.flight import Flight, find_flights, likely_rate, rate_sentence
 from poise.kin.ground import clip_flights
 from poise.kin.solids import centre_of_mass
@@ -25,6 +25,11 @@ def leap(fps: float = 60.0, gravity: float = 9.81) -> np.ndarray:
     """Height (m) over two seconds: half a second in the air from one second on."""
     t = np.arange(round(2 * fps) + 1) / fps - 1.0
     return np.where((t > 0) & (t < 0.5), gravity * t * (0.5 - t) / 2, 0.0)
+
+
+def upright(height: np.ndarray) -> np.ndarray:
+    """The centre of mass of a body that rises and falls with its lowest point."""
+    return np.stack((0 * height, 0 * height, height + 1.0), -1)
 
 
 def raised(clip: Clip, height: np.ndarray) -> Clip:
@@ -57,7 +62,7 @@ def test_the_centre_of_mass_is_mujocos():
 @pytest.mark.parametrize("fps", [30.0, 60.0, 120.0])
 def test_a_leap_is_a_flight_that_falls_with_g(fps):
     height = leap(fps)
-    (flight,) = find_flights(height, height + 1.0, fps)
+    (flight,) = find_flights(height, upright(height), fps)
     assert flight.fall == pytest.approx(9.81) and flight.rms_m < 1e-9
     # The lowest 6 cm at both ends are not seen.
     assert fps < flight.start <= 1.05 * fps + 1 and 1.44 * fps <= flight.stop < 1.5 * fps
@@ -65,14 +70,38 @@ def test_a_leap_is_a_flight_that_falls_with_g(fps):
 
 def test_a_slow_rise_and_a_short_hop_are_no_flights():
     slow = 0.3 * np.sin(np.linspace(0, np.pi, 121)) ** 2
-    assert find_flights(slow, slow, 60.0) == ()
+    assert find_flights(slow, upright(slow), 60.0) == ()
     hop = np.zeros(121)
     hop[60:63] = 0.1
-    assert find_flights(hop, hop, 60.0) == ()
+    assert find_flights(hop, upright(hop), 60.0) == ()
 
 
-@pytest.mark.parametrize(("factor", "rate"), [(1.0, None), (2.0, 60.0), (4.0, 30.0)])
-def test_a_clip_played_too_fast_is_told(factor, rate):
+@pytest.mark.parametrize("seconds", [0.8, 1.2, 2.0])
+@pytest.mark.parametrize("metres", [0.09, 0.15, 0.2, 0.3, 0.5])
+def test_a_body_that_is_lifted_and_put_down_is_no_slow_flight(metres, seconds):
+    height = np.zeros(300)
+    frames = round(60 * seconds)
+    height[100 : 100 + frames] = metres * np.hanning(frames)
+    assert likely_rate(find_flights(height, upright(height), 60.0), 60.0) is None
+
+
+def test_a_slow_arc_that_leads_aside_is_no_flight():
+    """A vault over hands, a ride: gravity pulls straight down."""
+    height, t = leap(120.0), np.arange(241) / 60.0
+    com = upright(height)
+    assert likely_rate(find_flights(height, com, 60.0), 60.0) == 120.0
+    com[:, 0] += t**2 / 2
+    assert find_flights(height, com, 60.0) == ()
+    # One that falls as fast as it should stays a flight, which judges no rate.
+    com[:, 0] += 3 * t**2 / 2
+    (flight,) = find_flights(height, com, 120.0)
+    assert flight.aside == pytest.approx(16 / 9.81) and likely_rate((flight,), 1200.0) is None
+
+
+@pytest.mark.parametrize(
+    ("factor", "rate"), [(1.0, None), (2.0, 60.0), (4.0, 30.0), (0.5, 240.0), (0.75, None)]
+)
+def test_a_clip_played_too_fast_or_too_slow_is_told(factor, rate):
     clip = raised(swing(2.0, 120.0 / factor), leap(120.0 / factor)).replaced(fps=120.0)
     flights = clip_flights(clip, TABLE)
     assert likely_rate(flights, 120.0) == rate
@@ -80,7 +109,8 @@ def test_a_clip_played_too_fast_is_told(factor, rate):
     if rate is None:
         assert said is None
     else:
-        assert said is not None and f"{factor**2:.0f}.0 times gravity" in said
+        assert said is not None and f"{factor**2:.3g} times gravity" in said
+        assert ("too slow" in said) == (factor < 1)
         assert said.endswith(f"state it with --fps {rate:g}.")
 
 
@@ -162,6 +192,29 @@ def test_gravity_tells_the_rate_of_real_clips(data_dir, name, rate):
     *_, report = fit_humanoid(clip)
     assert likely_rate(report.clips[0].flights, clip.fps) == rate
     assert any("times gravity" in s for s in report.sentences()) == (rate is not None)
+
+
+@pytest.mark.parametrize(
+    ("name", "stated", "rate"),
+    [
+        ("cmu_amc/rfc/90_05.amc", 60.0, 120.0),
+        ("cmu_amc/rfc/90_05.amc", 30.0, 120.0),
+        ("cmu_amc/rfc/90_08.amc", 60.0, None),
+        ("cmu_amc/02/02_04.amc", 60.0, 120.0),
+        ("deepmimic_txt/humanoid3d_spinkick.txt", 30.0, 60.0),
+        ("deepmimic_txt/humanoid3d_cartwheel.txt", None, None),
+        ("cmu_bvh/acrnn_indian/07.bvh", None, None),
+        ("cmu_amc/07/07_11.amc", None, None),
+    ],
+)
+def test_gravity_tells_slow_motion_of_real_clips(data_dir, name, stated, rate):
+    skeleton = data_dir / "cmu_amc/rfc/08.asf" if "/rfc/" in name else None
+    clip = read_clip(data_dir / name, skeleton=skeleton)
+    clip = clip.replaced(fps=stated or clip.fps)
+    faults = [f for f in examine(clip).faults if f.kind == "frame rate"]
+    assert [f.size for f in faults] == ([] if rate is None else [rate])
+    (told,) = [g for g in find_guesses(clip) if g.what == "fps"]
+    assert (f"--fps {rate or 0:g}" == told.override) == (rate is not None)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,8 @@ from poise.recipes.imitation import Imitation
 from toy_policy import toy_run, walk
 
 FEW = LookaheadConfig(candidates=16, horizon=6, hold_steps=3)
+#: Tracking alone decides.
+PLAIN = LookaheadConfig(jerk_price=0.0, slide_price=0.0, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def test_it_goes_on_where_the_policy_is_lost(task: Imitation, tracker: Tracker) 
         rollouts, _ = run_episodes(lambda _: env, acts, zero, zero, cycles=1)  # type: ignore[arg-type]
         return (rollouts.pos - rollouts.ref_pos).norm(dim=-1).mean(-1)[0]
 
-    env, control = alone(task), made(task, tracker, LookaheadConfig(candidates=48, horizon=8, seed=3))
+    env, control = alone(task), made(task, tracker, PLAIN)
     plain = off(alone(task), tracker.policy)
     control.watch(env)
     ahead = off(env, control)
@@ -112,7 +114,12 @@ def test_it_goes_on_where_the_policy_is_lost(task: Imitation, tracker: Tracker) 
 
 def test_without_anything_to_try_it_is_the_policy(task: Imitation, tracker: Tracker) -> None:
     nothing = LookaheadConfig(
-        candidates=4, horizon=4, noise_range=(1e-12, 1e-12), smoothing=(0.0,), warm=0.0
+        candidates=4,
+        horizon=4,
+        noise_range=(1e-12, 1e-12),
+        smoothing=(0.0,),
+        corrections=(1.0,),
+        warm=0.0,
     )
     env, other = alone(task), alone(task)
     actions, zero = run(env, made(task, tracker, nothing), 8), torch.zeros(1, dtype=torch.long)

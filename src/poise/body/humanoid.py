@@ -59,9 +59,14 @@ class Humanoid:
         return tuple(sorted(self.rows_of("foot"), key=lambda i: rows[i].side))
 
     @property
+    def head(self) -> int | None:
+        """Row of the head, of the last neck where there is no head, None without either."""
+        return next(iter(self.rows_of("head") or self.rows_of("neck")[-1:]), None)
+
+    @property
     def end_effectors(self) -> tuple[int, ...]:
-        """Rows of feet, hands and head (the last neck where there is no head): the paper's five."""
-        head = self.rows_of("head") or self.rows_of("neck")[-1:]
+        """Rows of feet, hands and head: the paper's five."""
+        head = () if self.head is None else (self.head,)
         return (*self.rows_of("foot"), *self.rows_of("hand"), *head)
 
     @property

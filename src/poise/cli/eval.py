@@ -17,7 +17,7 @@ from poise.cli.progress import working
 
 @dataclass(frozen=True)
 class Options:
-    """Simulate a trained run from every start frame and print its score card."""
+    """Simulate a trained run from every start frame with 1 s to come, and print its score card."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a result or of a run."""
@@ -25,6 +25,8 @@ class Options:
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
+    starts: Annotated[int, arg(metavar="N")] = 1
+    """Begin every episode N times, its joints about 1 mrad off, and say how far figures spread."""
     help_limit: Annotated[float | None, arg(metavar="NEWTONS", help_behavior_hint="")] = None
     """The help dial: the most residual force, from 0; by default what training has left of it."""
     device: Device = "cpu"
@@ -38,6 +40,6 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
     with working("simulating every start frame"):
         o = options
-        card = open_run(o.run).score(o.rule, o.help_limit, o.device)
+        card = open_run(o.run).score(o.rule, o.help_limit, o.device, o.starts)
     print_card(card)
     return Answer(card.to_dict())

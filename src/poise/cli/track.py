@@ -1,11 +1,11 @@
-"""`poise track`: a motion in, the same motion done by a trained policy out."""
+"""`poise track`: motions in, the same motions done by a trained policy out."""
 
 from __future__ import annotations
 
 import contextlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -34,13 +34,16 @@ NAMED = 8
 class Options:
     """Let a trained policy do a motion that it need not know, without help and without training: write
     the motion, score.json and report.html. It looks ahead, and a motion that is lost so is searched;
-    what is lost then it can --learn."""
+    what is lost then it can --learn. Several motions are done one after another in one episode, each
+    where it stands: between them the character walks, turns and gets up to the next one's start."""
 
-    clip: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The motion file: a clip of any human skeleton, or keypoints; or a folder of them."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
+    clips: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="FILE ...", help_behavior_hint="(required)")
+    ] = ()
+    """Motion files: clips of any human skeleton, or keypoints; or one folder, each file on its own."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
     Poise."""
@@ -82,9 +85,9 @@ class Options:
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
-    """One motion, or each of a folder with one policy, into a folder of its name."""
+    """One motion, several in a row, or each of a folder with one policy, into a folder of its name."""
     check(o := options)
-    if not o.clip.is_dir():
+    if not any(clip.is_dir() for clip in o.clips):
         return track_one(o)
     if o.save_policy is not None:
         raise PoiseError("--save-policy is for one motion", hint="Leave it out")
@@ -95,13 +98,20 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             tracker = open_run(o.policy).tracker
 
         def one(path: Path, name: str) -> Answer:
-            return track_one(replace(o, clip=path, out=o.out / name), tracker, o.out / name)
+            return track_one(replace(o, clips=(path,), out=o.out / name), tracker, o.out / name)
 
-        return each("track", (o.clip,), o.out, one)
+        return each("track", o.clips, o.out, one)
 
 
 def check(o: Options) -> None:
-    """Refuses numbers that make no sense, before anything is read or made."""
+    """Refuses what makes no sense, before anything is read or made."""
+    if not o.clips:
+        raise PoiseError("poise track needs a motion file", hint="See poise track --help")
+    several = len(o.clips) > 1
+    if several and (folder := next((c for c in o.clips if c.is_dir()), None)):
+        raise PoiseError("is a folder, and several clips are done in a row", folder, "Name its files")
+    if several and o.learn:
+        raise PoiseError("--learn is for a single clip", hint="Leave it out, or learn clip by clip")
     check_range("count", o.count, 1, 64)
     check_range("seed", o.seed, 0)
     check_range("learn", o.learn, 0, 100_000)
@@ -122,7 +132,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
 
     out, motion = places(o.out) if folder is None else (folder, None)
     goes_on = o.learn > 0 and (out / "learned" / RUN_FILE).exists()
-    may_deliver(out, motion, o.force or goes_on, o.clip)
+    may_deliver(out, motion, o.force or goes_on, *o.clips)
     if o.save_policy is not None:
         may_write(o.save_policy, o.force)
     if motion is not None and o.count > 1:
@@ -135,16 +145,17 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
 
     noise = noise_of(o.noise)
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
-    given = read(o.clip, o.reading)
-    if tracker is None:
-        with working("opening the policy"):
-            tracker = open_run(o.policy).tracker
     search = SamplingConfig(o.characters, rounds=o.rounds)
     config = TrackConfig(
         noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
         smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
         search=search, threads=o.threads,
     )  # fmt: skip
+    config.check(len(o.clips))
+    given = [read(clip, o.reading) for clip in o.clips]
+    if tracker is None:
+        with working("opening the policy"):
+            tracker = open_run(o.policy).tracker
     with claimed(out):
         # What is to be learned is the motion alone.
         plain = replace(config, recover=False, controller="policy") if o.learn else config
@@ -161,32 +172,38 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     print_card(done.card)
     said, lost = outcome(tracked, o.reset_on_fail), is_lost(tracked)
     say(said)
+    for part in tracked.parts:
+        say(part.sentence())
     if lost:
         say(advice(o, tracked))
     word = "came back" if tracked.losses else "found" if tracked.controller == "search" else "tracked"
-    word = "lost" if lost else word
+    survived = o.count == 1 and tracked.losses is None and tracked.card.survived
+    word = "lost" if lost else "not tracked" if survived else word
     failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
     result = {
         "outcome": word,
         "controller": tracked.controller,
         "sentence": said,
         "failures": failures,
+        "clips": [asdict(part) | {"done": part.done} for part in tracked.parts],
         "score": done.card.to_dict(),
     }
     saved = {"policy": o.save_policy} if o.save_policy else {}
     told = (*tracked.notes, *done.notes)
-    code = LOST if lost else 0
+    code = LOST if lost or survived else 0
     return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
 
 
 def is_lost(tracked: Tracked) -> bool:
-    """Whether the character failed and did not end on the motion."""
+    """Whether the character failed and did not end on the motion, or not on one of several."""
     losses = tracked.losses
+    if tracked.parts:
+        return not all(part.done for part in tracked.parts)
     return bool(tracked.failures) and (losses is None or len(losses.back) < len(losses.lost))
 
 
-def follow(tracker: Tracker, given: Clip | Keypoints, config: TrackConfig) -> Tracked:
-    """The motion as it is tracked, with a bar while it is looked ahead or searched."""
+def follow(tracker: Tracker, given: Sequence[Clip | Keypoints], config: TrackConfig) -> Tracked:
+    """The motions as they are tracked, with a bar while it is looked ahead or searched."""
     from poise.jobs.track import track
 
     with contextlib.ExitStack() as shown:
@@ -235,6 +252,9 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
 def advice(options: Options, tracked: Tracked) -> str:
     """What to do about a motion that was lost."""
     o = options
+    if tracked.parts:
+        again = "" if o.recover else "With --recover the character comes back to a clip that it lost. "
+        return f"{again}poise track CLIP does a single clip, and searches what is lost."
     learns = "with --learn 10 the policy first learns this motion, for 10 minutes at most."
     if o.learn:
         return f"The same command with more minutes goes on learning: --learn {2 * o.learn:g}."
@@ -246,10 +266,18 @@ def advice(options: Options, tracked: Tracked) -> str:
 
 
 def outcome(tracked: Tracked, reset: bool) -> str:
-    """Where the character failed, in one sentence."""
+    """Where the character failed, in a sentence, and what was missing."""
+    from poise.jobs.track.missing import shortfalls
+
     reference, times = tracked.imitation.reference, tracked.failed_s
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
     off = f"{tracked.card.mpjpe_global_mm:.0f} mm off on average"
+    if parts := tracked.parts:
+        done, waits = sum(p.done for p in parts), max(p.after or 0.0 for p in parts)
+        return (
+            f"{done} of {len(parts)} clips done one after another in {seconds:.1f} s, without help or "
+            f"reset, {off}; the longest way to the next took {waits:.1f} s."
+        )
     count, fell = len(reference.length), {k for k, _ in tracked.failures}
     if count > 1:
         first = f", the first lost at {tracked.failures[0][1]:.1f} s" if fell else ""
@@ -257,6 +285,9 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
     if tracked.losses is not None:
         return tracked.losses.sentence()
+    more = " ".join(("", *shortfalls(tracked.card)))
+    if not times and tracked.card.survived:
+        return f"Not tracked: within 0.5 m for all {seconds:.1f} s, {off}.{more}"
     if not times and tracked.controller == "search":
         return f"Found by a search to its end, {seconds:.1f} s, without help, {off}."
     if not times:
@@ -264,8 +295,8 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         return f"Tracked {by} to its end, {seconds:.1f} s, without help, {off}."
     if not reset:
         return (
-            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; "
-            "what follows is not tracking. --reset-on-fail puts it back and goes on."
+            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; what "
+            f"follows is not tracking.{more} --reset-on-fail puts it back and goes on."
         )
     named = ", ".join(f"{t:.1f}" for t in times[:NAMED]) + (", ..." if len(times) > NAMED else "")
     return (

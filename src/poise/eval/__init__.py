@@ -3,9 +3,11 @@
 from poise.eval.card import THRESHOLDS, Help, Row, ScoreCard, Threshold, read_score, table, write_score
 from poise.eval.clip_results import ClipJudge, ClipResults
 from poise.eval.episodes import (
+    Nothing,
     Observer,
     Recorder,
     Recording,
+    perturb,
     run_episodes,
     run_in_batches,
     simulate,
@@ -13,13 +15,15 @@ from poise.eval.episodes import (
 )
 from poise.eval.recovery import RecoveryCard, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
-from poise.eval.scorecard import clip_figures, score_rollouts
+from poise.eval.scorecard import TRACKING, clip_figures, score_rollouts
 
 __all__ = [
     "THRESHOLDS",
+    "TRACKING",
     "ClipJudge",
     "ClipResults",
     "Help",
+    "Nothing",
     "Observer",
     "Recorder",
     "Recording",
@@ -29,6 +33,7 @@ __all__ = [
     "ScoreCard",
     "Threshold",
     "clip_figures",
+    "perturb",
     "read_score",
     "recovery_card",
     "run_episodes",

@@ -38,8 +38,12 @@ class Help:
 class ScoreCard:
     """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.
 
-    NaN means "not measured" and becomes null. `variants` holds the tracking figures under each
-    weighting ("frame", "episode") and for successes alone ("succ_frame", "succ_episode").
+    NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
+    `kin.doctor.needs`. `variants` holds the tracking figures under each
+    weighting ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all
+    frames, those after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success
+    and tracking figures of action 0 from the same starts, `spread` their standard deviations over
+    `starts` perturbed starts; empty where that was not measured.
     """
 
     succ: float
@@ -63,11 +67,21 @@ class ScoreCard:
     episodes: int = 0
     frames: int = 0
     mpjpe_succ_mm: float = NAN
+    tracked: float = NAN
+    needs: tuple[Mapping[str, Any], ...] = ()
     reference: Mapping[str, float] = field(default_factory=dict)
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
     variants: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    nothing: Mapping[str, float] = field(default_factory=dict)
+    starts: int = 1
+    spread: Mapping[str, float] = field(default_factory=dict)
     delivered: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def survived(self) -> bool:
+        """Whether all episodes succeed by the rule, and yet not all are tracked."""
+        return self.succ == 1.0 and self.tracked < 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values with the keys in field order; what is not finite becomes None."""
@@ -153,6 +167,7 @@ class Threshold:
 THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
     {
         "succ": Threshold(0.95, 0.80, more=True),
+        "tracked": Threshold(0.95, 0.80, more=True),
         "mpjpe_mm": Threshold(40.0, 80.0),
         "mpjpe_global_mm": Threshold(60.0, 120.0),
         "vel_mm_per_frame": Threshold(10.0, 20.0),
@@ -193,12 +208,16 @@ _ROWS = (
 def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
     """Rows (label, value, unit, verdict) for the command line and the report, most important first.
 
-    Each plausibility row is followed by the reference's own figure, which gets no verdict.
+    Each row is followed by what stands beside it, without a verdict: the error over all frames, the
+    spread over perturbed starts, what doing nothing comes to, the reference's own figure.
     """
     t = THRESHOLDS
     rows: list[tuple[str, float, str, Verdict]] = [
-        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ))
+        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
+        *_beside(card, "succ", "Success", "%", 100.0),
     ]
+    if math.isfinite(card.tracked):
+        rows.append(Row("Tracked", 100.0 * card.tracked, "%", t["tracked"].verdict(card.tracked)))
     for key, label, unit in _ROWS:
         value = getattr(card, key)
         reference = card.reference.get(key, math.nan)
@@ -206,7 +225,10 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
             ratio = value / reference if reference > 0 else math.nan
             rows.append(Row(label, value, unit, t["jerk_ratio"].verdict(ratio)))
         else:
-            rows.append(Row(label, value, unit, t[key].verdict(value)))
+            rows += [
+                Row(label, value, unit, t[key].verdict(value)),
+                *_beside(card, key, label, unit),
+            ]
         if math.isfinite(reference):
             rows.append(Row(f"{label}, reference", reference, unit, ""))
     aid = card.help
@@ -220,3 +242,16 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
         Row("Reward per step", card.reward.get("total", math.nan), "", ""),
     ]
     return rows
+
+
+def _beside(card: ScoreCard, key: str, label: str, unit: str, times: float = 1.0) -> list[Row]:
+    """What stands beside a figure of tracking, as far as it was measured."""
+    uncut = card.variants.get(f"uncut_{card.weighting}", {}).get(key, math.nan)
+    # Without a failure all frames count anyway.
+    uncut = math.nan if card.succ == 1.0 else uncut
+    found = (
+        ("all frames", uncut),
+        (f"spread over {card.starts} starts", card.spread.get(key, math.nan)),
+        ("doing nothing", card.nothing.get(key, math.nan)),
+    )
+    return [Row(f"{label}, {w}", times * v, unit, "") for w, v in found if math.isfinite(v)]

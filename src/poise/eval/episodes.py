@@ -19,9 +19,26 @@ from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval.rolloutset import RolloutSet
 from poise.kin.solids import shapes_of
+from poise.sim import UnstableError
+from poise.spatial import quat_mul, rotvec_to_quat
 
 #: Frames of a part of rollouts: 110 MB of 20 bodies.
 PADDED = 100_000
+#: Seconds that an episode must last to count: shorter ones succeed by doing nothing.
+LEAST_S = 1.0
+#: rad, by which joint angles and the root's rotation of perturbed starts are off (one deviation).
+OFF_RAD = 1e-3
+
+
+class Nothing:
+    """A policy that does nothing: action 0, which any other must beat."""
+
+    def __init__(self, num_actions: int):
+        self.num_actions = num_actions
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Zeros `(N, A)` for observations `(N, O)`."""
+        return obs.new_zeros(len(obs), self.num_actions)
 
 
 class Observer(Protocol):
@@ -68,18 +85,21 @@ class Recording:
 
 
 def start_frames(reference: Reference, most_frames: int = 40_000) -> tuple[Tensor, Tensor]:
-    """(clip, frame) of every frame from which at least one step can be made.
+    """(clip, frame) of every frame from which an episode lasts `LEAST_S` or more.
 
-    Every start frame of every clip, thinned evenly only where simulating all of them to the end
-    would take more than `most_frames` control steps; frame 0 of every clip is always among them.
+    Every such frame of every clip, thinned evenly only where simulating all of them to the end would
+    take more than `most_frames` control steps; frame 0 of every clip is always among them.
     """
     cost = sum(int(n) * int(n) // 2 for n in reference.length)
     stride = max(1, round(cost / most_frames + 0.5)) if cost > most_frames else 1
     clips: list[Tensor] = []
     frames: list[Tensor] = []
     lengths = cast("list[int]", reference.length.tolist())
+    least = round(LEAST_S * reference.rate_hz)
     for c, n in enumerate(lengths):
         picks = torch.arange(0, n - 1, stride)
+        steps = frames_from(reference, torch.full_like(picks, c), picks) - 1
+        picks = picks[(steps >= least) | (picks == 0)]
         clips.append(torch.full_like(picks, c))
         frames.append(picks)
     return torch.cat(clips), torch.cat(frames)
@@ -92,6 +112,28 @@ def frames_from(reference: Reference, clip: Tensor, start: Tensor, cycles: int =
     return (reference.length.cpu()[clip] - 1) * rounds - start + 1
 
 
+def perturb(env: ImitationEnv, clip: Tensor, start: Tensor, trial: Tensor) -> Tensor:
+    """Turns all joints and the root of characters that stand on their starts by about `OFF_RAD`.
+
+    Args:
+        clip, start, trial: `(N,)` long; what a world draws depends on its own three numbers alone.
+
+    Returns:
+        observations `(N, O)`.
+    """
+    state = env.backend.state
+    turns = state.qvel.new_zeros(env.num_envs, state.qvel.shape[1] - 3)
+    numbers = cast("list[list[int]]", torch.stack((clip, start, trial), 1).tolist())
+    for i, own in enumerate(numbers):
+        drawn = np.random.default_rng(own).normal(scale=OFF_RAD, size=turns.shape[1])
+        turns[i] = torch.as_tensor(drawn)
+    qpos = state.qpos.clone()
+    qpos[:, 3:7] = quat_mul(qpos[:, 3:7], rotvec_to_quat(turns[:, :3]))
+    qpos[:, 7:] += turns[:, 3:]
+    env.backend.write(None, qpos, state.qvel.clone())
+    return env.observe()
+
+
 def run_episodes(
     make_env: Callable[[int], ImitationEnv],
     policy: Acts,
@@ -100,14 +142,20 @@ def run_episodes(
     limit: float = 0.0,
     cycles: int = 2,
     observers: Sequence[Observer] = (),
+    trial: Tensor | None = None,
 ) -> tuple[RolloutSet, list[Recording]]:
     """Every episode simulated to the end of its clip (cyclic clips: `cycles` rounds), failed or not.
+
+    Where the simulation of a single episode goes bad, because the motion throws the body about, the
+    episode ends and has failed.
 
     Args:
         make_env: gives an environment of N worlds without automatic reset, which is closed in the end.
         policy: acts on raw observations, deterministically.
         clip, start: `(E,)` clip index and first frame. limit: the help budget, N and N m.
         observers: watch beside the recorder.
+        trial: `(E,)` which of several perturbed starts each is, see `perturb`; None leaves characters
+            exactly on their starts.
 
     Returns:
         the padded rollouts (frame 0 is the start itself, before any action) and, for each clip's
@@ -119,8 +167,14 @@ def run_episodes(
     env = make_env(len(clip))
     try:
         obs = env.reset_to(clip, start)
-        recorder = Recorder(env, clip, start, cycles)
-        simulate(env, policy, obs, recorder.total - 1, recorder, *observers)
+        if trial is not None:
+            obs = perturb(env, clip, start, trial)
+        recorder = Recorder(env, clip, start, cycles, trial)
+        try:
+            simulate(env, policy, obs, recorder.total - 1, recorder, *observers)
+        except UnstableError:
+            if len(clip) > 1:
+                raise
     finally:
         env.close()
     return recorder.rollouts(limit), recorder.recordings()
@@ -134,6 +188,7 @@ def run_in_batches(
     start: Tensor,
     limit: float = 0.0,
     most: int = PADDED,
+    trial: Tensor | None = None,
 ) -> Iterator[RolloutSet]:
     """The rollouts of `run_episodes` in parts, each of episodes of like length.
 
@@ -143,6 +198,7 @@ def run_in_batches(
     Args:
         reference: the clips, as the environments have them.
         most: frames of a part, with the padding.
+        trial: see `run_episodes`.
     """
     length = frames_from(reference, clip, start)
     order = torch.arange(len(clip))
@@ -152,7 +208,8 @@ def run_in_batches(
         # Episodes are sorted, so that a part is as long as its last one.
         fits = (torch.arange(1, len(order) + 1) * length[order].cummax(0).values <= most).sum()
         rows, order = order[: max(1, int(fits))], order[max(1, int(fits)) :]
-        yield run_episodes(make_env, policy, clip[rows], start[rows], limit)[0]
+        own = None if trial is None else trial[rows]
+        yield run_episodes(make_env, policy, clip[rows], start[rows], limit, trial=own)[0]
 
 
 class Recorder:
@@ -161,10 +218,17 @@ class Recorder:
     total: T, the frames of the longest episode. tensors: by the names of `RolloutSet`.
     """
 
-    def __init__(self, env: ImitationEnv, clip: Tensor, start: Tensor, cycles: int = 2):
+    def __init__(
+        self,
+        env: ImitationEnv,
+        clip: Tensor,
+        start: Tensor,
+        cycles: int = 2,
+        trial: Tensor | None = None,
+    ):
         # The score card works on the CPU, wherever the worlds are.
         self.reference = ref = env.reference.to(torch.device("cpu"))
-        self.clip, self.start = clip, start
+        self.clip, self.start, self.trial = clip, start, trial
         self.lengths = frames_from(ref, clip, start, cycles)
         self.total = int(self.lengths.max())
         bodies = len(ref.humanoid.bodies)
@@ -213,11 +277,12 @@ class Recorder:
         """All episodes, padded. limit: the help budget that they had, N and N m."""
         ref, humanoid = self.reference, self.reference.humanoid
         kept: dict[str, Any] = self.tensors
+        lengths = self.lengths.clamp_max(len(self._qpos))
         return RolloutSet(
             **kept,
-            alive=torch.arange(self.total) < self.lengths[:, None],
-            lengths=self.lengths,
-            reached_end=torch.ones(len(self.clip), dtype=torch.bool),
+            alive=torch.arange(self.total) < lengths[:, None],
+            lengths=lengths,
+            reached_end=lengths == self.lengths,
             reward=self.reward,
             clip=self.clip,
             start=self.start,
@@ -225,10 +290,12 @@ class Recorder:
             fps=ref.rate_hz,
             mass=humanoid.mass,
             feet=humanoid.feet,
+            head=humanoid.head,
             shapes=shapes_of(humanoid.table, torch.float32),
             limit_n=limit,
             limit_nm=limit,
             ref_min_height=ref.min_height[self.clip],
+            trial=self.trial,
         )
 
     def recordings(self) -> list[Recording]:

@@ -28,10 +28,13 @@ class RolloutSet:
     reward: `(E, T)` per term, with "total" among them; empty when no reward was computed.
     clip, start: `(E,)` int, index of the clip and first frame in it. clip_names: one per index.
     fps: frames per second of all tensors. mass: kg.
-    feet: body indices of the feet. shapes: the character's geoms; None skips the contact figures.
+    feet: body indices of the feet. head: that of the head, None where none is told.
+    shapes: the character's geoms; None skips the contact figures.
     limit_n, limit_nm: the help budget per wrench, N and N m; `inf` where it is unlimited.
     ref_min_height: `(E,)` m, lowest root height of the whole reference (rule "rfc_height").
     rule_bodies: bodies the success rule looks at; None for all.
+    trial: `(E,)` int, which of several perturbed starts each episode is, see `episodes.perturb`; None
+        where starts are exact.
     """
 
     pos: Tensor
@@ -56,8 +59,10 @@ class RolloutSet:
     shapes: Shapes | None = None
     clip_names: tuple[str, ...] = ()
     root: int = 0
+    head: int | None = None
     ref_min_height: Tensor | None = None
     rule_bodies: tuple[int, ...] | None = None
+    trial: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.pos.ndim != 4 or self.pos.shape[-1] != 3 or 0 in self.pos.shape:
@@ -76,6 +81,8 @@ class RolloutSet:
         want |= dict.fromkeys(("force", "torque", "point_vel", "ang_vel"), (episodes, frames, helped, 3))
         if self.ref_min_height is not None:
             want["ref_min_height"] = (episodes,)
+        if self.trial is not None:
+            want["trial"] = (episodes,)
         for name, shape in want.items():
             _check_shape(name, getattr(self, name), shape)
         for name, values in self.reward.items():
@@ -115,12 +122,14 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
 class Judged(NamedTuple):
     """won `(E,)`: reached the end and broke the rule in no frame. mask `(E, T)`: the frames that count,
     up to and including the first that broke the rule, since what comes after is not tracking. failed_at
-    `(E,)`: the frame of failure, -1 for none; the last one where an episode was stopped early.
+    `(E,)`: the frame of failure, -1 for none; the last one where an episode was stopped early. uncut
+    `(E, T)`: all frames that were simulated, those after a failure among them.
     """
 
     won: Tensor
     mask: Tensor
     failed_at: Tensor
+    uncut: Tensor
 
 
 def judge(r: RolloutSet, rule: SuccessRule) -> Judged:
@@ -140,10 +149,11 @@ def judge(r: RolloutSet, rule: SuccessRule) -> Judged:
     last = torch.where(outcome.first_fail >= 0, outcome.first_fail, r.pos.shape[1])
     # A state that blew up is a failure, not a number to average.
     finite = r.pos.isfinite().flatten(2).all(2) & r.quat.isfinite().flatten(2).all(2)
-    mask = valid & finite & (frame <= last.unsqueeze(-1))
+    uncut = valid & finite
+    mask = uncut & (frame <= last.unsqueeze(-1))
     # An episode that was stopped without breaking the rule failed at its last valid frame.
     stopped = torch.where(outcome.first_fail >= 0, outcome.first_fail, valid.sum(1) - 1)
-    return Judged(won, mask, torch.where(won, -1, stopped))
+    return Judged(won, mask, torch.where(won, -1, stopped), uncut)
 
 
 @dataclass(frozen=True, eq=False)

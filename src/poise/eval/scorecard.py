@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.eval.card import NAN, Help, ScoreCard, Weighting
+from poise.eval.posture import Posture, posture
 from poise.eval.rolloutset import RolloutSet, Sums, judge
 from poise.metrics import (
     HelpAudit,
@@ -76,27 +78,33 @@ class _Part(NamedTuple):
     of_reference: dict[str, Sums]
     reward: dict[str, Sums]
     force: Sums
+    posture: Posture
+    uncut: dict[str, Sums]
     won: Tensor
     failed_at: Tensor
     clip: Tensor
     start: Tensor
     frames: Tensor
+    trial: Tensor
     # Force, torque, and the velocities where they act, `(n, M, 3)`.
     wrench: tuple[Tensor, ...]
 
 
 def _part(r: RolloutSet, chosen: SuccessRule) -> _Part:
-    won, mask, failed_at = judge(r, chosen)
+    won, mask, failed_at, uncut = judge(r, chosen)
     return _Part(
         _tracking(r, mask) | _plausibility(r.pos, r.quat, mask, r.fps, r.shapes, r.feet),
         _plausibility(r.ref_pos, r.ref_quat, mask, r.fps, r.shapes, r.feet),
         {n: Sums.of(v, mask) for n, v in r.reward.items()},
         Sums.of(r.force.norm(dim=-1).sum(-1), mask),
+        posture(r, won, mask),
+        _tracking(r, uncut),
         won,
         failed_at,
         r.clip,
         r.start,
         mask.sum(1),
+        torch.full_like(r.clip, -1) if r.trial is None else r.trial,
         tuple(x[mask] for x in (r.force, r.torque, r.point_vel, r.ang_vel)),
     )
 
@@ -111,6 +119,8 @@ def _joined(parts: Sequence[_Part]) -> _Part:
             return Sums.cat(values)
         if isinstance(one, dict):
             return {k: cat([v[k] for v in values]) for k in one}
+        if isinstance(one, Posture):
+            return Posture(*(cat(x) for x in zip(*values, strict=True)))
         if isinstance(one, tuple):
             return tuple(cat(x) for x in zip(*values, strict=True))
         return torch.cat(list(values))
@@ -130,14 +140,21 @@ def _per_clip(
     entries = []
     for index in sorted(set(p.clip.tolist())):
         rows = p.clip == index
-        lost = rows & (p.failed_at >= 0)
-        seconds = float((p.start[lost] + p.failed_at[lost]).min()) / fps if bool(lost.any()) else NAN
+
+        def first(at: Tensor, rows: Tensor = rows) -> float:
+            """Seconds into the clip of the earliest of the frames `at (E,)`, NaN for -1 in all."""
+            lost = rows & (at >= 0)
+            return float((p.start[lost] + at[lost]).min()) / fps if bool(lost.any()) else NAN
+
         entry: dict[str, Any] = {
             "clip": name(int(index)),
             "episodes": int(rows.sum()),
             "frames": int(p.frames[rows].sum()),
             "succ": float(p.won[rows].double().mean()),
-            "first_fail_s": seconds,
+            "first_fail_s": first(p.failed_at),
+            "tracked": float(p.posture.tracked[rows].mean()),
+            "fallen_s": first(p.posture.fallen_at),
+            "off_feet_s": first(p.posture.off_feet_at),
         }
         for key in (*TRACKING, *PLAUSIBILITY):
             entry[key] = p.figures[key].mean(rows, weighting) if key in p.figures else NAN
@@ -161,7 +178,8 @@ def score_rollouts(
 
     An episode succeeds when it reached its end and no frame broke `rule`. All figures are over the
     valid frames up to and including the first that broke the rule, failed episodes included: what
-    comes after a failure is not tracking. The reference is scored over the same frames.
+    comes after a failure is not tracking. The reference is scored over the same frames. Errors over all
+    frames are `variants`' "uncut".
 
     Args:
         rollouts: all at once, or parts of one evaluation, of which only one is kept at a time.
@@ -187,6 +205,8 @@ def score_rollouts(
         for prefix, rows in (("", everyone), ("succ_", p.won))
         for way in ("frame", "episode")
     }
+    for way in ("frame", "episode"):
+        variants[f"uncut_{way}"] = {name: p.uncut[name].mean(everyone, way) for name in TRACKING}
 
     def named(index: int) -> str:
         return names[index] if names else str(index)
@@ -197,6 +217,7 @@ def score_rollouts(
     indices = sorted(set(p.clip.tolist()))
     whole = ", ".join(named(int(i)) for i in indices) if len(indices) <= 3 else f"{len(indices)} clips"
     figures: dict[str, Any] = means(p.figures, (*TRACKING, *PLAUSIBILITY))
+    trials = [p.trial == k for k in sorted(set(p.trial.tolist()))]
     return ScoreCard(
         succ=float(p.won.double().mean()),
         succ_rule=chosen.name,
@@ -210,12 +231,22 @@ def score_rollouts(
         method=method,
         episodes=len(p.won),
         frames=int(p.frames.sum()),
+        tracked=float(p.posture.tracked.mean()),
         mpjpe_succ_mm=variants["succ_" + weighting]["mpjpe_mm"],
         reference=means(p.of_reference, PLAUSIBILITY),
         per_clip=_per_clip(p, named, fps, weighting),
         weighting=weighting,
         variants=variants,
+        starts=len(trials),
+        spread=_spread(p, trials, weighting) if len(trials) > 1 else {},
     )
+
+
+def _spread(p: _Part, trials: Sequence[Tensor], weighting: Weighting) -> dict[str, float]:
+    """Standard deviations over perturbed starts `trials`, each the rows `(E,)` of one."""
+    each = {n: [p.figures[n].mean(rows, weighting) for rows in trials] for n in TRACKING}
+    each["succ"] = [float(p.won[rows].double().mean()) for rows in trials]
+    return {n: statistics.stdev(values) for n, values in each.items()}
 
 
 def clip_figures(

@@ -119,10 +119,18 @@ class Run:
         return evaluate(self.task, *self.trained, rule, help_limit, most, device)
 
     def score(
-        self, rule: str = "phc", help_limit: float | None = None, device: str = "cpu"
+        self,
+        rule: str = "phc",
+        help_limit: float | None = None,
+        device: str = "cpu",
+        starts: int = 1,
     ) -> ScoreCard:
-        """The score card of `evaluate`, also of large libraries."""
-        return score(self.task, *self.trained, rule, help_limit, device)
+        """The score card of `evaluate`, also of large libraries, beside that of doing nothing.
+
+        Args:
+            starts: how many times every episode is begun, each perturbed, see `runs.score`.
+        """
+        return score(self.task, *self.trained, rule, help_limit, device, starts)
 
     @cached_property
     def card(self) -> ScoreCard:

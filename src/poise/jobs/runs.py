@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env import ImitationEnv
+from poise.env import Acts, ImitationEnv
 from poise.env.help import scale_in
 from poise.errors import PoiseError
 from poise.eval import (
+    TRACKING,
+    Nothing,
     Recording,
     RolloutSet,
     ScoreCard,
@@ -161,12 +164,34 @@ def score(
     rule: str = "phc",
     help_limit: float | None = None,
     device: str = "cpu",
+    starts: int = 1,
 ) -> ScoreCard:
-    """The score card of `evaluate`, without all frames of a large library in memory at once."""
+    """The score card of `evaluate`, without all frames of a large library in memory at once, beside that
+    of doing nothing.
+
+    Args:
+        starts: from 2 on every episode is begun so many times, each perturbed (`eval.perturb`), and the
+            figures are means over these, beside their spread.
+
+    Raises:
+        PoiseError: less than one start.
+    """
+    if starts < 1:
+        raise PoiseError(
+            f"an evaluation needs at least 1 start, got {starts}", hint="Give 8, for example"
+        )
     make, limit = _worlds(imitation, meta, help_limit, device)
-    starts = start_frames(imitation.reference)
-    parts = run_in_batches(make, _on(policy, device), imitation.reference, *starts, limit)
-    return scored(parts, imitation, meta, rule)
+    clip, frame = (x.repeat(starts) for x in start_frames(imitation.reference))
+    trial = torch.arange(starts).repeat_interleave(len(clip) // starts) if starts > 1 else None
+
+    def card(acts: Acts) -> ScoreCard:
+        parts = run_in_batches(make, acts, imitation.reference, clip, frame, limit, trial=trial)
+        return scored(parts, imitation, meta, rule)
+
+    extra = imitation.task.residual.dims if imitation.task.residual else 0
+    nothing = card(Nothing(len(imitation.humanoid.hinges) + extra))
+    null = {key: getattr(nothing, key) for key in ("succ", *TRACKING)}
+    return replace(card(_on(policy, device)), nothing=null)
 
 
 def _worlds(

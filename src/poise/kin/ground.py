@@ -13,7 +13,7 @@ from poise.kin.feet.contact import stance_heights
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, find_flights
 from poise.kin.series import find_runs, smooth_hull, smooth_lift
-from poise.kin.solids import heights, poses_of
+from poise.kin.solids import low_and_com, poses_of
 from poise.motion import Clip
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
@@ -72,7 +72,7 @@ class GroundFit:
 
 def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
     """The flights of a clip at its own frame rate."""
-    return find_flights(*heights(table, *poses_of(clip, table)), clip.fps)
+    return find_flights(*low_and_com(table, *poses_of(clip, table)), clip.fps)
 
 
 def fit_ground(
@@ -116,8 +116,8 @@ def fit_heights(
 
     See `fit_ground`, which does it.
     """
-    low, height = heights(table, pos, quat)
-    flights = find_flights(low, height, fps)
+    low, com = low_and_com(table, pos, quat)
+    flights = find_flights(low, com, fps)
     stance = stance_heights(table, pos, quat, fps)
     lift = -float(np.quantile(low, 0.1))
     if len(stance) >= 3:

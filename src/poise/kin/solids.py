@@ -32,10 +32,10 @@ def poses_of(clip: Clip, table: BodyTable) -> tuple[Tensor, Tensor]:
     return pos, quat
 
 
-def heights(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """`(T)` m, of the lowest point and of the centre of mass, from world body poses."""
+def low_and_com(table: BodyTable, pos: Tensor, quat: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest point's height `(T)` m and the centre of mass `(T, 3)` m, from world body poses."""
     low = lowest_height(table, pos, quat).min(-1).values.numpy()
-    return low, centre_of_mass(table, pos, quat)[:, 2].numpy()
+    return low, centre_of_mass(table, pos, quat).numpy()
 
 
 def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:

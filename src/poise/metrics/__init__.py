@@ -18,6 +18,7 @@ from poise.metrics.plausibility import (
     uhc_penetration,
     uhc_skate,
 )
+from poise.metrics.posture import LASTING_S, fallen, first_lasting, off_feet
 from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
 from poise.metrics.tracking import (
     RULES,
@@ -33,6 +34,7 @@ from poise.metrics.tracking import (
 
 __all__ = [
     "KINDS",
+    "LASTING_S",
     "RULES",
     "HelpAudit",
     "Shapes",
@@ -40,6 +42,8 @@ __all__ = [
     "acceleration_error",
     "ballistic",
     "centre_of_mass",
+    "fallen",
+    "first_lasting",
     "float_gaps",
     "floating",
     "foot_contacts",
@@ -57,6 +61,7 @@ __all__ = [
     "mpjpe_pa",
     "mpjpe_root",
     "npss",
+    "off_feet",
     "penetration",
     "physdiff_float",
     "physdiff_penetrate",

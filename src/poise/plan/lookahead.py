@@ -9,8 +9,9 @@ the policy plus an offset of its own, is simulated some steps ahead, and costs
 
     c = - sum_h gamma^h r_h - gamma^H V(o_H) + prices,
 
-with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`). What
-the best of them began with is done. Nothing is trained, nothing helps, and the goal is seen no farther
+with the imitation reward r, the critic's V, and prices of jerk and sliding feet (`plan.prices`); each
+control step in which the motion is lost costs more than all of that. What the best of them began with
+is done. Nothing is trained, nothing helps, and the goal is seen no farther
 than it tells: a clip its frames, a stream or a generator what it knows.
 """
 
@@ -36,6 +37,10 @@ from poise.plan.sampling import draw_offsets
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4
+#: Budget from which on the horizon is longer, and the longer one in control steps.
+FAR = (400.0, 16)
+#: Share of the slack that is always left; what each control step costs in which a copy is lost.
+LEAST, LOSS = 0.05, 100.0
 #: Frames before a prediction that its jerk needs.
 PAST = 3
 
@@ -54,9 +59,14 @@ class LookaheadConfig:
         warm: share of the copies with offsets about those that the last decision had planned to go on
             with; the others have theirs about none.
         smoothing: shares of the last action that actions keep; the copies take them in turns.
+        corrections: shares of the policy's own action that the copies add their offsets to; they take
+            them in turns, too. Less of it is less jerk, where the policy corrects more than it must.
         jerk_price: cost of a control step as jerky as the goal, see `Roughness.price`.
         slide_price: cost of 1 m/s with which soles slide more than the goal's, in a control step.
-        slack: how much more than the best one a copy may cost in tracking alone, and still be chosen.
+        slack: how much more than the best one a copy may cost in tracking alone, and still be chosen,
+            where the character is on its goal.
+        strict_m: mean distance (m) from the goal at which there is next to no slack left, so that
+            tracking alone decides; between them it falls evenly.
         discount: gamma.
         seed: seed of all draws.
     """
@@ -67,9 +77,11 @@ class LookaheadConfig:
     noise_range: tuple[float, float] = (0.03, 0.3)
     warm: float = 0.5
     smoothing: tuple[float, ...] = (0.0, 0.5, 0.7, 0.9, 0.97)
+    corrections: tuple[float, ...] = (1.0, 0.7, 0.4, 0.1)
     jerk_price: float = 0.5
     slide_price: float = 12.0
     slack: float = 1.5
+    strict_m: float = 0.25
     discount: float = 0.97
     seed: int = 0
 
@@ -89,8 +101,12 @@ class LookaheadConfig:
         if not self.smoothing or not all(0 <= s < 1 for s in self.smoothing):
             what = f"shares of smoothing must lie in 0 to below 1, got {self.smoothing}"
             raise PoiseError(what, "LookaheadConfig")
-        if min(self.jerk_price, self.slide_price, self.slack) < 0:
-            raise PoiseError("prices and slack must be at least 0", "LookaheadConfig")
+        if self.corrections[:1] != (1.0,) or not all(0 <= c <= 1 for c in self.corrections):
+            what = f"corrections must begin with 1 and lie in 0 to 1, got {self.corrections}"
+            raise PoiseError(what, "LookaheadConfig")
+        if min(self.jerk_price, self.slide_price, self.slack) < 0 or self.strict_m <= 0:
+            what = "prices and slack must be at least 0, strict_m above"
+            raise PoiseError(what, "LookaheadConfig")
 
     @property
     def budget(self) -> float:
@@ -99,12 +115,13 @@ class LookaheadConfig:
 
     def with_budget(self, steps: float) -> LookaheadConfig:
         """The same with as many candidates as so many simulated control steps for each that is made
-        allow.
+        allow; from `FAR` on they look farther ahead, which is worth more then than further candidates.
 
         Raises:
             PoiseError: too few.
         """
-        return replace(self, candidates=int(steps * self.hold_steps / self.horizon))
+        horizon = max(self.horizon, FAR[1]) if steps >= FAR[0] else self.horizon
+        return replace(self, candidates=int(steps * self.hold_steps / horizon), horizon=horizon)
 
 
 class _Choice(NamedTuple):
@@ -113,10 +130,12 @@ class _Choice(NamedTuple):
     Attributes:
         offsets: `(H, A)` rad, by control step from now on.
         smoothing: share of the last action that actions keep.
+        correction: share of the policy's own action.
     """
 
     offsets: Tensor
     smoothing: float
+    correction: float
 
 
 @dataclass(eq=False)
@@ -164,7 +183,10 @@ class Lookahead:
         humanoid = copies.goal.humanoid
         self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
         shares = torch.tensor(c.smoothing)
-        self._keep = shares[torch.arange(c.candidates) % len(shares)].unsqueeze(1)
+        turn = torch.arange(c.candidates)
+        self._keep = shares[turn % len(shares)].unsqueeze(1)
+        much = torch.tensor(c.corrections)
+        self._much = much[turn // len(shares) % len(much)].unsqueeze(1)
         # Held, then fading to nothing at the horizon.
         left = torch.arange(1, c.horizon + 1) - c.hold_steps
         self._shape = 1.0 - left.clamp_min(0) / max(1, c.horizon - c.hold_steps)
@@ -200,7 +222,8 @@ class Lookahead:
         if env is None:
             raise PoiseError("a lookahead acts in an environment", hint="Call watch(env) first")
         pos, fresh = env.pose().pos, (env.age == 0).tolist()
-        offsets, keep = torch.zeros(len(obs), env.num_actions), torch.zeros(len(obs), 1)
+        offsets = torch.zeros(len(obs), env.num_actions)
+        keep, much = torch.zeros(len(obs), 1), torch.ones(len(obs), 1)
         for i, world in enumerate(self._worlds):
             if fresh[i]:
                 world.choice, world.past = None, []
@@ -208,9 +231,10 @@ class Lookahead:
                 world.choice, world.step = self._decide(i, world), 0
             offsets[i] = world.choice.offsets[world.step]
             keep[i] = 0.0 if fresh[i] else world.choice.smoothing
+            much[i] = world.choice.correction
             world.step += 1
             world.past = [*world.past, pos[i].clone()][-PAST:]
-        return torch.lerp(self.policy.act(obs) + offsets, env.action, keep)
+        return torch.lerp(much * self.policy.act(obs) + offsets, env.action, keep)
 
     def _decide(self, i: int, world: _World) -> _Choice:
         """What world i does next."""
@@ -218,11 +242,13 @@ class Lookahead:
         begun, c = time.perf_counter(), self.config
         drawn = self._drawn(world.choice)
         cost, price = self._simulate(self._env.snapshot(torch.tensor([i])), drawn, world.past)
-        allowed = cost.isfinite() & (cost <= cost.min() + c.slack)
-        # Where all lose the motion the policy acts alone.
+        off = self._env.pose().pos[i] - self._env.goal_pose().pos[i]
+        left = 1.0 - float(off.norm(dim=-1).mean()) / c.strict_m
+        allowed = cost.isfinite() & (cost <= cost.min() + c.slack * max(LEAST, left))
+        # Where all went bad the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
         self.seconds.append(time.perf_counter() - begun)
-        return _Choice(drawn[best], float(self._keep[best]))
+        return _Choice(drawn[best], float(self._keep[best]), float(self._much[best]))
 
     def _drawn(self, last: _Choice | None) -> Tensor:
         """`(K, H, A)` offsets: none, those planned before, and random ones about either."""
@@ -249,9 +275,9 @@ class Lookahead:
         keep, factor = self._keep if past else torch.zeros_like(self._keep), 1.0
         for h in range(c.horizon):
             # The last frame of a clip is a goal that is reached.
-            if bool((env.goal.layout.place(env.goal.now()).end > 0).all()):
+            if bool((env.goal.layout.place(env.goal.now()).end > 0).any()):
                 break
-            action = torch.lerp(self.policy.act(obs) + offsets[:, h], env.action, keep)
+            action = torch.lerp(self._much * self.policy.act(obs) + offsets[:, h], env.action, keep)
             keep = self._keep
             obs = env.step(action).final_obs
             pose = env.pose()
@@ -262,7 +288,7 @@ class Lookahead:
             ref_quat.append(aim.quat[:1].clone())
             off = mpjpe_global(pose.pos, aim.pos) / 1000.0
             lost |= ~(off <= LOST)
-            cost, factor = cost - factor * env.imitation, factor * c.discount
+            cost, factor = cost - factor * env.imitation + LOSS * lost, factor * c.discount
         cost = cost - factor * self.value(obs)
         self.steps += c.candidates * (len(pos) - 1)
         rough, source = (
@@ -273,5 +299,4 @@ class Lookahead:
             for p, q, was in ((pos, quat, past), (ref_pos, ref_quat, []))
         )  # fmt: skip
         price = rough.price(source, c.jerk_price, c.slide_price)
-        whole = ~lost & cost.isfinite() & price.isfinite()
-        return torch.where(whole, cost, torch.inf), price
+        return torch.where(cost.isfinite() & price.isfinite(), cost, torch.inf), price

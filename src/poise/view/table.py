@@ -35,7 +35,7 @@ _RUN: tuple[tuple[str, str, str, str], ...] = (
 NONE = "\u2013"
 """Stands where nothing was measured."""
 
-_SPECIAL = {"succ", "succ_rule", "reward", "help", "reference"}
+_SPECIAL = {"succ", "tracked", "succ_rule", "reward", "help", "reference"}
 
 
 def amount(value: Any, unit: str = "") -> str:
@@ -78,7 +78,9 @@ def score_rows(score: dict[str, Any]) -> list[Row]:
     before: dict[str, Any] = raw if isinstance(raw, dict) else {}
     share = number(score.get("succ"))
     rule = str(score.get("succ_rule") or "share of starts that reach the end")
-    rows = [Row("Whole clip tracked", NONE if share is None else percent(share), "", rule)]
+    rows = [Row("Success", NONE if share is None else percent(share), "", rule)]
+    if (whole := number(score.get("tracked"))) is not None:
+        rows.append(Row("Tracked", percent(whole), "", "success, upright and on its feet"))
     for key, name, unit, meaning in _ROWS:
         mark = _mark(number(score.get(key)), number(before.get(key)))
         beside = amount(before[key], unit) if key in before else ""

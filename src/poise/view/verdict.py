@@ -71,13 +71,16 @@ THRESHOLDS: dict[str, tuple[float, float]] = {
 
 
 def tracking(score: dict[str, Any]) -> Grade:
-    """How often the whole clip is tracked to its end."""
-    succ = number(score.get("succ"))
+    """How often the whole clip is tracked to its end, upright and on its feet where measured."""
+    succ, tracked = number(score.get("succ")), number(score.get("tracked"))
+    detail = str(score.get("succ_rule") or "")
+    if succ is not None and tracked is not None and tracked < succ:
+        detail = f"{percent(succ)} by {detail}, but down or off its feet"
+        succ = tracked
     rule = _rule("succ", "%", 100, "from")
     if succ is None:
         return Grade("Tracks the whole clip", "not measured", "unknown", rule)
     word = "yes" if succ >= 1 - 1e-9 else "almost" if succ >= 0.95 else "no"
-    detail = str(score.get("succ_rule") or "")
     return Grade(
         "Tracks the whole clip", f"{word} ({percent(succ)})", _level(succ, "succ", True), rule, detail
     )

@@ -13,7 +13,8 @@ from torch import Tensor
 from poise.env import Reference
 from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
 from poise.env.recovery.get_up import LIFT, GetUpPlanner
-from poise.env.recovery.planner import plan_recovery, recovery_motions
+from poise.env.recovery.planner import plan_recovery, recovery_motions, walk_of
+from poise.env.recovery.run_up import SPEEDS_UP, run_up
 from poise.kin import Kinematics
 from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual, build
@@ -69,6 +70,48 @@ def test_a_walk_leads_from_anywhere_to_a_place(built: Built, bearing: float) -> 
     # No motion runs, and all stand for a second at the end.
     pace = (way[1:, :2] - way[:-1, :2]).norm(dim=-1) * reference.rate_hz
     assert pace.max() < 1.5 and pace[-20:].max() < 1e-6
+
+
+@pytest.mark.parametrize(("speed", "way"), [(1.4, 1), (2.5, 1), (1.0, -1)])
+def test_a_run_up_leads_from_standing_into_a_motion(built: Built, speed: float, way: int) -> None:
+    reference, get_up = built
+    ease, faces = get_up.recovery_clips.ease, walk_of(get_up, 0)[2]
+    place = facing(ease, 0.7)
+    place[:2], direction = torch.tensor([3.0, -2.0]), 0.7 - faces + (math.pi if way < 0 else 0.0)
+    velocity = torch.zeros(6 + len(ease) - 7, dtype=torch.float64)
+    velocity[0], velocity[1] = speed * math.cos(direction), speed * math.sin(direction)
+    frames = run_up(get_up, place, velocity)
+    assert torch.allclose(frames[-1], place)
+    step = (frames[1:, :2] - frames[:-1, :2]).norm(dim=-1) * reference.rate_hz
+    # It begins at rest, at ease, speeds up evenly, and arrives as fast as the motion is.
+    assert step[0] < 0.15 and turned_by(frames[0], place) < 0.15
+    assert float(step[-1]) == pytest.approx(speed, abs=SPEEDS_UP / reference.rate_hz)
+    assert (step[1:] - step[:-1]).abs().max() * reference.rate_hz < 2 * SPEEDS_UP
+    gone = place[:2] - frames[0, :2]
+    assert float(gone.norm()) == pytest.approx(speed**2 / (2 * SPEEDS_UP), rel=0.1)
+    assert float(gone @ velocity[:2]) > 0
+    # What stands, and what goes sideways, has none.
+    assert torch.equal(run_up(get_up, place, 0.1 * velocity), place[None])
+    aside = velocity.clone()
+    aside[0], aside[1] = -velocity[1], velocity[0]
+    assert torch.equal(run_up(get_up, place, aside), place[None])
+
+
+def test_what_walks_already_walks_on(built: Built) -> None:
+    reference, get_up = built
+    cycle, speed, _ = walk_of(get_up, 0)
+    start, place = cycle[7].clone(), facing(get_up.recovery_clips.ease, 0.0)
+    place[0], place[1] = 2.0, 1.0
+    moves = torch.tensor([speed, 0.0], dtype=torch.float64)
+    way = plan_recovery(get_up, start, place, moves=moves)
+    steps = (way[1:, 0] - way[:-1, 0]) * reference.rate_hz
+    assert steps[:10].min() > 0.5 * speed and way[-1, :2].sub(place[:2]).norm() < 0.1
+    stops = plan_recovery(get_up, start, place)
+    assert abs(float(stops[1, 0] - stops[0, 0])) * reference.rate_hz < 0.2 * speed
+    # Behind a place that is at hand it first comes to rest.
+    place[0], place[1] = float(start[0]) + 0.1, float(start[1])
+    way = plan_recovery(get_up, start, place, moves=moves)
+    assert way[:, 0].max() > place[0] + 0.1 and way[-1, :2].sub(place[:2]).norm() < 0.1
 
 
 def test_what_is_near_and_behind_is_come_to_backwards(built: Built) -> None:

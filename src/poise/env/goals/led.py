@@ -1,4 +1,5 @@
-"""A goal that leads back: an episode that has lost its clip follows a recovery motion to it.
+"""A goal that leads back: an episode that has lost its clip follows a recovery motion to it, and one
+that has done its clip follows one to the start of the next.
 
 PHC tells a fallen or far character nothing but a point to come back to (`env.recovery.config`). A
 recovery motion says how: it is planned (`env.recovery.planner`) from clips that get up and clips that
@@ -18,13 +19,18 @@ from poise.env.goals.goal import Goal
 from poise.env.plugins import Start
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.get_up import GetUpPlanner, Poses
-from poise.env.recovery.planner import plan_recovery
+from poise.env.recovery.planner import DOWN, STAY_S, plan_recovery
+from poise.env.recovery.run_up import run_up
 from poise.env.reference import Reference
 
 #: m between bodies and their reference, on average, beyond which it is lost; the field's failure.
 LOST = 0.5
 #: m/s of the bodies on average, below which a character has come to rest; s for which that is waited.
 REST, WAITS_S = 0.5, 1.5
+#: m between bodies and the first frame of the next clip, on average, with which that goes on at once.
+AT_HAND = 0.15
+#: s that is stood at ease before a motion is entered.
+CALM_S = 0.3
 #: Where a motion is entered again: m for each m/s of its bodies, and for each s of it that is left out.
 MOVES, SKIPS = 0.3, 0.05
 #: What a world does.
@@ -41,6 +47,11 @@ class LedGoal(Goal):
     Args:
         goal: the clips.
         recovery_clips: of the library that the policy has learned.
+        chained: worlds do all clips from theirs on, in order: a recovery motion leads from the end of
+            each to the first frame of the next, wherever that stands, unless the character is there.
+        returns: whether a clip that is lost is come back to; without, it goes on to its end.
+        plans: whether recovery motions are planned here; a copy of such a world, in which a controller
+            tries something for some steps, does without.
 
     Attributes:
         doing: `(N,)`, `TRACKS`, `FALLS` or `RETURNS`.
@@ -48,8 +59,16 @@ class LedGoal(Goal):
         lost: (world, frame of its clip) of every time one was lost.
     """
 
-    def __init__(self, goal: ClipGoal, recovery_clips: RecoveryClips):
+    def __init__(
+        self,
+        goal: ClipGoal,
+        recovery_clips: RecoveryClips,
+        chained: bool = False,
+        returns: bool = True,
+        plans: bool = True,
+    ):
         self.goal, self.reference = goal, goal.reference
+        self.chained, self.returns, self.plans = chained, returns, plans
         self.humanoid, self.bodies, self.rate_hz = goal.humanoid, goal.bodies, goal.rate_hz
         self.layout, self.num_envs, self.device = goal.layout, goal.num_envs, goal.device
         self.rng, self.notes, self.begins = goal.rng, goal.notes, goal.begins
@@ -141,29 +160,46 @@ class LedGoal(Goal):
         return now, self.ahead(1)
 
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
-        """Notes worlds that have lost their goals, and leads those that have come to rest back."""
+        """Notes worlds that have lost their goals, and leads those that have come to rest back and those
+        that have done their clips on."""
         tracks, falls, returns = (self.doing == k for k in (TRACKS, FALLS, RETURNS))
         self.frame[tracks] = self.at[tracks]
         ref = self.layout.unpacked(self.now()).pos
-        lost = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST) & ~falls
+        off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
+        lost = off & (returns | (tracks & self.returns))
         self.lost += [(i, int(self.frame[i])) for i in (lost & tracks).nonzero().squeeze(-1).tolist()]
-        self.doing[lost], self._since[lost] = FALLS, 0
         ends = torch.where(self._on, self._length, self.reference.length[self.goal.clip]) - 1
         back = returns & ~lost & (self.at >= ends)
         self.doing[back], self._on[back], self.at[back] = TRACKS, False, self.frame[back]
+        more = self.goal.clip < len(self.reference.length) - 1
+        over = tracks & ~lost & (self.at >= ends) & more & (self.chained and self.plans)
+        self.goal.clip[over] += 1
+        self.frame[over] = self.at[over] = 0
+        there = (pos - self.layout.unpacked(self.now()).pos).norm(dim=-1).mean(-1) <= AT_HAND
+        rests = over & ~off & ~there
+        lost |= over & off & ~there
+        self.doing[lost], self._since[lost] = FALLS, 0
         self._since += 1
         late = self._since > WAITS_S * self.rate_hz
-        rests = falls & ((linvel.norm(dim=-1).mean(-1) < REST) | late)
+        rests |= falls & ((linvel.norm(dim=-1).mean(-1) < REST) | late) & self.plans
+        # What has not fallen needs no rest.
+        rests |= (
+            lost & returns & (qpos[:, 2] > DOWN * float(self.get_up.recovery_clips.ease[2])) & self.plans
+        )
         if bool(rests.any()):
-            self.lead(rests.nonzero().squeeze(-1), qpos)
+            self.lead(rests.nonzero().squeeze(-1), qpos, linvel[:, 0])
         self.goal.frame.copy_(self.frame)
-        return bool((rests | back | falls).any())
+        return bool((rests | back | falls | over).any())
 
-    def lead(self, worlds: Tensor, qpos: Tensor) -> None:
-        """Recovery motions for worlds `(n,)` from where they are, `qpos (N, 7 + n)` of all."""
+    def lead(self, worlds: Tensor, qpos: Tensor, linvel: Tensor | None = None) -> None:
+        """Recovery motions for worlds `(n,)` from where they are, `qpos (N, 7 + n)` of all.
+
+        linvel: m/s `(N, 3)`, how the roots move; by default they rest.
+        """
         self._tidy()
         for i in worlds.tolist():
-            motion = self._motion(i, qpos[i].double().cpu())
+            moves = None if linvel is None else linvel[i, :2].double().cpu()
+            motion = self._motion(i, qpos[i].double().cpu(), moves)
             rows = torch.arange(motion.frames, device=self.device)
             self._first[i], self._length[i] = len(self._packed), motion.frames
             self._packed = torch.cat((self._packed, motion.packed(rows)))
@@ -182,19 +218,23 @@ class LedGoal(Goal):
         self._packed, self._qpos = self._packed[rows], self._qpos[rows]
         self._first[on] = self._length[on].cumsum(0) - self._length[on]
 
-    def _motion(self, world: int, qpos: Tensor) -> Reference:
-        """From `qpos (7 + n)` to where the world's clip is entered again."""
+    def _motion(self, world: int, qpos: Tensor, moves: Tensor | None) -> Reference:
+        """From `qpos (7 + n)` that moves with `moves (2)` m/s to where the world's clip is entered."""
         own, one = self.reference, slice(world, world + 1)
         self.frame[world] = self._entry(int(self.goal.clip[world]), int(self.frame[world]))
-        place = own.coordinates(self.goal.clip[one], self.frame[one])[0][0].cpu()
-        way = plan_recovery(self.get_up, qpos, place)
-        way = torch.cat((way[:-1], self.get_up.blend(way[-1], place)))
+        place, velocity = own.coordinates(self.goal.clip[one], self.frame[one])
+        into = run_up(self.get_up, place[0].cpu(), velocity[0].cpu())
+        way = plan_recovery(self.get_up, qpos, into[0], moves=moves)
+        way = way[: len(way) - round((STAY_S - CALM_S) * self.rate_hz)]
+        way = torch.cat((way[:-1], self.get_up.blend(way[-1], into[0]), into[1:]))
         found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"recovery {world}"])
         return found.to(self.device)
 
     def _entry(self, clip: int, frame: int) -> int:
         """A frame of a clip, `frame` or a later one, from which it is easily gone on."""
         own = self.reference
+        if self.chained and not frame:
+            return 0
         rows = slice(int(own.start[clip]) + frame, int(own.start[clip] + own.length[clip]))
         if rows.stop - rows.start < 2:
             return frame

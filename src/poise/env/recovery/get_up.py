@@ -58,18 +58,25 @@ class GetUpPlanner:
         """`(T, 7 + n)` from one pose to another, the longer the farther they are apart."""
         return self.out_of(a, b.expand(self._between(a, b), -1))
 
-    def out_of(self, pose: Tensor, frames: Tensor) -> Tensor:
-        """Frames of which the first ones come out of a pose, more of them the farther it is apart."""
+    def out_of(self, pose: Tensor, frames: Tensor, moves: Tensor | None = None) -> Tensor:
+        """Frames of which the first ones come out of a pose, more of them the farther it is apart.
+
+        moves: m/s `(2)` with which the pose goes on meanwhile.
+        """
         count = self._between(pose, frames[0])
         if count == 1:
             return frames
         first = frames[:count]
-        share = smooth(torch.arange(len(first), dtype=torch.float64) / (count - 1))
-        return torch.cat((mixed(pose.expand(len(first), -1), first, share), frames[count:]))
+        step = torch.arange(len(first), dtype=torch.float64)
+        left = pose.repeat(len(first), 1)
+        if moves is not None:
+            left[:, :2] += moves * step[:, None] / self.rate_hz
+        return torch.cat((mixed(left, first, smooth(step / (count - 1))), frames[count:]))
 
     def _between(self, a: Tensor, b: Tensor) -> int:
         """Frames from one pose to another; 1 where they are the same."""
         gap = float(Poses(self.table, a[None]).apart(Poses(self.table, b[None])))
+        gap = max(gap, float((b[:2] - a[:2]).norm()))
         return round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)) + 1 if gap > SAME else 1
 
     def _lifted(self, frames: Tensor) -> Tensor:

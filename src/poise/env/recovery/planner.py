@@ -10,6 +10,8 @@ Before a walk to a place farther than `NEAR` the character stands at ease, too.
 It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
 track such motions (`jobs.perpetual.demonstrations`) finds what physics allows.
 
+A body that moves at the start walks on.
+
 Turning follows a unicycle: the heading turns toward the place at no more than `TURN` rad/s, and the
 walk's stride shortens by the cosine of what is left to turn. To a place that is near and behind, the
 walk is played from its end to its start.
@@ -23,8 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.recovery.clips import RecoveryClips
-from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
+from poise.env.recovery.get_up import GetUpPlanner, Poses, mixed, smooth
 from poise.spatial import quat_mul
 from poise.spatial.directions import facing, heading_angle, yaw_quat
 
@@ -41,10 +42,20 @@ NEAR, BEHIND = 1.2, -0.6
 STAY_S = 1.0
 #: Steps after which a walk gives up.
 LONGEST = 600
+#: m/s above which a body moves; cosine between that and how it faces, from which it is a walk.
+MOVING, AHEAD = 0.5, 0.5
+#: Times the walk's own speed, with which it begins at most; what it loses of that in a step; m/s^2 to
+#: the side that it turns with meanwhile.
+FASTEST, CALMER, CURVES = 2.0, 0.04, 1.0
 
 
 def plan_recovery(
-    get_up: GetUpPlanner, start: Tensor, place: Tensor, which: int = 0, phase: float = 0.0
+    get_up: GetUpPlanner,
+    start: Tensor,
+    place: Tensor,
+    which: int = 0,
+    phase: float = 0.0,
+    moves: Tensor | None = None,
 ) -> Tensor:
     """The frames `(T, 7 + n)` from `start (7 + n)` to standing at ease at `place (7 + n)`.
 
@@ -52,17 +63,49 @@ def plan_recovery(
         get_up: how this library gets up, and its other recovery clips.
         which: of the walks.
         phase: 0 to 1, where in its cycle the walk begins.
+        moves: m/s `(2)`, how the body moves at the start; it walks on if that is how it faces.
     """
     recovery_clips, body = get_up.recovery_clips, start[None]
     if float(start[2]) < DOWN * float(recovery_clips.ease[2]):
-        body = get_up.up(start)
+        body, moves = get_up.up(start), None
     stand = facing(recovery_clips.ease, heading_angle(body[-1, 3:7]))
     stand[:2] = body[-1, :2]
-    walk = _walk(recovery_clips, stand, place, get_up.rate_hz, which, phase)
+    pace = 0.0 if moves is None else _pace(get_up, body[-1], moves, which)
+    if pace and moves is not None:
+        phase, direction = nearest_phase(get_up, body[-1], which), math.atan2(*moves.flip(0).tolist())
+        stand = facing(stand, direction + walk_of(get_up, which)[2])
+        stand[:2] = body[-1, :2]
+        walk = _walk(get_up, stand, place, which, phase, pace)
+        return get_up.out_of(body[-1], walk, moves)
+    walk = _walk(get_up, stand, place, which, phase)
     if float((place[:2] - stand[:2]).norm()) > NEAR:
         # Stand first before a long walk: characters that set off while getting up fall more often.
         return torch.cat((body[:-1], get_up.blend(body[-1], stand)[:-1], walk))
     return torch.cat((body[:-1], get_up.out_of(body[-1], walk)))
+
+
+def walk_of(get_up: GetUpPlanner, which: int) -> tuple[Tensor, float, float]:
+    """A walk's closed cycle along +X, its speed in m/s, and how its frames are turned off that, rad."""
+    walks = get_up.recovery_clips.walks
+    cycle = walks[which % len(walks)]
+    speed = float(cycle[-1, 0]) * get_up.rate_hz / (len(cycle) - 1)
+    return cycle, speed, heading_angle(cycle[:-1, 3:7])
+
+
+def nearest_phase(get_up: GetUpPlanner, pose: Tensor, which: int) -> float:
+    """0 to 1, where in a walk's cycle the body is most as in `pose (7 + n)`."""
+    cycle = walk_of(get_up, which)[0]
+    apart = Poses(get_up.table, pose[None]).apart(Poses(get_up.table, cycle[:-1]))[0]
+    return int(apart.argmin()) / (len(cycle) - 1)
+
+
+def _pace(get_up: GetUpPlanner, pose: Tensor, moves: Tensor, which: int) -> float:
+    """Share of a walk's speed at which a body that moves with `moves (2)` m/s walks already."""
+    _, speed, faces = walk_of(get_up, which)
+    heading = heading_angle(pose[3:7]) - faces
+    ahead = float(moves[0]) * math.cos(heading) + float(moves[1]) * math.sin(heading)
+    walks = ahead > max(MOVING, AHEAD * float(moves.norm()))
+    return min(FASTEST, ahead / speed) if walks else 0.0
 
 
 def recovery_motions(
@@ -92,30 +135,32 @@ def recovery_motions(
 
 
 def _walk(
-    recovery_clips: RecoveryClips, start: Tensor, place: Tensor, rate_hz: float, which: int, phase: float
+    get_up: GetUpPlanner, start: Tensor, place: Tensor, which: int, phase: float, pace: float = 0.0
 ) -> Tensor:
-    """From standing at `start` to standing at `place`, by one of the walks."""
-    cycle = recovery_clips.walks[which % len(recovery_clips.walks)]
-    walk, count = cycle.numpy(), len(cycle) - 1
-    length = float(walk[-1, 0])
-    speed, faces = length * rate_hz / count, heading_angle(cycle[:-1, 3:7])
+    """From standing, or walking at a `pace`, at `start` to standing at `place`, by one of the walks."""
+    cycle, speed, faces = walk_of(get_up, which)
+    walk, count, rate_hz = cycle.numpy(), len(cycle) - 1, get_up.rate_hz
     at, goal, psi, aim = start[:2].numpy().copy(), place[:2].numpy(), heading_angle(start[3:7]), 0.0
-    to, here, pace, stayed, k = phase * count, False, 0.0, 0, 0
+    to, here, stayed, k, rest = phase * count, False, 0, 0, pace
     left = goal - at
     ahead = math.atan2(left[1], left[0]) - (psi - faces)
     # To what is near and behind it is walked backwards.
-    way = -1 if math.hypot(*left) < NEAR and math.cos(ahead) < BEHIND else 1
+    way = -1 if not pace and math.hypot(*left) < NEAR and math.cos(ahead) < BEHIND else 1
     path, seen = [], []
     while stayed < STAY_S * rate_hz and k < LONGEST:
         left = goal - at
         apart = math.hypot(*left)
-        here = here or apart < HERE
+        here = here or (apart < HERE and not rest)
         toward = math.atan2(way * left[1], way * left[0])
         want = heading_angle(place[3:7]) if here else toward + faces
         error = math.remainder(want - psi, 2 * math.pi)
-        turn = max(-TURN, min(TURN, 4 * error))
+        most = min(TURN, CURVES / (rest * speed)) if rest else TURN
+        turn = max(-most, min(most, 4 * error))
         psi += turn / rate_hz
         stride = 0.0 if here else max(0.0, math.cos(error)) * min(1.0, max(0.15, 2 * apart / speed))
+        # What walks already slows down step by step.
+        rest = max(0.0, rest - CALMER)
+        stride = max(stride, rest)
         done = here and abs(error) < FACING
         aim = 0.0 if done else max(stride, ON_SPOT * min(1.0, abs(turn) / TURN))
         pace += max(-SLOWER, min(FASTER, aim - pace))
@@ -127,7 +172,7 @@ def _walk(
         path.append((*at, heading, psi))
         seen.append((to, pace))
         stayed, k = stayed + (pace <= 1e-9 and done), k + 1
-    return _laid(recovery_clips.ease, cycle, torch.tensor(path), torch.tensor(seen))
+    return on_path(get_up.recovery_clips.ease, cycle, torch.tensor(path), torch.tensor(seen))
 
 
 def _along(walk: np.ndarray, to: float) -> float:
@@ -138,7 +183,7 @@ def _along(walk: np.ndarray, to: float) -> float:
     return cycle * walk[-1, 0] + walk[i, 0] + (rest - i) * (walk[i + 1, 0] - walk[i, 0])
 
 
-def _laid(ease: Tensor, cycle: Tensor, path: Tensor, seen: Tensor) -> Tensor:
+def on_path(ease: Tensor, cycle: Tensor, path: Tensor, seen: Tensor) -> Tensor:
     """A walk's poses on a path (x, y, its direction, the heading), fading from and to standing."""
     (to, pace), count = seen.double().unbind(-1), len(cycle) - 1
     rest = to % count

@@ -16,7 +16,8 @@ from poise.eval.episodes import Recording
 from poise.eval.rolloutset import Judged, RolloutSet, judge
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.crowd import Crowd
-from poise.jobs.track.recovering import Replay, look_for, replay, sentence
+from poise.jobs.track.placement import Placed
+from poise.jobs.track.recovering import Led, Replay, led_along, look_for, replay, sentence
 from poise.jobs.tracker import Tracker
 from poise.metrics import mpjpe_global, success_rule
 from poise.plan import Lookahead, LookaheadConfig, SamplingResult
@@ -70,11 +71,10 @@ def done_by(
     """
     notes: list[str] = []
     if replayed is not None:
-        return _episode(imitation, config, replayed, "policy"), notes
-    looks = config.looks_ahead and tracker.value is not None
-    if config.looks_ahead and not looks:
+        return _episode(imitation, config, replayed, replayed.by), notes
+    if config.looks_ahead and tracker.value is None:
         notes.append(NO_CRITIC)
-    if looks:
+    if config.looks_ahead and tracker.value is not None:
         ahead = look_ahead(tracker, imitation, config.lookahead, config.threads, config.seed)
         try:
             done = _episode(imitation, config, ahead, "lookahead", show)
@@ -93,6 +93,31 @@ def done_by(
             done = _episode(imitation, config, replay(found, tracker.policy), "search")
         done = done._replace(found=found)
     return done, notes
+
+
+def led_by(
+    tracker: Tracker,
+    placed: Sequence[Placed],
+    imitation: Imitation,
+    config: TrackConfig,
+    show: Show | None = None,
+) -> tuple[Led, Sequence[str]]:
+    """Does motions one after another, see `led_along`, with lookahead where that is wanted.
+
+    Returns:
+        what came of them, and sentences on that.
+    """
+    told = show and (lambda made, steps: show("tracking", made, steps))
+    if not config.looks_ahead or tracker.value is None:
+        led = led_along(tracker, placed, imitation, config.recover, None, told)
+        return led, [NO_CRITIC] if config.looks_ahead else []
+    ahead = look_ahead(tracker, imitation, config.lookahead, config.threads, config.seed)
+    told = show and (lambda made, steps: show("looking ahead", made, steps))
+    try:
+        led = led_along(tracker, placed, imitation, config.recover, ahead, told)
+    finally:
+        ahead.copies.close()
+    return led._replace(replayed=replace(led.replayed, by="lookahead")), []
 
 
 def look_ahead(
@@ -135,7 +160,7 @@ def _episode(
         acts.watch(env)
     keeper = Keeper(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
-    told = () if show is None else (_Told("looking ahead", int(task.reference.length[0]) - 1, show),)
+    told = () if show is None else (Told("looking ahead", int(task.reference.length[0]) - 1, show),)
     rollouts, recordings = run_episodes(
         lambda _: env, keeper or acts, every, starts, cycles=1, observers=told
     )
@@ -146,7 +171,7 @@ def _episode(
     return Done(rollouts, recordings, judged, frames, controller)
 
 
-class _Told:
+class Told:
     """Tells how many control steps of an episode are done."""
 
     def __init__(self, what: str, steps: int, show: Show):

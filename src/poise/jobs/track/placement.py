@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, 
 from poise.kin.feet.level import Levelled
 from poise.kin.fit import ClipFit
 from poise.kin.ground import clip_flights
-from poise.motion import Clip
+from poise.motion import Clip, shifted
 
 if TYPE_CHECKING:
     from poise.jobs.tracker import Tracker
@@ -54,6 +55,47 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     fit = ClipFit(clip.name, clip.fps, flights, on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
     return Placed(clip, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
+
+
+def place_all(clips: Sequence[Clip], tracker: Tracker) -> list[Placed]:
+    """Motions on the tracker's body between which recovery motions can lead, in one world, each at its
+    own place, all on the first one's skeleton.
+
+    The body's world is as much larger as the body, about the start of the first: that is how `home`
+    makes it smaller again. Hinges are shifted by whole turns as near to those of a body at ease as
+    their ranges let them: a joint that is a turn off would be turned all round on the way.
+
+    Raises:
+        PoiseError: see `place`.
+    """
+    first, out = clips[0], list[Placed]()
+    for clip in clips:
+        notes: tuple[str, ...] = ()
+        if not clip.skeleton.same_bones(first.skeleton):
+            clip = retarget(clip, first)[0]
+            notes = (f"{clip.name}: it is on another skeleton than {first.name}, and was retargeted.",)
+        p = place(clip, tracker)
+        larger = (out or [p])[0].moved
+        away = (clip.root_pos[0] - first.root_pos[0]) * (larger.scale - 1.0 if larger else 0.0)
+        qpos = _unwound(p.qpos, tracker)
+        qpos[:, :2] += away[:2]
+        moved = shifted(p.clip, (away[0], away[1], 0.0))
+        out.append(replace(p, clip=moved, qpos=qpos, notes=(*notes, *p.notes)))
+    return out
+
+
+def _unwound(qpos: np.ndarray, tracker: Tracker) -> np.ndarray:
+    """A motion `(T, 7 + n)` with hinges as near to those at ease as whole turns bring them."""
+    out, angles = qpos.copy(), qpos[:, 7:]
+    if tracker.recovery_clips is None:
+        return out
+    near = angles - 2 * np.pi * np.round(
+        (angles.mean(0) - tracker.recovery_clips.ease[7:].numpy()) / (2 * np.pi)
+    )
+    low, high = tracker.humanoid.model.jnt_range[1:].T
+    fits = (near.min(0) >= low) & (near.max(0) <= high)
+    out[:, 7:] = np.where(fits, near, angles)
+    return out
 
 
 def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:

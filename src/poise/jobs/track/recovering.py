@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,10 +18,12 @@ from poise.errors import PoiseError
 from poise.eval import simulate
 from poise.jobs.track.placement import Placed
 from poise.jobs.tracker import Tracker
-from poise.kin import qpos_to_clip
+from poise.kin import FitReport, qpos_to_clip
+from poise.kin.feet.level import Levelled
 from poise.motion import Clip, ClipLibrary, resample
-from poise.plan import SamplingConfig, SamplingControl, SamplingResult
+from poise.plan import Lookahead, SamplingConfig, SamplingControl, SamplingResult
 from poise.recipes.imitation import Imitation
+from poise.spatial import slerp
 
 #: A motion that is lost more often is given up, and so is one that the character has left for so many s.
 LOSSES, AWAY_S = 8, 30.0
@@ -44,86 +48,168 @@ class Losses:
         return f"{said} and came back; the motion waited for it, and is {away:.1f} s longer in all."
 
 
-def with_returns(
-    tracker: Tracker, placed: Placed, imitation: Imitation
-) -> tuple[Placed, Imitation, Replay, Losses] | None:
-    """Tracks a motion, and a recovery motion wherever it is lost; None where it never is.
+class Led(NamedTuple):
+    """What came of motions to which a character was led.
 
-    Returns:
-        the motion with the recovery motions in it, as it was tracked, also as a task of its own; the
-        actions that track it; and when it was lost.
+    Attributes:
+        placed, imitation: the motions and the recovery motions between them as one motion, as it was
+            tracked, and as a task of its own.
+        replayed: the actions that track it.
+        losses: when a motion was lost; None where none was.
+        spans: of each motion the frames at which it began and ended, None where it was not reached or
+            did not end.
+    """
+
+    placed: Placed
+    imitation: Imitation
+    replayed: Replay
+    losses: Losses | None
+    spans: list[tuple[int | None, int | None]]
+
+
+def led_along(
+    tracker: Tracker,
+    placed: Sequence[Placed],
+    imitation: Imitation,
+    returns: bool,
+    ahead: Lookahead | None = None,
+    show: Callable[[int, int], None] | None = None,
+) -> Led:
+    """Tracks motions one after another, a recovery motion from the end of each to the start of the next,
+    and one wherever a motion is lost.
+
+    Args:
+        placed, imitation: the motions, and the task of them in order.
+        returns: whether a motion that is lost is come back to; without, it goes on to its end.
+        ahead: looks ahead in place of the policy alone; see `look_ahead`.
+        show: is told how many frames of the motions are done, and of how many.
 
     Raises:
         PoiseError: the policy has not learned to come back.
     """
     if tracker.recovery_clips is None:
+        what = ("come back", "Leave --recover out")
+        if len(placed) > 1:
+            what = ("go from one clip to the next", "Give one clip")
         raise PoiseError(
-            "the policy has not learned to come back",
-            hint="Leave --recover out, or train one on a library with a clip that gets up",
+            f"the policy has not learned to {what[0]}",
+            hint=f"{what[1]}, or train one on a library with a clip that gets up",
         )
     task = replace(imitation.task, help_by="all")
     env = replace(imitation, task=task).env(1, auto_reset=False, threads=1, help_scale=0.0)
     try:
         zero = torch.zeros(1, dtype=torch.long)
         env.reset_to(zero, zero)
-        goal = LedGoal(env.goal.clips, tracker.recovery_clips)
-        led = _Led(goal, env.reference.coordinates(zero, zero)[0])
-        most = led.last + int((LOSSES + 1) * AWAY_S * led.rate)
-        simulate(env, tracker.policy, env.set_goal(goal), most, led)
+        how = tracker.recovery_clips, len(placed) > 1, returns
+        goal = LedGoal(env.goal.clips, *how)
+        led = _Led(goal, env.reference.coordinates(zero, zero)[0], show)
+        most = led.total + int((LOSSES + len(placed)) * AWAY_S * led.rate)
+        obs = env.set_goal(goal)
+        if ahead is not None:
+            ahead.copies.set_goal(LedGoal(ahead.copies.goal.clips, *how, plans=False))
+            ahead.watch(env)
+        simulate(env, ahead or tracker.policy, obs, most, led)
     finally:
         env.close()
-    if not led.lost:
-        return None
-    qpos, own = torch.cat(led.frames).cpu().numpy(), imitation.library.clips[0]
-    body, rate, of = imitation.humanoid, led.rate, led.of
-    clip = qpos_to_clip(qpos, body.table, own.skeleton, rate, _held(own, rate, of), own.name)
-    source = resample(_held(placed.source, rate, of), placed.source.fps)
-    placed = replace(placed, source=source, clip=resample(clip, own.fps), qpos=qpos)
-    library = ClipLibrary((placed.clip,), (1.0,))
+    replayed = Replay(torch.cat(led.actions))
+    losses = Losses(tuple(led.lost), tuple(led.back)) if led.lost else None
+    if losses is None and len(placed) == 1:
+        return Led(placed[0], imitation, replayed, None, led.spans)
+    qpos, body, rate = torch.cat(led.frames).cpu().numpy(), imitation.humanoid, led.rate
+    own = _held(imitation.library.clips, rate, led.of)
+    clip = qpos_to_clip(qpos, body.table, own.skeleton, rate, own, own.name)
+    whole, first = one_after_another(placed, led.of, led.spans, rate), imitation.library.clips[0]
+    whole = replace(whole, clip=resample(clip, first.fps), qpos=qpos)
+    library = ClipLibrary((whole.clip,), (1.0,))
     reference = Reference(body, [qpos], rate, [own.name])
     out = replace(imitation, library=library, reference=reference)
-    return placed, out, Replay(torch.cat(led.actions)), Losses(tuple(led.lost), tuple(led.back))
+    return Led(whole, out, replayed, losses, led.spans)
 
 
 class _Led:
-    """Observes one character that is led back to its motion.
+    """Observes one character that is led along its motions.
 
     Attributes:
         frames: coordinates `(1, 7 + n)` that it aimed at, one after another, `start` first.
-        of: the frame of its motion that each of them is of.
+        of: the motion, and the frame of it, that each of them is of.
         actions: `(1, A)` each.
-        lost, back: when it lost the motion and found it again, s.
+        lost, back: when it lost a motion and found it again, s.
+        spans: see `Led`.
     """
 
-    def __init__(self, goal: LedGoal, start: Tensor):
-        self.goal, self.rate, self.last = goal, goal.rate_hz, int(goal.reference.length[0]) - 1
-        self.frames, self.of, self.actions = [start], [0], list[Tensor]()
+    def __init__(self, goal: LedGoal, start: Tensor, show: Callable[[int, int], None] | None = None):
+        self.goal, self.rate, self.show = goal, goal.rate_hz, show
+        self.last = (goal.reference.length - 1).tolist()
+        self.total = sum(self.last)
+        self.frames, self.of, self.actions = [start], [(0, 0)], list[Tensor]()
         self.lost, self.back = list[float](), list[float]()
-        # Whether it is on its motion, and at which frame of it, before the next step.
-        self._here, self._frame = True, 0
+        self.spans: list[tuple[int | None, int | None]] = [(None, None)] * len(self.last)
+        # Whether it is on a motion, on which, and at which frame of it, before the next step; the s at
+        # which it left the last one.
+        self._here, self._clip, self._frame, self._left = True, 0, 0, 0.0
 
     def see(self, env: ImitationEnv, step: int) -> bool:
-        """Keeps what the step aimed at; True: the motion is over, or given up."""
+        """Keeps what the step aimed at; True: the motions are over, or given up."""
+        now, clip = step / self.rate, self._clip
         if step:
+            at = self._frame + 1 if self._here else self._frame
             self.actions.append(env.action.clone())
             self.frames.append(self.goal.aimed())
-            self.of.append(self._frame + 1 if self._here else self._frame)
-            if self._here and self._frame + 1 >= self.last:
-                return True
-        now = step / self.rate
-        self._here, self._frame = int(self.goal.doing) == TRACKS, int(self.goal.frame)
+            self.of.append((clip, at))
+            if self._here and at >= self.last[clip]:
+                self.spans[clip] = self.spans[clip][0], step
+                if clip == len(self.last) - 1:
+                    return True
+        if self.show is not None:
+            self.show(sum(self.last[:clip]) + self._frame, self.total)
+        was, self._here = self._here, int(self.goal.doing) == TRACKS
+        self._clip, self._frame = int(self.goal.clips.clip), int(self.goal.frame)
+        self._left = now if was and not self._here else self._left
+        if self._here and self.spans[self._clip][0] is None:
+            self.spans[self._clip] = step, None
         if len(self.goal.lost) > len(self.lost):
             self.lost.append(now)
         if self._here and len(self.back) < len(self.lost):
             self.back.append(now)
-        return len(self.lost) > LOSSES or (not self._here and now > self.lost[-1] + AWAY_S)
+        return len(self.lost) > LOSSES or (not self._here and now > self._left + AWAY_S)
 
 
-def _held(clip: Clip, rate: float, of: list[int]) -> Clip:
-    """A clip's frames `of` at `rate`, one after another."""
-    clip = resample(clip, rate)
-    rows = np.minimum(of, clip.frames - 1)
-    return clip.replaced(root_pos=clip.root_pos[rows], rot=clip.rot[rows])
+def one_after_another(
+    placed: Sequence[Placed],
+    of: Sequence[tuple[int, int]],
+    spans: Sequence[tuple[int | None, int | None]],
+    rate: float,
+) -> Placed:
+    """What came in as one motion: frames `of` (clip, frame) of all at `rate`, at the first one's rate.
+
+    Feet are turned as in each clip, and in between from one to the other.
+    """
+    first = placed[0]
+    source = resample(_held([p.source for p in placed], rate, of), first.source.fps)
+    at = np.minimum(np.round(np.arange(source.frames) * rate / source.fps).astype(int), len(of) - 1)
+    share = np.array([float(k) for k, _ in of])
+    for (_, end), (begin, _) in itertools.pairwise(spans):
+        if end is not None:
+            begin = len(of) if begin is None else begin
+            share[end : begin + 1] = share[end] + np.linspace(0, 1, begin + 1 - end)[: len(of) - end]
+    turns: dict[int, Tensor] = {}
+    for joint in {j for p in placed for j in p.level.turns}:
+        still = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        each = torch.stack([p.level.turns.get(joint, still) for p in placed])
+        low = torch.tensor(share[at]).long()
+        high = (low + 1).clamp(max=len(placed) - 1)
+        turns[joint] = slerp(each[low], each[high], torch.tensor(share[at]) - low)
+    report = FitReport(tuple(fit for p in placed for fit in p.report.clips))
+    return replace(first, source=source, level=Levelled(turns), report=report)
+
+
+def _held(clips: Sequence[Clip], rate: float, of: Sequence[tuple[int, int]]) -> Clip:
+    """Frames `of` (clip, frame) of clips at `rate`, one after another."""
+    timed = [resample(clip, rate) for clip in clips]
+    rows = [(timed[k], min(t, timed[k].frames - 1)) for k, t in of]
+    root, rot = ([getattr(c, name)[t] for c, t in rows] for name in ("root_pos", "rot"))
+    name = ", ".join(c.name for c in clips)
+    return timed[0].replaced(root_pos=np.stack(root), rot=np.stack(rot), name=name)
 
 
 def look_for(
@@ -165,11 +251,12 @@ def replay(found: SamplingResult, policy: Acts) -> Replay:
 @dataclass(eq=False)
 class Replay:
     """Actions `(T, A)` one after another, for the one character that they were made for; after them
-    acts the policy, if there is one."""
+    acts the policy, if there is one. by: the controller that made them."""
 
     actions: Tensor
     policy: Acts | None = None
     step: int = 0
+    by: str = "policy"
 
     def act(self, obs: Tensor) -> Tensor:
         """The next one, `(1, A)`; `obs` is looked at by the policy alone."""

@@ -11,6 +11,8 @@ from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, deliver, finished, simulated_clip
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
+from poise.jobs.track.missing import shortfalls
+from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
 from poise.jobs.track.recovering import Losses
 from poise.jobs.tracker import Tracker
@@ -51,7 +53,8 @@ class Tracked(Result):
     without `reset_on_fail` and `recover` at most one per character. clean: what the noise changed, None
     without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
     was lost and found again; None where it was not. found: what a search came to; None where
-    nothing was searched. controller: which did the motion: "policy", "lookahead" or "search".
+    nothing was searched. controller: which did the motion: "policy", "lookahead" or "search". parts:
+    what became of each of several clips; none where it was one.
     """
 
     tracker: Tracker
@@ -64,6 +67,7 @@ class Tracked(Result):
     losses: Losses | None = None
     found: SamplingResult | None = None
     controller: str = "policy"
+    parts: tuple[Part, ...] = ()
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -118,6 +122,8 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
         f"The character failed at {seconds:.1f} s" + (f" (character {k + 1})." if count > 1 else ".")
         for k, seconds in t.failures
     )
+    said = tuple(p.sentence() for p in t.parts) or said
+    said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(t.imitation, t.evaluation, out, {}, inner, hold, placed.source, said)
     if not other:
         return done

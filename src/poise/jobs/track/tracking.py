@@ -20,11 +20,13 @@ from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
-from poise.jobs.track.controllers import RULE, Controller, Show, done_by
+from poise.jobs.track.controllers import RULE, Controller, Show, done_by, led_by
 from poise.jobs.track.crowd import places
-from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.missing import needs_of
+from poise.jobs.track.parts import Span, cut, parts_of, with_parts
+from poise.jobs.track.placement import Placed, place, place_all
 from poise.jobs.track.points import fitted, follow, points_of
-from poise.jobs.track.recovering import with_returns
+from poise.jobs.track.rates import rate_notes
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
@@ -40,6 +42,8 @@ from poise.settings import changed, validate
 
 #: Characters in one world.
 MOST = 64
+#: What is tracked.
+Motion = Clip | Keypoints | str | Path
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class TrackConfig:
         count: characters that do the motion side by side in one world, see `track.crowd`.
         controller: "policy" acts alone, "lookahead" simulates what it may do before it acts
             (`plan.lookahead`), "search" looks for the whole motion (`plan.sampling`), for one character;
-            "auto" looks ahead, and searches what is lost so. With `recover` the policy acts alone.
+            "auto" looks ahead, and searches what is lost so, but for `recover` and several clips.
         lookahead: how it looks ahead; its seed is `seed`.
         search: how it searches; its seed is `seed`.
         threads: cores of lookahead and search, 0 is all of them.
@@ -82,14 +86,28 @@ class TrackConfig:
         if self.controller == "search" and (self.recover or self.reset_on_fail or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes or is put back"
             raise PoiseError(f"a motion is searched for a single character, not {what}")
-        if self.controller == "lookahead" and self.recover:
-            what = "a character that comes back by itself does not look ahead yet"
-            raise PoiseError(what, hint="Leave recover or the controller out")
+
+    def check(self, clips: int) -> None:
+        """Refuses what cannot be done with so many clips one after another.
+
+        Raises:
+            PoiseError: no clips, or several with what is for a single one.
+        """
+        alone = {
+            "several characters are": self.count > 1, "noise is": bool(self.noise),
+            "putting a character back is": self.reset_on_fail,
+            "a search is": self.controller == "search",
+        }  # fmt: skip
+        if not clips:
+            raise PoiseError("there is no clip to track")
+        if clips > 1 and any(alone.values()):
+            what = next(name for name, asked in alone.items() if asked)
+            raise PoiseError(f"{what} for a single clip, and {clips} were given")
 
     @property
     def looks_ahead(self) -> bool:
         """Whether lookahead is wanted."""
-        return self.controller == "lookahead" or (self.controller == "auto" and not self.recover)
+        return self.controller in ("auto", "lookahead")
 
     @property
     def searches(self) -> bool:
@@ -99,7 +117,7 @@ class TrackConfig:
 
 
 def track(
-    clip: Clip | Keypoints | str | Path,
+    clip: Motion | Sequence[Motion],
     policy: Tracker | Run | str | Path | None = None,
     config: TrackConfig | None = None,
     *,
@@ -112,7 +130,9 @@ def track(
     keypoints frame by frame (`kin.retarget`); any other policy gets the clip that is fitted to them.
 
     Args:
-        clip: a clip, keypoints, or a file; keypoints in a file stay keypoints.
+        clip: a clip, keypoints, or a file; keypoints in a file stay keypoints. Several of them are done
+            one after another by one character, each where it stands: between them it walks, turns and
+            gets up to the next one's first frame (`Tracked.parts`).
         policy: a policy file, the folder of a run of poise train perpetual, or one that is open; by
             default the policy that comes with Poise.
         config: how it is tracked; `settings` are those that differ, such as recover=True, count=4 or
@@ -129,26 +149,47 @@ def track(
         tracker = policy
     else:
         tracker = (policy if isinstance(policy, Run) else open_run(policy)).tracker
-    motion = read_motion(clip)
+    motions = [clip] if isinstance(clip, Motion) else list(clip)
+    config.check(len(motions))
+    motions = [read_motion(m) for m in motions]
+    motion = motions[0]
     given, points = _input(motion, config)
-    placed = place(given, tracker)
-    imitation = imitation_of(tracker, [placed])
-    notes = list(placed.notes)
-    if points is not None:
+    several = len(motions) > 1
+    if config.recover or several:
+        all_placed = place_all([given, *(_input(m, config)[0] for m in motions[1:])], tracker)
+    else:
+        all_placed = [place(given, tracker)]
+    placed = all_placed[0]
+    imitation = imitation_of(tracker, all_placed)
+    notes = [f"{p.clip.name}: {n}" if several else n for p in all_placed for n in p.notes]
+    if points is not None and not several:
         reference, said = follow(tracker, placed, points, imitation.reference, config.smooth_hz)
         imitation, notes = replace(imitation, reference=reference), [*notes, *said]
     goals = imitation.reference.pose.pos
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
-    losses, replayed = None, None
-    if config.recover and (back := with_returns(tracker, placed, imitation)):
-        placed, imitation, replayed, losses = back
+    losses, replayed, apart, spans = None, None, imitation.reference, list[Span]()
+    if config.recover or several:
+        led, said = led_by(tracker, all_placed, imitation, config, progress)
+        placed, imitation, replayed, losses, spans = led
+        notes += said
     done, said = done_by(tracker, imitation, config, replayed, progress)
     notes += said
+    if not several:
+        notes += rate_notes(
+            tracker, given, placed.report.clips[0].flights,
+            lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
+        )  # fmt: skip
     rollouts, frames = done.rollouts, done.failures
     about, rate = tracker.about, imitation.reference.rate_hz
     suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
-    card = scored(rollouts, imitation, about, RULE, tracker.config.method + suffix)
+    scores = cut(rollouts, spans, apart) if several else rollouts
+    card = scored(scores, imitation, about, RULE, tracker.config.method + suffix)
+    parts = tuple(parts_of(scores, spans, RULE, config.recover)) if several else ()
+    if several:
+        card = with_parts(card, parts)
+    else:
+        card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation)))
     clean = None
     if config.noise:
         seen = rollouts.pos[0], goals
@@ -163,9 +204,11 @@ def track(
     times = tuple((character, frame / rate) for character, frame in frames)
     if losses is not None:
         times = tuple((0, t) for t in losses.lost)
+    elif several:
+        times = tuple((0, p.lost) for p in parts if p.lost is not None)
     return Tracked(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
-        done.controller,
+        done.controller, parts,
     )  # fmt: skip
 
 
@@ -213,7 +256,7 @@ def side_by_side(imitation: Imitation, count: int) -> Imitation:
     return replace(imitation, library=clips, reference=made, report=report)
 
 
-def read_motion(clip: Clip | Keypoints | str | Path) -> Clip | Keypoints:
+def read_motion(clip: Motion) -> Clip | Keypoints:
     """A motion as it is, or that in a file, keypoints where it holds keypoints.
 
     Raises:

@@ -84,7 +84,14 @@ class NotAlone:
 
 
 def not_alone(clip: Clip, table: BodyTable, rules: AloneRules | None = None) -> tuple[NotAlone, ...]:
-    """Spells of a clip, standing on z = 0, that its body `table` cannot do alone; in order of time.
+    """Spells of a clip, standing on z = 0, that its body `table` cannot do alone (`beyond_a_floor`)."""
+    return beyond_a_floor(table, *poses_of(clip, table), clip.fps, rules or AloneRules())
+
+
+def beyond_a_floor(
+    table: BodyTable, pos: Tensor, quat: Tensor, fps: float, rules: AloneRules
+) -> tuple[NotAlone, ...]:
+    """Spells of a motion, standing on z = 0, that need more than a floor; in order of time.
 
     Held: the lowest point is above `aloft_m` for more than `held_s` and the centre of mass c does not
     follow a parabola (`find_flights`), or it does for more than `jump_s`. Leaning: the point about
@@ -92,19 +99,20 @@ def not_alone(clip: Clip, table: BodyTable, rules: AloneRules | None = None) -> 
     body's own spin), p = c_xy - c_z c''_xy / (g + c''_z), is farther than `margin_m` from the convex
     hull of the parts below `near_m`, for more than `lean_s`. Below: the lowest point is deeper than
     `aloft_m` for more than `held_s`.
+
+    Args:
+        pos, quat: `(T, B, 3)` m and `(T, B, 4)` wxyz, places of the body's rows in the world.
     """
-    rules = rules or AloneRules()
-    pos, quat = poses_of(clip, table)
     points = extreme_points(table, pos, quat).numpy()
     com = centre_of_mass(table, pos, quat).numpy()
     low = points[..., 2].min(-1)
-    flights = find_flights(low, com[:, 2], clip.fps)
-    found = _held(low, flights, clip.fps, rules)
-    out = np.where(low > rules.near_m, 0.0, _beyond(points, com, clip.fps, rules.near_m))
-    found += _spells("leaning", out, out > rules.margin_m, rules.lean_s, clip.fps, TOUCH_S)
-    found += _spells("below", -low, -low > rules.aloft_m, rules.held_s, clip.fps, GAP_S)
+    flights = find_flights(low, com, fps)
+    found = _held(low, flights, fps, rules)
+    out = np.where(low > rules.near_m, 0.0, _beyond(points, com, fps, rules.near_m))
+    found += _spells("leaning", out, out > rules.margin_m, rules.lean_s, fps, TOUCH_S)
+    found += _spells("below", -low, -low > rules.aloft_m, rules.held_s, fps, GAP_S)
     unborne = (np.abs(low) > rules.near_m) | (out > rules.margin_m)
-    return tuple(sorted((_with_ends(f, unborne, clip.fps) for f in found), key=lambda f: f.start))
+    return tuple(sorted((_with_ends(f, unborne, fps) for f in found), key=lambda f: f.start))
 
 
 def _with_ends(found: NotAlone, unborne: np.ndarray, fps: float) -> NotAlone:

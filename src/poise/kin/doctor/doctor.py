@@ -199,7 +199,7 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
         slide = foot_slide(support.soles, clip.fps, height=NEAR_M, ground=-support.fit.lift_m)
         lowest = torch.tensor(support.low.min(-1))
         depth = penetration(lowest)
-        gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com), clip.fps)
+        gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com[:, 2]), clip.fps)
         out["foot_slide_mm_per_s"] = _number(slide)
         out["penetration_mm"], out["penetration_max_mm"] = _number(depth.mean_mm), _number(depth.max_mm)
         out["float_mm"] = _number(gap)

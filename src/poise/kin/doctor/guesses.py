@@ -80,7 +80,7 @@ def _rate(clip: Clip, support: Support | None, why: str) -> Guess:
     fall, rate = clear_fall(flights), likely_rate(flights, clip.fps)
     if rate is not None and fall is not None:
         why += (
-            f"; but in flight the body falls with {fall / GRAVITY:.1f} times gravity, "
+            f"; but in flight the body falls with {fall / GRAVITY:.3g} times gravity, "
             f"as it would at {rate:g} frames per second"
         )
     elif fall is not None:

@@ -16,7 +16,7 @@ from poise.kin.feet.contact import NEAR_M, soles_of
 from poise.kin.fk import carried
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights
 from poise.kin.series import find_runs
-from poise.kin.solids import heights
+from poise.kin.solids import low_and_com
 from poise.metrics import foot_contacts
 from poise.motion import Clip
 
@@ -41,7 +41,7 @@ class Support:
     soles: `(T, F, 3)` heel and toe end of every sole. feet: `(F,)` the foot joint of each.
     low: `(T, P)` heights of the body's joints and of its bone tips, each with its `margin (P,)`;
     names: `(P,)` the joint that each belongs to. sole_low: `(T,)` lowest point of the body's shapes.
-    com: `(T,)` height of the centre of mass. fit: how the clip would be set on the floor.
+    com: `(T, 3)` centre of mass. fit: how the clip would be set on the floor.
     """
 
     fps: float
@@ -68,7 +68,7 @@ class Support:
             low,
             margin,
             names,
-            *heights(table, pos, quat),
+            *low_and_com(table, pos, quat),
             fit_heights(table, pos, quat, clip.fps),
         )
 

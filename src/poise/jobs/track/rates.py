@@ -1,0 +1,110 @@
+"""Doubts about a motion's frame rate: what its flights say, and if a lost one is done at another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from poise.env import Acts
+from poise.errors import PoiseError
+from poise.eval import ClipJudge, simulate
+from poise.jobs.track.controllers import Show, Told, look_ahead
+from poise.jobs.tracker import Tracker
+from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence, usual_rate
+from poise.motion import Clip
+from poise.plan import Lookahead
+from poise.recipes.imitation import Imitation
+
+if TYPE_CHECKING:
+    from poise.jobs.track.tracking import TrackConfig
+
+#: The rates that a lost motion is tried at, over its own, if files have them within `USUAL`.
+TRIED, USUAL = (0.5, 2.0), 0.02
+
+
+def rate_notes(
+    tracker: Tracker,
+    given: Clip,
+    flights: Sequence[Flight],
+    on_body: Callable[[Clip], Imitation],
+    config: TrackConfig,
+    lost: bool,
+    show: Show | None = None,
+) -> list[str]:
+    """Sentences on the frame rate of a motion, none where nothing speaks against it.
+
+    A motion that more than the policy lost is tried at half and at double its rate, by the policy alone
+    and then with lookahead if that is wanted; each try ends where it loses the motion. A policy that is
+    alone loses much that it does when it is a little faster or slower: that says nothing. Where flights
+    that fall with gravity vouch for the rate, nothing is tried. What was tracked stays as it is.
+
+    Args:
+        given: the motion as it was tracked. flights: of it on the tracker's body.
+        on_body: makes a task of a clip. lost: whether the motion was.
+        show: is told of tries with lookahead.
+    """
+    doubt = rate_sentence(flights, given.fps)
+    notes = [] if doubt is None else [doubt]
+    vouched = clear_fall(flights) is not None and likely_rate(flights, given.fps) is None
+    single = (
+        config.count == 1
+        and config.controller != "policy"
+        and not (config.recover or config.reset_on_fail or config.noise)
+    )
+    if lost and single and not vouched:
+        rate = _done_at(tracker, given, on_body, config, show)
+        if rate is not None:
+            notes.append(
+                f"The motion was lost at its rate of {given.fps:.4g} Hz; played at {rate:.4g} Hz it is "
+                f"done: is the frame rate right? If not, state it with --fps {rate:.4g}."
+            )
+    return notes
+
+
+def _done_at(
+    tracker: Tracker,
+    given: Clip,
+    on_body: Callable[[Clip], Imitation],
+    config: TrackConfig,
+    show: Show | None,
+) -> float | None:
+    """The first of the rates tried (Hz) at which the motion is done; None without any."""
+    tasks: dict[float, Imitation] = {}
+    for rate in (given.fps * x for x in TRIED):
+        if abs(usual_rate(rate) / rate - 1.0) > USUAL:
+            continue
+        try:
+            tasks[rate] = on_body(given.replaced(fps=rate))
+        except PoiseError:
+            # Too short, or too fast for a body.
+            continue
+    for rate, task in tasks.items():
+        if _done(task, tracker.policy):
+            return rate
+    if not config.looks_ahead or tracker.value is None:
+        return None
+    for rate, task in tasks.items():
+        ahead = look_ahead(tracker, task, config.lookahead, config.threads, config.seed)
+        try:
+            if _done(task, ahead, show, f"trying {rate:.4g} Hz"):
+                return rate
+        finally:
+            ahead.copies.close()
+    return None
+
+
+def _done(task: Imitation, acts: Acts, show: Show | None = None, what: str = "") -> bool:
+    """Whether a task's first motion is done to its end, without help."""
+    last = task.reference.length[:1] - 1
+    env, first = task.bare().env(1, None, False, 1, help_scale=0.0, guard=False), torch.zeros_like(last)
+    judge = ClipJudge(last)
+    told = () if show is None else (Told(what, int(last), show),)
+    try:
+        if isinstance(acts, Lookahead):
+            acts.watch(env)
+        simulate(env, acts, env.reset_to(first, first), int(last), judge, *told)
+    finally:
+        env.close()
+    return bool(judge.alive.all())
