@@ -1,11 +1,13 @@
-"""The paper's ablations on a small library, each run one switch away from the one before it.
+"""The paper's ablations on a small library, each run one switch away from the one it is compared with.
 
     python benchmarks/perpetual_ablations.py --library FOLDER --onto FILE -o RUNS [--samples 2000000]
     python benchmarks/perpetual.py --runs NAME=RUNS/NAME ... --parts table noise recovery owners curves
 
-Trains every run of `LADDER` with the same samples, the cloning of the expert counted, without any help
-and without a motion prior, and prints the second command. A run that was stopped is gone on with,
-finished ones stay. `--worker K --workers N` takes every Nth run, for several processes at once.
+Trains the runs of `ROWS` with the same samples, the cloning of the expert counted, without any help
+(but for "uhc-helped") and without a motion prior (but for "style"), writes `perpetual_rows.json` and
+`.md` of all that are done (see `perpetual_rows.py`) and prints the second command. A run that was
+stopped is gone on with, finished ones stay. `--worker K --workers N` takes every Nth run, for several
+processes at once; `--collect` trains nothing.
 """
 
 from __future__ import annotations
@@ -15,17 +17,21 @@ import contextlib
 from dataclasses import replace
 from pathlib import Path
 
+import perpetual_rows
 from tracker import SIXTY
 
 from poise.body import BodyConfig
 from poise.cli.train_perpetual import shown
 from poise.cli.training import beginning
+from poise.jobs import runs
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.result import RESULT
 from poise.jobs.perpetual.run import begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
-from poise.learn import Until
-from poise.recipes.perpetual import Perpetual
+from poise.learn import AmpConfig, Until
+from poise.motion import ClipLibrary
+from poise.recipes.perpetual import Perpetual, build
+from poise.recipes.residual_force import ResidualForce
 
 #: Every row adds what its name says to the one before; the last three stand for themselves.
 LADDER = {
@@ -38,6 +44,18 @@ LADDER = {
     "absolute-rotations": {"action": "absolute", "recovery": False},
     "absolute-keypoints": {"action": "absolute", "goal": "keypoints", "recovery": False},
 }
+#: One switch away from a row of the ladder each.
+MORE = {
+    "no-energy": LADDER["relaxed"] | {"energy": 0.0},
+    "style": LADDER["relaxed"] | {"style": AmpConfig()},
+    "means": LADDER["progressive"] | {"combine": "means"},
+    "primitives-1": LADDER["progressive"] | {"max_primitives": 1},
+    "primitives-3": LADDER["progressive"] | {"max_primitives": 3},
+    "primitives-4": LADDER["progressive"] | {"max_primitives": 4},
+}
+#: In the manner of UHC: one network, additive actions, its reward, a root force up to 100 N or none.
+UHC = ("uhc", "uhc-helped")
+ROWS = (*LADDER, *MORE, *UHC)
 
 
 def settings(name: str, seed: int) -> Perpetual:
@@ -49,44 +67,64 @@ def settings(name: str, seed: int) -> Perpetual:
     if name.startswith("absolute"):
         # Noise in shares of a joint's range.
         ppo = replace(ppo, std=0.02)
-    return replace(additive, ppo=ppo, **LADDER[name])
+    return replace(additive, ppo=ppo, **(LADDER | MORE).get(name, {}))
+
+
+def uhc(name: str, seed: int) -> ResidualForce:
+    """The settings of one of `UHC`, with the learner of the others."""
+    ppo = settings("relaxed", seed).ppo
+    method = "rfc-implicit" if name == "uhc-helped" else "deepmimic"
+    return ResidualForce(method=method, help_limit=100.0, help_start=None, ppo=ppo, seed=seed)
+
+
+def library_at(a: argparse.Namespace) -> ClipLibrary:
+    """The clips on one skeleton."""
+    how = LibraryConfig(rates=SIXTY)
+    library, notes = clips_of(a.library, BodyConfig(), (), (), print, a.onto, how)
+    print(*notes, sep="\n")
+    return library
 
 
 def one(a: argparse.Namespace, name: str, seed: int) -> None:
     """Trains one run, or goes on with it."""
-    out, config = a.out / f"{name}-{seed}", settings(name, seed)
-    source = str(a.library)
-    if (out / RESULT).exists():
+    out, until = a.out / f"{name}-{seed}", Until(samples=a.samples)
+    if (out / RESULT).exists() or (out / perpetual_rows.ROW).exists():
         return
+    if name in UHC:
+        task = runs.begin(out, library_at(a), uhc(name, seed))
+        runs.train(task, out, until, threads=1, tensorboard=False)
+        return
+    config, source = settings(name, seed), str(a.library)
     if (out / RUN_FILE).exists():
         imitation = resume(out, config, source)
     else:
-        how = LibraryConfig(rates=SIXTY)
-        library, notes = clips_of(a.library, BodyConfig(), (), (), print, a.onto, how)
-        print(*notes, sep="\n")
-        imitation = begin(out, library, config, source)
+        imitation = begin(out, library_at(a), config, source)
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
-        train(imitation, out, Until(samples=a.samples), show, 1, beginning=beginning())
+        train(imitation, out, until, show, 1, beginning=beginning())
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--onto", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--samples", type=int, default=2_000_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--only", nargs="+", choices=tuple(LADDER), default=list(LADDER))
+    parser.add_argument("--only", nargs="+", choices=ROWS, default=list(LADDER))
     parser.add_argument("--worker", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--collect", action="store_true")
     a = parser.parse_args()
     jobs = [(name, seed) for seed in a.seeds for name in a.only]
     for k, (name, seed) in enumerate(jobs):
-        if k % a.workers == a.worker:
+        if k % a.workers == a.worker and not a.collect:
             print(f"{name}, seed {seed}")
             one(a, name, seed)
-    runs = " ".join(f"{name}-{seed}={a.out}/{name}-{seed}" for name, seed in jobs)
-    print(f"python benchmarks/perpetual.py --runs {runs} --parts table noise recovery owners curves")
+    kept = a.out / "nothing.json"
+    null = perpetual_rows.null_of(lambda: build(library_at(a), settings("relaxed", 0)), kept)
+    perpetual_rows.write(a.out, a.samples, null, Path(__file__).with_name("perpetual_rows.json"))
+    named = " ".join(f"{n}-{s}={a.out}/{n}-{s}" for n, s in jobs if n not in UHC)
+    print(f"python benchmarks/perpetual.py --runs {named} --parts table noise recovery owners curves")
 
 
 if __name__ == "__main__":

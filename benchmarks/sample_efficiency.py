@@ -39,7 +39,7 @@ def settings(kind: str, seed: int) -> ResidualForce:
     if kind != "paper":
         return ours
     same = {"sim": SimConfig(), "body": BodyConfig(), "done": "bodies", "horizon": 300}
-    return ResidualForce.paper(seed=seed, residual_std=0.3, **same)
+    return ResidualForce.paper(seed=seed, residual_std=0.3, help_capped=True, **same)
 
 
 def trainer_of(task: Imitation, threads: int) -> Trainer:

@@ -152,6 +152,21 @@ def test_norms_never_exceed_the_limits(size, worlds):
             )
 
 
+@pytest.mark.parametrize("kind", [ImplicitResidual, ExplicitResidual])
+def test_without_a_cap_the_limits_only_scale_the_action(kind, worlds):
+    _, (xpos, xquat, xipos), drive = worlds
+    free = kind(limit_n=50.0, limit_nm=20.0, capped=False)
+    action = 3.0 * torch.randn(N, free.dims, generator=torch.Generator().manual_seed(3)).double()
+    wrench = free.apply(action, xpos, xquat, xipos, drive)
+    # Force and torque are the last two vectors, the contact point of the explicit form is the first.
+    sizes = action.reshape(N, -1, 3).norm(dim=-1)
+    torch.testing.assert_close(wrench.force.norm(dim=-1)[:, 0], 50.0 * sizes[:, -2])
+    torch.testing.assert_close(wrench.torque.norm(dim=-1)[:, 0], 20.0 * sizes[:, -1])
+    assert float(wrench.force.norm(dim=-1).min()) > 50.0
+    if kind is ExplicitResidual:
+        torch.testing.assert_close((wrench.point[:, 0] - xpos[:, 1]).norm(dim=-1), sizes[:, 0])
+
+
 @pytest.mark.parametrize("kind", [ImplicitResidual(80.0, 40.0), ExplicitResidual((0, 3), 80.0, 40.0)])
 def test_each_world_may_have_a_scale_of_its_own(kind, worlds):
     _, arrays, _ = worlds

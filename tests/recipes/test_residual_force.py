@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,7 +14,7 @@ from poise.env.terms import reward
 from poise.errors import PoiseError
 from poise.eval import Nothing, run_episodes, start_frames
 from poise.jobs.open import open_run
-from poise.jobs.runs import begin
+from poise.jobs.runs import begin, evaluate
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import config_of, most_help, schedule, task
@@ -82,6 +83,26 @@ def test_methods_and_the_papers_own_setting():
     env = faithful.env(2)
     assert torch.isfinite(env.step(torch.zeros(2, env.num_actions)).obs).all()
     env.close()
+
+
+def test_the_papers_help_has_no_cap_and_the_codes_acts_on_all_bodies():
+    ours = ResidualForce(method="rfc-explicit", help_limit=100.0, help_start=None)
+    few = build(swing(), ours).task.residual
+    assert isinstance(few, ExplicitResidual) and few.capped and len(few.bodies) == 3
+    made = build(swing(), ResidualForce.code(swing(), method="rfc-explicit"))
+    every = made.task.residual
+    assert isinstance(every, ExplicitResidual) and not every.capped
+    assert every.bodies == tuple(range(len(made.humanoid.bodies)))
+    paper = build(swing(), ResidualForce.paper(swing(), method="rfc-explicit", num_envs=2))
+    assert paper.task.residual == replace(few, capped=False)
+    # A card says that such help had no limit; a limit of 0 is one all the same.
+    policy = paper.trainer(threads=1).policy()
+    starts = (torch.zeros(2, dtype=torch.long), torch.arange(2))
+    assert math.isinf(evaluate(paper, policy, {}, starts=starts).card.help.limit_n)
+    assert evaluate(paper, policy, {}, help_limit=0.0, starts=starts).card.help.limit_n == 0.0
+    # Runs of earlier versions, which name neither setting, keep what they did.
+    old = config_of({"method": "rfc-explicit", "faithful": "paper", "help_limit": 100.0})
+    assert old.help_capped and old.help_bodies == "hip and feet"
 
 
 def test_a_run_folder_rebuilds_the_task(tmp_path):

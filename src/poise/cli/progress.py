@@ -48,8 +48,10 @@ def figures(stats: IterationStats) -> str:
         if math.isnan(stats.episode_length)
         else (f"  episode {stats.episode_length:.0f} steps  failures {100 * stats.failure_rate:.0f} %")
     )
-    limit = stats.terms.get("help/limit_n")
-    helped = "" if limit is None else f"  help at most {limit:.0f} N" if limit else "  no help"
+    limit, force = stats.terms.get("help/limit_n"), stats.terms.get("help/force_n")
+    helped = "  no help" if limit == 0 else f"  help at most {limit or 0:.0f} N"
+    if limit is None:
+        helped = "" if force is None else f"  help {force:.0f} N, without a limit"
     return f"{stats.samples_per_s:,.0f} samples/s  imitation {reward:.3f}{ended}{helped}"
 
 

@@ -2,7 +2,8 @@
 
 Both kinds turn a residual action into forces on a `Drive` and report what they applied, so that every
 newton can be audited. The limits bound norms: the sum over bodies of the force never exceeds
-`limit_n`, that of the torque never `limit_nm`; zero switches the help off altogether.
+`limit_n`, that of the torque never `limit_nm`; zero switches the help off altogether. Without `capped`,
+as in the paper, they are only the scale of the action, and nothing bounds the help.
 """
 
 from __future__ import annotations
@@ -45,6 +46,11 @@ class Residual(Protocol):
     @property
     def limit_nm(self) -> float:
         """The most torque in N m, summed over bodies."""
+        ...
+
+    @property
+    def capped(self) -> bool:
+        """Whether the limits bound the help; else they only scale the action."""
         ...
 
     @property
@@ -103,11 +109,13 @@ class ImplicitResidual:
         limit_n: N.
         limit_nm: N m.
         k_r: weight in the regularizer exp(-k_r |a|^2).
+        capped: whether the limits bound the help, or only scale the action.
     """
 
     limit_n: float = 100.0
     limit_nm: float = 100.0
     k_r: float = 1.0
+    capped: bool = True
 
     def __post_init__(self) -> None:
         _check_limits(self.limit_n, self.limit_nm)
@@ -130,7 +138,7 @@ class ImplicitResidual:
         root = xquat[:, 1].to(action.dtype)
         # Force and torque are one vector each, so that both are capped and turned together.
         unit = action.reshape(-1, 2, 3)
-        local = unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
+        local = unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0) if self.capped else unit
         local = local * local.new_tensor([[self.limit_n], [self.limit_nm]]) * _of_worlds(scale)
         force, torque = quat_rotate(torch.stack((heading_quat(root), root), 1), local).unbind(1)
         drive.qfrc_applied[:, 0:3].add_(force)
@@ -156,6 +164,8 @@ class ExplicitResidual:
         k_f: weight of the wrench in the regularizer.
         k_cp: weight of the contact point in the regularizer.
         reach_m: m, bound on |e|.
+        capped: whether the limits bound the help and `reach_m` the points, or the limits only scale the
+            action.
     """
 
     bodies: tuple[int, ...] = (0,)
@@ -164,6 +174,7 @@ class ExplicitResidual:
     k_f: float = 1.0
     k_cp: float = 4.0
     reach_m: float = 0.3
+    capped: bool = True
 
     def __post_init__(self) -> None:
         _check_limits(self.limit_n, self.limit_nm)
@@ -187,13 +198,15 @@ class ExplicitResidual:
         """Adds sum_j J_ej^T xi_j, through MuJoCo's Cartesian applied forces."""
         index = [b + 1 for b in self.bodies]
         parts = action.reshape(-1, len(index), 3, 3)
-        reach = parts[:, :, 0]
-        reach = reach * (self.reach_m / reach.norm(dim=-1, keepdim=True).clamp_min(self.reach_m))
+        reach, *units = parts.unbind(2)
+        if self.capped:
+            reach = reach * (self.reach_m / reach.norm(dim=-1, keepdim=True).clamp_min(self.reach_m))
+            units = [_capped(unit) for unit in units]
         quat = xquat[:, index].to(action.dtype)
         point = xpos[:, index].to(action.dtype) + quat_rotate(quat, reach)
         scale = _of_worlds(scale)
-        force = quat_rotate(quat, _capped(parts[:, :, 1]) * (self.limit_n * scale))
-        torque = quat_rotate(quat, _capped(parts[:, :, 2]) * (self.limit_nm * scale))
+        force = quat_rotate(quat, units[0] * (self.limit_n * scale))
+        torque = quat_rotate(quat, units[1] * (self.limit_nm * scale))
         drive.add_wrench_at(index, point, force, torque, xipos=xipos)
         return Wrench(force, torque, point, self.bodies)
 

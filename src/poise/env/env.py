@@ -69,7 +69,7 @@ class ImitationEnv:
             raise PoiseError(
                 f"the model has {backend.model.nu} actuators, the body {self.hinges} hinges"
             )
-        self._limit_n = task.residual.limit_n if task.residual else 0.0
+        self._limit_n = task.residual.limit_n if task.residual and task.residual.capped else None
         self.num_actions = self.hinges + (task.residual.dims if task.residual else 0)
         n, here = self.num_envs, self.device
         self.age = torch.zeros(n, dtype=torch.long, device=here)
@@ -244,7 +244,7 @@ class ImitationEnv:
             done = terminated & ~failed
             reward = torch.where(done, reward * (1.0 + task.completion_bonus), reward)
         obs, more = final, {k: v for p in self._logging for k, v in p.log().items()}
-        limit = self.help.limit(self._limit_n, group)
+        limit = None if self._limit_n is None else self.help.limit(self._limit_n, group)
         log = StepLog(self.terms, self.imitation, self.wrench, limit, more)
         if task.auto_reset:
             ids = (terminated | truncated).nonzero().squeeze(-1)

@@ -108,7 +108,8 @@ class TaskConfig:
 
 class StepLog(Mapping[str, float]):
     """Means over the worlds: "reward/NAME" of every term, "imitation", the help in N and N m,
-    the limit of its force in N (`limit_n`, a number or `(N,)`), and whatever `more` there is.
+    the limit of its force in N (`limit_n`, a number or `(N,)`, None without one), and whatever `more`
+    there is.
 
     All of them come by one pass and one wait for the numbers, at the first that is read.
     """
@@ -118,7 +119,7 @@ class StepLog(Mapping[str, float]):
         terms: Mapping[str, Tensor],
         imitation: Tensor,
         wrench: Wrench | None,
-        limit_n: float | Tensor,
+        limit_n: float | Tensor | None,
         more: Mapping[str, Tensor] | None = None,
     ):
         self._parts = terms, imitation, wrench, limit_n, more or {}
@@ -136,7 +137,7 @@ class StepLog(Mapping[str, float]):
                 rows["help/limit_n"] = limit_n
             means = torch.stack(list(rows.values())).mean(-1).tolist()
             self._values = dict(zip(rows, means, strict=True))
-            if wrench is not None and not isinstance(limit_n, Tensor):
+            if wrench is not None and isinstance(limit_n, float | int):
                 self._values["help/limit_n"] = limit_n
         return self._values
 

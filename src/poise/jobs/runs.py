@@ -199,6 +199,9 @@ def _worlds(
 ) -> tuple[Callable[[int], ImitationEnv], float]:
     """How environments of N worlds are made, and the limit of their help, N and N m."""
     limit, scale = help_left(imitation, meta, asked)
+    residual = imitation.task.residual
+    if limit and residual is not None and not residual.capped:
+        limit = math.inf
     return lambda n: imitation.env(n, auto_reset=False, help_scale=scale, device=device), limit
 
 

@@ -55,6 +55,10 @@ class ResidualForce:
             number in N m.
         help_start: N, the limit at the start; None (or a number that is not above help_limit) keeps the
             limit constant, as the paper does.
+        help_capped: the limits bound what the policy may ask for. Without, as in the paper, they only
+            scale it, and the score card says that the help had no limit.
+        help_bodies: what RFC-Explicit acts on: "hip and feet", the paper's example, or "all" bodies, as
+            the authors' code.
         help_schedule: from start to end by success (`control.SuccessHelp`) or linear in time over
             `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
         reward: world (App. B.1) or local (App. B.2).
@@ -73,6 +77,8 @@ class ResidualForce:
     method: Literal["rfc-implicit", "rfc-explicit", "deepmimic"] = "rfc-implicit"
     help_limit: float = 0.0
     help_start: float | None = 100.0
+    help_capped: bool = True
+    help_bodies: Literal["hip and feet", "all"] = "hip and feet"
     help_schedule: Literal["success", "linear"] = "success"
     help_steps: tuple[int, int] = (1600, 16000)
     reward: Literal["world", "local"] = "world"
@@ -114,11 +120,12 @@ class ResidualForce:
         """All that the authors' code does instead of what the paper states, where both differ.
 
         That is: kd = 0.1 kp, three times as much for 05_13 and twice for 05_06 and 05_07; half rotation
-        angles and other reward weights; a deviation of 0.1; time-outs that count as failures.
+        angles and other reward weights; a deviation of 0.1; time-outs that count as failures; explicit
+        forces on every body.
 
         Not expressed: targets about a constant bent pose with a scale of 5 at some hinges, weights of
         the feet in the pose reward, reference velocities clipped at 10, ten frames after the end of a
-        clip, episodes of whole clips per worker, explicit forces on every body (here pelvis and feet).
+        clip, episodes of whole clips per worker.
         """
         return _stated("code", clip, changes)
 
@@ -141,6 +148,8 @@ def _stated(
     stated: dict[str, Any] = {
         "help_limit": 100.0,
         "help_start": None,
+        "help_capped": False,
+        "help_bodies": "hip and feet" if faithful == "paper" else "all",
         "reward": "local" if clip is not None and clip.seconds >= LONG_S else "world",
         "observation": "phase",
         "action": "absolute",
@@ -176,12 +185,14 @@ def schedule(config: ResidualForce) -> HelpSchedule | None:
 
 
 def residual(config: ResidualForce, humanoid: Humanoid) -> Residual | None:
-    """The kind of help: none, a root wrench, or wrenches on pelvis and feet."""
-    limits = {"limit_n": most_help(config), "limit_nm": most_help(config)}
+    """The kind of help: none, a root wrench, or wrenches on pelvis and feet or on all bodies."""
+    most, capped = most_help(config), config.help_capped
     if config.method == "rfc-implicit":
-        return ImplicitResidual(**limits)
+        return ImplicitResidual(most, most, capped=capped)
     if config.method == "rfc-explicit":
-        return ExplicitResidual(bodies=(0, *humanoid.feet), **limits)
+        every = config.help_bodies == "all"
+        bodies = tuple(range(len(humanoid.bodies))) if every else (0, *humanoid.feet)
+        return ExplicitResidual(bodies, most, most, capped=capped)
     return None
 
 
