@@ -16,7 +16,7 @@ SOURCES: tuple[tuple[str, str], ...] = (
     ("CMU, walks published for prediction", r"expmaps.*walking"),
     ("CMU, runs, jumps and ball games published for prediction", "expmaps"),
     ("DeepMimic", "deepmimic|humanoid3d"),
-    ("Bandai", "bandai|^dataset_"),
+    ("Bandai", "bandai|^dataset[-_]"),
     ("CMU, dances", "salsa|indian|dance|-05_"),
     ("CMU, martial arts", "martial|kick|heiansyodan"),
     ("CMU, other", ""),
