@@ -109,7 +109,7 @@ def measured(name: str, source: Path | Clip, kind: str, budget: float) -> dict[s
 
 
 def noisy(clip: Clip, kind: str, how: dict[str, Any]) -> dict[str, Any]:
-    """A clip whose truth is known, with noise: how near and how jerky the input and the result are."""
+    """A clip with noise beside its known truth: how near and how jerky the input and the result are."""
     clip = resample(clip, RATE)
     truth = torch.tensor(clip.positions()).float()
     if kind == "video":

@@ -96,7 +96,7 @@ def jobs_of(a: argparse.Namespace) -> Iterator[Job]:
         for clip in sorted(clips)[:: a.every]:
             for condition in wanted:
                 for controller in a.controllers:
-                    # A planner's model is nothing to who does not plan.
+                    # Only a planner has a model of its own.
                     if CONDITIONS[condition].of_planner and controller != "lookahead":
                         continue
                     for budget in budgets if controller == "lookahead" else [""]:

@@ -57,7 +57,7 @@ class Condition:
 
     @property
     def of_planner(self) -> bool:
-        """Whether it concerns who plans alone."""
+        """Whether it changes the model of the planner alone."""
         return (self.mass, self.friction, self.gains) != (1.0, 1.0, 1.0)
 
 

@@ -53,14 +53,14 @@ def sets(rows: Sequence[Row]) -> list[str]:
               "floating, source, mm")]  # fmt: skip
     for (name, starts), own in groups(plain, "set", "starts").items():
         tried = groups(own, "controller", "budget")
-        most = max((len(g) for (who, _), g in tried.items() if who == "lookahead"), default=0)
+        most = max((len(g) for (by, _), g in tried.items() if by == "lookahead"), default=0)
         for (controller, _), g in tried.items():
             # Budgets that few clips were tried with have a table of their own.
             if controller == "lookahead" and len(g) < most:
                 continue
-            who = named(g[0])
+            by = named(g[0])
             near.append((
-                f"{len(g)} of {name}", str(starts), who, _share(*success(g)), _percent(mean(g, "part")),
+                f"{len(g)} of {name}", str(starts), by, _share(*success(g)), _percent(mean(g, "part")),
                 _number(median(g, "error_mm")), _number(mean(g, "error_uncut_mm")),
                 _number(median(g, "root_error_mm")), _number(mean(g, "root_error_uncut_mm")),
                 _number(median(g, "acc"), 1), _number(median(g, "vel"), 1),
@@ -68,7 +68,7 @@ def sets(rows: Sequence[Row]) -> list[str]:
             if not episodes(g, whole=True):
                 continue
             clean.append((
-                f"{len(episodes(g, whole=True))} of {name}", who, _number(median(g, jerk_ratio), 1),
+                f"{len(episodes(g, whole=True))} of {name}", by, _number(median(g, jerk_ratio), 1),
                 _pair(g, "slide"), _percent(share(g, slides_as_source)),
                 _number(median(g, "stance_ratio"), 2), _percent(share(g, stands_as_source)),
                 _pair(g, "penetration", 1), _pair(g, "floating", 1),
@@ -120,11 +120,11 @@ def robustness(rows: Sequence[Row]) -> list[str]:
     starts = {r["starts"] for r in rows if r["condition"] != "none"}
     rows = [r for r in rows if r["starts"] in starts]
     budgets = {r["budget"] for r in rows if r["condition"] != "none"}
-    whos = {named(r): None for r in rows if r["budget"] in budgets}
+    controllers = {named(r): None for r in rows if r["budget"] in budgets}
     head = ["what goes wrong"]
-    for who in whos:
+    for by in controllers:
         head += [
-            f"{who}: done whole",
+            f"{by}: done whole",
             "g-MPJPE, mm",
             "jerk / source",
             "near the true motion",
@@ -134,8 +134,8 @@ def robustness(rows: Sequence[Row]) -> list[str]:
     told = groups(rows, "condition")
     for condition in (c for c in CONDITIONS if (c,) in told):
         g, cells = told[(condition,)], [condition]
-        for who in whos:
-            own = [r for r in g if named(r) == who]
+        for by in controllers:
+            own = [r for r in g if named(r) == by]
             if not own:
                 cells += [""] * 5
                 continue
@@ -157,11 +157,11 @@ def budget_table(rows: Sequence[Row]) -> list[str]:
     out: list[Sequence[str]] = [("controller", "simulated for each step made", "done whole",
                                  "g-MPJPE, mm", "g-MPJPE of all frames", "jerk / source", "slide, mm/s",
                                  "a decision, ms: median, p99")]  # fmt: skip
-    for who, g in found:
+    for by, g in found:
         times = decision(g)
         took = "" if math.isnan(times[0]) else f"{times[0]:.0f}, {times[1]:.0f}"
         out.append((
-            who, f"{steps(g):.0f}", _share(*success(g)), _number(median(g, "error_mm")),
+            by, f"{steps(g):.0f}", _share(*success(g)), _number(median(g, "error_mm")),
             _number(mean(g, "error_uncut_mm")), _number(median(g, jerk_ratio), 1),
             _number(median(g, "slide")), took,
         ))  # fmt: skip

@@ -38,11 +38,11 @@ def report(result: Mapping[str, Any]) -> str:
 
 def about(a: Mapping[str, Any]) -> list[str]:
     """What was trained on what, and what it cost."""
-    b, who = a["body"], ", ".join(a["subjects"][:12])
+    b, subjects = a["body"], ", ".join(a["subjects"][:12])
     more = f" and {len(a['subjects']) - 12} more" if len(a["subjects"]) > 12 else ""
     state = "finished" if a["finished"] else f"unfinished, help of up to {a['help_n']:.0f} N left"
     return [
-        f"{a['clips']} clips, {a['minutes_of_motion']:.1f} minutes ({who}{more}). Body: "
+        f"{a['clips']} clips, {a['minutes_of_motion']:.1f} minutes ({subjects}{more}). Body: "
         f"{b['bodies']} bodies, {b['hinges']} hinges, {b['mass_kg']:g} kg, {b['height_m']:g} m. "
         f"{_network(a)}, "
         f"{a['policy_numbers']:,} numbers; {state}.",
@@ -149,7 +149,7 @@ def _recovery(part: Mapping[str, Any]) -> list[str]:
         )
         rows.append((kind, str(card["trials"]), *(_percent(x) for x in card["within"]), *ends))
     learned = (
-        "Who has lost the reference is led back by a way; such ways were part of the training."
+        "A recovery clip leads a character back that has lost the reference; training had such clips."
         if card.get("ways")
         else "Recovery was part of the training."
         if card.get("learned")

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
 from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
+from poise.env.recovery.clips import RecoveryClips
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from toy_library import PLAIN, lively, tiny
@@ -76,12 +77,18 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
     env.close()
 
 
-def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imitation) -> None:
+def begun(made: Imitation) -> tuple[ImitationEnv, Tensor, RecoveryClips]:
+    """One world at the start of the first clip, its row, and the recovery clips."""
     env = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
     zero = torch.zeros(1, dtype=torch.long)
     env.reset_to(zero, zero)
     assert made.recovery_clips is not None
-    goal = LedGoal(env.goal.clips, made.recovery_clips)
+    return env, zero, made.recovery_clips
+
+
+def test_a_character_that_loses_its_recovery_motion_gets_another_one(made: Imitation) -> None:
+    env, zero, recovery_clips = begun(made)
+    goal = LedGoal(env.goal.clips, recovery_clips)
     qpos = env.backend.state.qpos.clone()
     qpos[:, 0] += 3.0
     env.backend.write(None, qpos, env.backend.state.qvel.clone())
@@ -113,11 +120,8 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
     still = moved[spans[1].stop - 1].repeat(20, 1)
     motions = [moved[spans[0]].numpy(), moved[spans[1]].numpy(), still.numpy()]
     chain = replace(made, reference=Reference(own.humanoid, motions, own.rate_hz, ["a", "b", "c"]))
-    env = chain.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
-    zero = torch.zeros(1, dtype=torch.long)
-    env.reset_to(zero, zero)
-    assert made.recovery_clips is not None
-    goal = LedGoal(env.goal.clips, made.recovery_clips, chained=True)
+    env, zero, recovery_clips = begun(chain)
+    goal = LedGoal(env.goal.clips, recovery_clips, chained=True)
     env.set_goal(goal)
     Puppets(env, goal)
     seen, ends = [], [len(m) - 1 for m in motions]
@@ -134,7 +138,7 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
     # A copy that plans nothing stays at the end of its clip.
     env.set_goal(env.goal.clips)
     env.reset_to(zero, zero + ends[0] - 1)
-    goal = LedGoal(env.goal.clips, made.recovery_clips, chained=True, plans=False)
+    goal = LedGoal(env.goal.clips, recovery_clips, chained=True, plans=False)
     env.set_goal(goal)
     Puppets(env, goal)
     for _ in range(3):
@@ -144,11 +148,8 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
 
 
 def test_a_clip_that_is_not_come_back_to_goes_on(made: Imitation) -> None:
-    env = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
-    zero = torch.zeros(1, dtype=torch.long)
-    env.reset_to(zero, zero)
-    assert made.recovery_clips is not None
-    goal = LedGoal(env.goal.clips, made.recovery_clips, chained=True, returns=False)
+    env, _, recovery_clips = begun(made)
+    goal = LedGoal(env.goal.clips, recovery_clips, chained=True, returns=False)
     env.set_goal(goal)
     world = Puppets(env, goal)
     world.aside = torch.tensor([[2.0, 0.0]])
