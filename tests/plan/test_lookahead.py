@@ -213,4 +213,4 @@ def test_it_needs_its_copies_and_an_environment(task: Imitation, tracker: Tracke
     with pytest.raises(PoiseError, match="watch"):
         control.act(torch.zeros(1, control.num_obs))
     with pytest.raises(PoiseError, match="as many copies"):
-        Lookahead(control.copies, tracker.policy, control.value, LookaheadConfig())
+        Lookahead(control.copies, tracker.policy, tracker.value, LookaheadConfig())

@@ -4,13 +4,23 @@ from poise.learn.amp import Amp, AmpConfig
 from poise.learn.checkpoint import LAST_GOOD, LATEST, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.clone import CloneConfig, CloneStats, clone
 from poise.learn.config import PPOConfig
+from poise.learn.lessons import LessonConfig
 from poise.learn.log import Log
 from poise.learn.losses import gae
 from poise.learn.mining import Convergence, ConvergenceConfig, Decision, HardNegatives, MiningConfig
 from poise.learn.policy import PolicyBundle, Value, WarmStart, load_policy
 from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.progressive import columns_of, compose, first_column, next_column, primitive
-from poise.learn.protocols import DemoSampler, FeatureSource, Policy, Step, Style, Teacher, VecEnv
+from poise.learn.protocols import (
+    DemoSampler,
+    FeatureSource,
+    Lessons,
+    Policy,
+    Step,
+    Style,
+    Teacher,
+    VecEnv,
+)
 from poise.learn.rollout import Rollout, TrainingError
 from poise.learn.run import RunResult, Until, run
 from poise.learn.train import IterationStats, Trainer
@@ -30,6 +40,8 @@ __all__ = [
     "FeatureSource",
     "HardNegatives",
     "IterationStats",
+    "LessonConfig",
+    "Lessons",
     "Log",
     "MiningConfig",
     "PPOConfig",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -150,6 +150,30 @@ class Teacher(Protocol):
 
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for the environment as it stands now, with the observation `obs (N, O)`."""
+        ...
+
+
+class Lessons(Protocol):
+    """What a learner is taught where it has come to itself, such as by `plan.LookaheadTeacher`."""
+
+    def teach(
+        self, policy: Policy, value: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Raw observations `(n, O)` of states that the policy came to, the actions `(n, A)` that it
+        should take there, and numbers for the log. value: the return `(N,)` that the policy is still to
+        earn, of raw observations `(N, O)`."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a bit-exact continuation needs."""
+        ...
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continues from what `state` returned."""
+        ...
+
+    def close(self) -> None:
+        """Frees the worlds that it teaches in."""
         ...
 
 

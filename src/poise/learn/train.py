@@ -16,6 +16,7 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.learn.checkpoint import TrainerMeta, check_fits, load_checkpoint, save_checkpoint
 from poise.learn.config import PPOConfig
+from poise.learn.lessons import LessonConfig, Student
 from poise.learn.parallel import (
     ALONE,
     Comm,
@@ -27,7 +28,7 @@ from poise.learn.parallel import (
 )
 from poise.learn.policy import PolicyBundle, WarmStart
 from poise.learn.ppo import PPO, UpdateStats
-from poise.learn.protocols import Style, VecEnv
+from poise.learn.protocols import Lessons, Style, VecEnv
 from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.learn.state import State, load_module, prefixed, take, under
 from poise.settings import check_data
@@ -62,7 +63,7 @@ class IterationStats:
     collect_seconds: float
     update_seconds: float
     style: Mapping[str, float] = field(default_factory=dict)
-    """Numbers of a learned style reward, if there is one."""
+    """Numbers of a learned style reward and of lessons, if there are any."""
 
     @property
     def samples_per_s(self) -> float:
@@ -101,6 +102,8 @@ class Trainer:
             environment's own threads rest; the numbers are the same.
         comm: the processes that train together, each with a trainer and environments of its own but
             with the same seed, config and number of environments.
+        lessons: a teacher, from which the policy learns after each update, see `learn.lessons`, and how;
+            it is closed with `close`.
     """
 
     def __init__(
@@ -114,6 +117,7 @@ class Trainer:
         update_threads: int = 1,
         comm: Comm = ALONE,
         style: Style | None = None,
+        lessons: tuple[Lessons, LessonConfig] | None = None,
     ):
         self.env, self.config, self.seed = env, config or PPOConfig(), seed
         self.update_threads, self.comm, self.style = update_threads, comm, style
@@ -123,6 +127,7 @@ class Trainer:
         self.ppo = PPO(env.num_obs, env.num_actions, self.config, seed, env.device, comm, actor)
         if start is not None:
             _take_over(self.ppo, start)
+        self.student = None if lessons is None else Student(self.ppo, *lessons, seed)
         drawn = self.ppo.actor.policy.num_drawn
         self.rollout = Rollout(
             self.config.horizon, env.num_envs, env.num_obs, drawn, torch.device(env.device)
@@ -170,7 +175,11 @@ class Trainer:
         # The style first: if it fails, the policy is still that of the last good iteration.
         style = {} if self.style is None else self.style.update()
         train_policy = self.iteration >= self.config.critic_warmup
+        if self.student is not None:
+            train_policy &= self.student.config.reinforce
         update = ppo.update(rollout, train_policy, self.update_threads)
+        if self.student is not None:
+            style = style | self.student.learn()
         done = time.perf_counter()
         self.iteration += 1
         self.samples += rollout.samples * self.comm.size
@@ -243,7 +252,8 @@ class Trainer:
         }
         style = {} if self.style is None else prefixed("style", self.style.state())
         env = prefixed("env", self.env.state())
-        return gather_state(self.comm, self.ppo.state() | env | style | own)
+        taught = {} if self.student is None else prefixed("student", self.student.state())
+        return gather_state(self.comm, self.ppo.state() | env | style | taught | own)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from what `state` returned, with the same environment and network sizes."""
@@ -261,6 +271,8 @@ class Trainer:
         self.ppo.load_state(state)
         if self.style is not None:
             self.style.load_state(under("style", state))
+        if self.student is not None:
+            self.student.load_state(under("student", state))
         try:
             self.env.load_state(under("env", state))
         except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as problem:
@@ -329,6 +341,12 @@ class Trainer:
         except PoiseError as problem:
             raise PoiseError(problem.what, problem.where or path, problem.hint) from problem
         return meta
+
+    def close(self) -> None:
+        """Frees the worlds, a teacher's too."""
+        self.env.close()
+        if self.student is not None:
+            self.student.lessons.close()
 
 
 def _take_over(ppo: PPO, start: WarmStart) -> None:

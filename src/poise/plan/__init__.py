@@ -4,6 +4,7 @@ from poise.plan.expert import Expert, ExpertConfig, Plan, make_plan
 from poise.plan.lookahead import Lookahead, LookaheadConfig
 from poise.plan.lqr_teacher import LqrTeacher
 from poise.plan.sampling import SamplingConfig, SamplingControl, SamplingResult
+from poise.plan.teacher import LookaheadTeacher, TeacherConfig
 from poise.plan.trajopt import TrajectoryOptimizer
 from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
 
@@ -12,11 +13,13 @@ __all__ = [
     "ExpertConfig",
     "Lookahead",
     "LookaheadConfig",
+    "LookaheadTeacher",
     "LqrTeacher",
     "Plan",
     "SamplingConfig",
     "SamplingControl",
     "SamplingResult",
+    "TeacherConfig",
     "TrajOptConfig",
     "TrajOptStats",
     "Trajectories",

@@ -26,21 +26,17 @@ import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
-from poise.env.goals.led import LOST
-from poise.env.snapshot import Snapshot
 from poise.env.task import Acts
 from poise.errors import PoiseError
-from poise.kin.solids import shapes_of
-from poise.metrics import mpjpe_global
-from poise.plan.prices import Roughness
+from poise.plan.candidates import Candidates, Changes
 from poise.plan.sampling import draw_offsets
 
 #: Copies below which there is nothing to choose from.
 FEWEST = 4
 #: Budget from which on the horizon is longer, and the longer one in control steps.
 FAR = (400.0, 16)
-#: Share of the slack that is always left; what each control step costs in which a copy is lost.
-LEAST, LOSS = 0.05, 100.0
+#: Share of the slack that is always left.
+LEAST = 0.05
 #: Frames before a prediction that its jerk needs.
 PAST = 3
 
@@ -165,7 +161,6 @@ class Lookahead:
 
     Attributes:
         seconds: of each decision.
-        steps: control steps that were simulated for the decisions.
     """
 
     def __init__(
@@ -175,13 +170,12 @@ class Lookahead:
         value: Callable[[Tensor], Tensor],
         config: LookaheadConfig | None = None,
     ):
-        self.copies, self.policy, self.value = copies, policy, value
+        self.copies, self.policy = copies, policy
         self.config = c = config or LookaheadConfig(candidates=copies.num_envs)
         if copies.num_envs != c.candidates:
             what = f"{c.candidates} candidates need as many copies, got {copies.num_envs}"
             raise PoiseError(what, "Lookahead")
-        humanoid = copies.goal.humanoid
-        self._shapes, self._feet = shapes_of(humanoid.table, torch.float32), humanoid.feet
+        self._candidates = Candidates(copies, policy, value, c.discount)
         shares = torch.tensor(c.smoothing)
         turn = torch.arange(c.candidates)
         self._keep = shares[turn % len(shares)].unsqueeze(1)
@@ -194,13 +188,17 @@ class Lookahead:
         self._env: ImitationEnv | None = None
         self._worlds: list[_World] = []
         self.seconds: list[float] = []
-        self.steps = 0
 
     def watch(self, env: ImitationEnv) -> None:
         """Acts in the worlds of `env` from now on."""
         self._env = env
         self._worlds = [_World() for _ in range(env.num_envs)]
         self._rng.manual_seed(self.config.seed)
+
+    @property
+    def steps(self) -> int:
+        """Control steps that were simulated for the decisions."""
+        return self._candidates.steps
 
     @property
     def num_obs(self) -> int:
@@ -243,9 +241,14 @@ class Lookahead:
         assert self._env is not None
         begun, c = time.perf_counter(), self.config
         drawn = self._drawn(world.choice)
-        cost, price = self._simulate(self._env.snapshot(torch.tensor([i])), drawn, world.past)
+        bodies = torch.stack(world.past) if world.past else self._env.pose().pos[:0]
+        changes = Changes(drawn, self._keep, self._much)
+        snapshot = self._env.snapshot(torch.tensor([i]))
+        cost, _, _, rough, source = self._candidates.tried(snapshot, changes, bodies.unsqueeze(0))
+        price = rough.price(source, c.jerk_price, c.slide_price)
         off = self._env.pose().pos[i] - self._env.goal_pose().pos[i]
         left = 1.0 - float(off.norm(dim=-1).mean()) / c.strict_m
+        cost = torch.where(cost.isfinite() & price.isfinite(), cost, torch.inf)
         allowed = cost.isfinite() & (cost <= cost.min() + c.slack * max(LEAST, left))
         # Where all went bad the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
@@ -263,42 +266,3 @@ class Lookahead:
             rest = last.offsets[c.hold_steps :]
             out[about, : len(rest)] += rest
         return out
-
-    def _simulate(
-        self, snapshot: Snapshot, offsets: Tensor, past: list[Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Costs of tracking and prices `(K,)` of all copies."""
-        c, env = self.config, self.copies
-        obs, start = env.restore(snapshot), env.pose()
-        pos, quat = [start.pos.clone()], [start.quat.clone()]
-        aim = env.goal_pose()
-        ref_pos, ref_quat = [aim.pos[:1].clone()], [aim.quat[:1].clone()]
-        cost, lost = torch.zeros(c.candidates), torch.zeros(c.candidates, dtype=torch.bool)
-        keep, factor = self._keep if past else torch.zeros_like(self._keep), 1.0
-        for h in range(c.horizon):
-            # The last frame of a clip is a goal that is reached.
-            if bool((env.goal.layout.place(env.goal.now()).end > 0).any()):
-                break
-            action = torch.lerp(self._much * self.policy.act(obs) + offsets[:, h], env.action, keep)
-            keep = self._keep
-            obs = env.step(action).final_obs
-            pose = env.pose()
-            pos.append(pose.pos.clone())
-            quat.append(pose.quat.clone())
-            aim = env.goal_pose()
-            ref_pos.append(aim.pos[:1].clone())
-            ref_quat.append(aim.quat[:1].clone())
-            off = mpjpe_global(pose.pos, aim.pos) / 1000.0
-            lost |= ~(off <= LOST)
-            cost, factor = cost - factor * env.imitation + LOSS * lost, factor * c.discount
-        cost = cost - factor * self.value(obs)
-        self.steps += c.candidates * (len(pos) - 1)
-        rough, source = (
-            Roughness.of(
-                torch.stack(p, 1), torch.stack(q, 1), torch.stack(was) if was else p[0][:0],
-                self._shapes, self._feet, env.goal.rate_hz,
-            )
-            for p, q, was in ((pos, quat, past), (ref_pos, ref_quat, []))
-        )  # fmt: skip
-        price = rough.price(source, c.jerk_price, c.slide_price)
-        return torch.where(cost.isfinite() & price.isfinite(), cost, torch.inf), price

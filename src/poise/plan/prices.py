@@ -37,7 +37,7 @@ class Roughness:
         Args:
             pos: `(K, T, B, 3)` m, world positions of the bodies, the first where they are now.
             quat: `(K, T, B, 4)` wxyz.
-            past: `(k, B, 3)` m, up to three frames before them, which all motions share.
+            past: `(K, k, B, 3)` m, up to three frames before them; `(1, k, B, 3)` where all share them.
             shapes: the solids of the bodies.
             feet: indices of the feet among the bodies.
             rate_hz: frames a second.
@@ -49,7 +49,7 @@ class Roughness:
         return cls(slide[:, :0] if few else jerk(whole, rate_hz), slide)
 
     def price(self, reference: Roughness, jerk_price: float, slide_price: float) -> Tensor:
-        """`(K,)`, what these motions cost beside a reference `(1, ...)`,
+        """`(K,)`, what these motions cost beside references `(G, ...)`, each that of K / G of them,
 
             jerk_price sum_t j_t / max(mean j_ref, CALM) + slide_price sum_t max(0, s_t - mean s_ref),
 
@@ -58,8 +58,12 @@ class Roughness:
         """
         if not self.slide.shape[1]:
             return torch.zeros(len(self.slide))
-        price = slide_price * (self.slide - reference.slide.mean()).clamp_min(0.0).sum(1)
+        each = len(self.slide) // len(reference.slide)
+        slid = reference.slide.mean(1, keepdim=True).repeat_interleave(each, 0)
+        price = slide_price * (self.slide - slid).clamp_min(0.0).sum(1)
         if self.jerk.shape[1]:
-            source = float(reference.jerk.mean()) if reference.jerk.shape[1] else 0.0
-            price = price + jerk_price / max(source, CALM) * self.jerk.sum(1)
+            source = torch.full((len(price),), CALM)
+            if reference.jerk.shape[1]:
+                source = reference.jerk.mean(1).clamp_min(CALM).repeat_interleave(each)
+            price = price + jerk_price / source * self.jerk.sum(1)
         return price

@@ -14,10 +14,11 @@ from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.kin import FitReport
-from poise.learn import Amp, AmpConfig, PPOConfig, Trainer, VecEnv, WarmStart
+from poise.learn import Amp, AmpConfig, LessonConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
-from poise.learn.protocols import Style
+from poise.learn.protocols import Lessons, Style
 from poise.motion import Clip, ClipLibrary, read_clip
+from poise.plan import LookaheadTeacher, TeacherConfig
 from poise.sim import Backend, NanGuard, make_backend
 
 #: What a recipe is built of: a clip, the file of one, or a library.
@@ -140,6 +141,7 @@ class Imitation:
         device: str = "cpu",
         style: Style | AmpConfig | None = None,
         env: ImitationEnv | None = None,
+        lessons: tuple[Lessons, LessonConfig] | None = None,
         **metadata: Any,
     ) -> Trainer:
         """A PPO trainer on a fresh environment; `ppo` in place of this task's own settings.
@@ -150,6 +152,7 @@ class Imitation:
             style: a motion prior's settings, for which the task must have `TaskConfig.style`; or a style
                 of your own, with the `env` that it watches.
             env: in place of a fresh environment.
+            lessons: a teacher and how is learned from it, see `teacher`.
         """
         if env is None and style is not None and not isinstance(style, AmpConfig):
             raise PoiseError(
@@ -181,7 +184,16 @@ class Imitation:
             update_threads=cores,
             comm=comm,
             style=style,
+            lessons=lessons,
         )
+
+    def teacher(self, config: TeacherConfig, threads: int = 0) -> LookaheadTeacher:
+        """A teacher of this task in worlds of its own, without help."""
+        env = self.env(config.worlds, threads=threads, help_scale=0.0, guard=False)
+        copies = self.bare(rewards=True).env(
+            config.worlds * config.candidates, None, False, threads, help_scale=0.0, guard=False
+        )
+        return LookaheadTeacher(env, copies, config, int(self.config.seed))
 
 
 #: Fewer characters than these fit anywhere, so that nothing is worked out for them.

@@ -226,7 +226,12 @@ def make_trainer(
     own = staged(practised(imitation, stage), stage)
     own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
     ppo = finetuning(own.ppo()) if warm else own.ppo()
-    return own.trainer(threads, dumps, warm_start=start, ppo=ppo, device=device, style=config.style)
+    lessons = None
+    if config.teacher is not None:
+        lessons = own.teacher(config.teacher, threads), config.lessons
+    return own.trainer(
+        threads, dumps, warm_start=start, ppo=ppo, device=device, style=config.style, lessons=lessons
+    )
 
 
 def staged(imitation: Imitation, stage: Stage) -> Imitation:

@@ -56,6 +56,7 @@ from poise.learn import (
 )
 from poise.learn.checkpoint import remove_partial
 from poise.learn.state import make_generator, prefixed, under
+from poise.plan import LookaheadTeacher
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.task import Perpetual
 from poise.sim import UnstableError
@@ -273,7 +274,7 @@ class StageTrainer:
         # A composer and what recovers learn without help; a primitive's clips keep what they have.
         scale = self.helps if follows.kind == "primitive" else 0.0
         self.before, self.begun = self.iteration, (start.samples, start.seconds)
-        self.env.close()
+        self.trainer.close()
         stage_record.begin(members_of(follows, hard, self.imitation))
         self._enter(follows, start, True, scale)
         if isinstance(self.trainer.style, Amp) and isinstance(t.style, Amp):
@@ -293,6 +294,9 @@ class StageTrainer:
         """Clips are drawn by what is known of them."""
         library, length = self.stage_record.mining.weights(), self.env.reference.length
         self.env.weights = odds(self.imitation, self.stage, library, length)
+        student = self.trainer.student
+        if student is not None and isinstance(student.lessons, LookaheadTeacher):
+            student.lessons.env.weights = self.env.weights
 
     # --- persistence --------------------------------------------------------------------------
 
@@ -323,4 +327,4 @@ class StageTrainer:
     def close(self) -> None:
         """Frees the worlds and closes the log."""
         self.log.close()
-        self.env.close()
+        self.trainer.close()

@@ -10,8 +10,15 @@ from typing import Any, Literal
 
 from poise.body import BodyConfig
 from poise.errors import PoiseError
-from poise.learn import AmpConfig, CloneConfig, ConvergenceConfig, MiningConfig, PPOConfig
-from poise.plan import TrajOptConfig
+from poise.learn import (
+    AmpConfig,
+    CloneConfig,
+    ConvergenceConfig,
+    LessonConfig,
+    MiningConfig,
+    PPOConfig,
+)
+from poise.plan import TeacherConfig, TrajOptConfig
 from poise.recipes.perpetual.shapes import BodyShapes
 from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
@@ -119,6 +126,9 @@ class Perpetual:
         cooling: share of a stage's longest time, at its end, in which the policy's step size falls
             evenly to a tenth; for steps of a fixed size, `ppo.kl_target=None`.
         mining, convergence: what fails is trained more; when a stage has learned what it can.
+        teacher: lookahead that says what the policy should have done, None for none; PPO then trains
+            the critic alone, unless `lessons.reinforce`.
+        lessons: how is learned from it.
     """
 
     goal: Literal["rotations", "keypoints"] = "rotations"
@@ -161,6 +171,8 @@ class Perpetual:
     mining: MiningConfig = field(default_factory=MiningConfig)
     convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
     clone: CloneConfig | None = None
+    teacher: TeacherConfig | None = None
+    lessons: LessonConfig = field(default_factory=LessonConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
     sim: SimConfig = field(default_factory=SimConfig)
     ppo: PPOConfig = field(
