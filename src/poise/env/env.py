@@ -44,7 +44,8 @@ class ImitationEnv:
         plugins: help, adaptive sampling, recovery, bodies, ... as far as the task has them.
         help: what is left of the residual force, see `HelpBudget`.
         age: `(N,)` control steps since the episode began.
-        action: `(N, A)` the last one.
+        action: `(N, A)` the last one, as it acted.
+        given: `(N, A)` the last one, as it was given; the same without `TaskConfig.filter`.
         wrench: what the residual force was.
         terms, imitation: values of the last step's rewards by name, and the imitation reward `(N,)`.
     """
@@ -74,6 +75,10 @@ class ImitationEnv:
         n, here = self.num_envs, self.device
         self.age = torch.zeros(n, dtype=torch.long, device=here)
         self.action = torch.zeros(n, self.num_actions, device=here)
+        self.given = torch.zeros_like(self.action)
+        # What acted in the step before, and the hinges' torques at the begin of the last one.
+        self._action_before = torch.zeros_like(self.action)
+        self._torque_before = torch.zeros(n, self.hinges, device=here)
         self.wrench: Wrench | None = None
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
@@ -90,7 +95,7 @@ class ImitationEnv:
         self._terms = self._make_terms(fused)
         self.goal.aim(None, None)
         # Once as they are, so that it is known which tensors the terms read.
-        self._terms.check(self._sources.live(self.goal.now(), self.goal.ahead()), n)
+        self._terms.check(self._sources.live(self._told()), n)
         self._sources.settle()
         # Worlds stand on their goals where these are known already.
         obs = self._set_down(None) if self.goal.begins else self.observe()
@@ -101,14 +106,18 @@ class ImitationEnv:
     def _make_terms(self, fused: bool) -> Terms:
         task, model, here = self.task, self.backend.model, self.device
         named = {**observables.STANDARD, **task.observables}
-        held: dict[str, Tensor] = {"action": self.action, "age": self.age}
+        held: dict[str, Tensor] = {
+            "action": self.action, "age": self.age, "action_before": self._action_before,
+            "torque_before": self._torque_before,
+        }  # fmt: skip
         for plugin in self.plugins:
             named |= plugin.observables
             held |= plugin.sources()
         self._sources = Sources(self.backend, held)
         roots = torch.as_tensor(model.body_rootid[1:], dtype=torch.long).to(here)
+        self._left = None if task.left is None else task.left.to(here)
         context = observables.Context(
-            self.goal.layout, self.goal.local, roots, self.hinges, task.residual
+            self.goal.layout, self.goal.local, roots, self.hinges, task.residual, self._left
         )
         kinds = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
         return Terms(*kinds, placed(task.style, here), named, context, self._ends, here, fused)
@@ -216,9 +225,18 @@ class ImitationEnv:
             raise PoiseError(
                 f"actions must be ({self.num_envs}, {self.num_actions}), got {tuple(actions.shape)}"
             )
-        # A copy, since a restart clears its rows and the caller's actions are the caller's.
-        self.action.copy_(actions)
         goal, task = self.goal, self.task
+        self._action_before.copy_(self.action)
+        if self._sources.reads("torque_before"):
+            state = self.backend.state
+            torque = state["qfrc_actuator"] + state["qfrc_damper"]
+            self._torque_before.copy_(torque[:, 6:])
+        # A copy, since a restart clears its rows and the caller's actions are the caller's.
+        self.given.copy_(actions)
+        self.action.copy_(actions)
+        if task.filter:
+            joints = torch.lerp(actions, self._action_before, self._kept())[:, : self.hinges]
+            self.action[:, : self.hinges] = joints
         row, group = goal.row(), goal.group(task.help_by)
         targets, rows = goal.targets()
         if self._targeting and task.pd.mode == "additive":
@@ -233,7 +251,9 @@ class ImitationEnv:
         for plugin in self._ticking:
             plugin.tick()
         ref, ahead = goal.advance(waited, self._held())
-        final, scores, ends, self._style = self._terms.judge(self._sources.of(ref, ahead))
+        final, scores, ends, self._style = self._terms.judge(
+            self._sources.of({"goal": ref, "ahead": ahead, **self._window()})
+        )
         reward, self.imitation, *values = scores.unbind(0)
         self.terms = {t.name: v for t, v in zip(task.rewards, values, strict=True)}
         failed, terminated, truncated = ends.unbind(0)
@@ -255,12 +275,29 @@ class ImitationEnv:
             if len(ids):
                 self._restart(ids)
                 obs = self._obs.copy_(final)
-                fresh = self._sources.of(goal.now(ids), goal.ahead(1, ids), ids)
+                fresh = self._sources.of(self._told(ids), ids)
                 obs[ids] = self._terms.observe(fresh)
         if self._watched():
             obs = self._observe()
             final = final if task.auto_reset else obs
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
+
+    def unfiltered(self, actions: Tensor) -> Tensor:
+        """What to give to the next `step` so that `actions (N, A)` act in spite of the task's filter.
+
+            u_t = (a_t - f a_(t-1)) / (1 - f)
+
+        A controller that smooths its actions by itself, or states what shall act, goes through it.
+        """
+        if not self.task.filter:
+            return actions
+        kept = self._kept()
+        joints = ((actions - kept * self.action) / (1.0 - kept))[:, : self.hinges]
+        return torch.cat((joints, actions[:, self.hinges :]), 1)
+
+    def _kept(self) -> Tensor:
+        """`(N, 1)`, the share of the last action that the next one keeps."""
+        return self.task.filter * (self.age > 0).to(self.action).unsqueeze(1)
 
     def _watched(self) -> bool:
         """Whether the goal has changed by what it sees of the characters."""
@@ -298,7 +335,7 @@ class ImitationEnv:
 
     def goal_pose(self) -> Pose:
         """What the goal asks for now."""
-        return self.goal.layout.unpacked(self.goal.now())
+        return observables.headed(self.goal.layout.unpacked(self.goal.now()), self._left)
 
     def where(self, env: int) -> str:
         """What world `env` is at, for messages."""
@@ -306,10 +343,25 @@ class ImitationEnv:
 
     def _frame(self) -> Frame:
         """What the terms see of all worlds, from nothing but where they are."""
-        return self._terms.frame(self._sources.live(self.goal.now(), self.goal.ahead()))
+        return self._terms.frame(self._sources.live(self._told()))
+
+    def _told(self, ids: Tensor | None = None) -> dict[str, Tensor]:
+        """What the goal tells worlds `ids (n,)`, all for None, see `Sources.of`."""
+        goal = self.goal
+        return {"goal": goal.now(ids), "ahead": goal.ahead(1, ids), **self._window(ids)}
+
+    def _window(self, ids: Tensor | None = None) -> dict[str, Tensor]:
+        steps = self.task.window
+        return {"window": self.goal.window(steps, ids)} if steps else {}
 
     def _observe(self) -> Tensor:
         return seen_by(self._terms.obs, self._frame())
+
+    @property
+    def obs_widths(self) -> dict[str, int]:
+        """How many numbers each term of the observation gives, by name and in order."""
+        frame = self._frame()
+        return {term.name: seen_by((term,), frame).shape[1] for term in self._terms.obs}
 
     # --- motion prior -------------------------------------------------------------------------
 
@@ -337,7 +389,7 @@ class ImitationEnv:
 
     @cached_property
     def _clip_features(self) -> ClipFeatures:
-        return ClipFeatures(self.reference, self._terms.style)
+        return ClipFeatures(self.reference, self._terms.style, left=self._left)
 
     # --- copies and persistence ---------------------------------------------------------------
 
