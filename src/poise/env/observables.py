@@ -44,9 +44,14 @@ class Context:
 
 
 def headed(pose: Pose, left: Tensor | None) -> Pose:
-    """Poses as an environment sees them, whose headings go by the root's axis `left (3)`; packed ones
-    hold the twist."""
+    """Poses as an environment sees them, with headings by the root's axis `left (3)`; packed ones hold
+    the twist."""
     return pose if left is None else replace(pose, heading=lateral_heading(pose.qpos[..., 3:7], left))
+
+
+def hinge_torques(servos: Tensor, damping: Tensor) -> Tensor:
+    """What both of MuJoCo's generalized forces `(N, 6 + n)` exert on each hinge, N m `(N, n)`."""
+    return (servos + damping)[:, 6:].float()
 
 
 def sim(frame: Frame) -> Pose:
@@ -133,8 +138,7 @@ def age(frame: Frame) -> Tensor | None:
 
 def torque(frame: Frame) -> Tensor | None:
     """What servos and damping exert on each hinge at the end of the step, N m `(N, n)`."""
-    # The hinges' part of the generalized forces, after the root's six.
-    return (frame.source("qfrc_actuator") + frame.source("qfrc_damper"))[:, 6:].float()
+    return hinge_torques(frame.source("qfrc_actuator"), frame.source("qfrc_damper"))
 
 
 def torque_before(frame: Frame) -> Tensor | None:
@@ -156,5 +160,7 @@ def sizes(frame: Frame) -> Tensor | None:
 STANDARD: dict[str, Observable] = {
     name: fn
     for name, fn in vars().copy().items()
-    if getattr(fn, "__module__", "") == __name__ and isinstance(fn, FunctionType)
+    if getattr(fn, "__module__", "") == __name__
+    and isinstance(fn, FunctionType)
+    and name not in ("headed", "hinge_torques")
 }

@@ -171,6 +171,10 @@ class Terms:
         ends = torch.stack(self.ends(frame, failed))
         return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
 
+    def widths(self, frame: Frame) -> dict[str, int]:
+        """How many numbers each observation gives, by name and in order."""
+        return {term.name: seen_by((term,), frame).shape[1] for term in self.obs}
+
     def check(self, sources: Mapping[str, Tensor], worlds: int) -> None:
         """Evaluates every term once, and names one that gives what it must not.
 
