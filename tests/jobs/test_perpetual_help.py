@@ -198,7 +198,7 @@ def test_a_checkpoint_with_one_scale_for_all_goes_on_by_clip(
     """Settings of before there was help by clip or moment say that all share one."""
     config, until = tiny(single=True, expert=False, help_by="clip"), Until(iterations=8)
     old = {k: v for k, v in to_data(config).items() if k not in ("help_by", "adaptive_sampling")}
-    assert config_of(old) == replace(config, help_by="all", adaptive_sampling=0.0, heading="twist")
+    assert config_of(old) == replace(config, help_by="all", adaptive_sampling=0.0)
     stages = StageTrainer(begin(tmp_path, library(), config), tmp_path, until, 1, tensorboard=False)
     plain: Callable[[], dict[str, Tensor]] = stages.env.help.state
     monkeypatch.setattr(stages.env.help, "state", lambda: {"help": plain()["help"][:4]})

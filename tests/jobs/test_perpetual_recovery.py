@@ -206,9 +206,7 @@ def test_runs_of_before_there_was_recovery_stay_as_they_were(tmp_path: Path) -> 
     old = to_data(tiny(recovery=False))
     for name in ("recovery", "recovering", "multiplicative", "progressive"):
         del old[name]
-    assert config_of(old) == replace(
-        tiny(recovery=False), recovering=Perpetual().recovering, heading="twist"
-    )
+    assert config_of(old) == replace(tiny(recovery=False), recovering=Perpetual().recovering)
     config = tiny(recovery=False, recovering=Perpetual().recovering)
     begin(tmp_path, library(), config)
     tensors, meta = load_checkpoint(tmp_path / RUN_FILE)
