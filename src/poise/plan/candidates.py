@@ -25,7 +25,8 @@ class Changes(NamedTuple):
 
     Attributes:
         offsets: `(N, H, A)` rad.
-        keep: `(N, 1)`, share of the last action that actions keep.
+        keep: `(N, 1)`, share of the last action that actions keep, in place of the environment's own
+            (`TaskConfig.filter`).
         much: `(N, 1)`, share of the policy's own action.
     """
 
@@ -91,7 +92,9 @@ class Candidates:
         ref_pos, ref_quat = [aim.pos[own].clone()], [aim.quat[own].clone()]
         cost, lost = torch.zeros(n), torch.zeros(n, dtype=torch.bool)
         ended = torch.zeros(groups, dtype=torch.bool)
-        keep, factor = changes.keep if past.shape[1] else torch.zeros_like(changes.keep), 1.0
+        # Nothing came before the first action of an episode.
+        keep = changes.keep * (env.age > 0).unsqueeze(1) if past.shape[1] else 0.0 * changes.keep
+        factor = 1.0
         for offset in changes.offsets.unbind(1):
             # The last frame of a clip is a goal that is reached.
             ended |= env.goal.layout.place(env.goal.now()).end[own] > 0
@@ -99,7 +102,7 @@ class Candidates:
                 break
             action = torch.lerp(changes.much * self.policy.act(obs) + offset, env.action, keep)
             keep = changes.keep
-            obs = env.step(action).final_obs
+            obs = env.step(env.unfiltered(action)).final_obs
             pose = env.pose()
             pos.append(pose.pos.clone())
             quat.append(pose.quat.clone())

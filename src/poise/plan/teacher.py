@@ -136,9 +136,10 @@ class LookaheadTeacher:
         drawn = draw_offsets(len(rows), self.copies, c.noise_range, self._rng)
         drawn[:: c.candidates] = 0.0
         held = (torch.arange(c.horizon) < c.hold_steps).float()
-        off, on = torch.zeros(len(rows), 1), torch.ones(len(rows), 1)
+        # They act as the learner does: through the environment's own filter.
+        kept, on = torch.full((len(rows), 1), env.task.filter), torch.ones(len(rows), 1)
         assert self._past is not None
-        changes = Changes(drawn[:, None] * held[:, None], off, on)
+        changes = Changes(drawn[:, None] * held[:, None], kept, on)
         told = tries.tried(env.snapshot(worlds).picked(rows), changes, self._past[rows], c.worlds)
         price = told.rough.price(told.source, c.jerk_price, c.slide_price)
         cost = (told.cost + price).nan_to_num(torch.inf).view(c.worlds, -1)
