@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from tyro.conf import arg
 
@@ -39,6 +39,10 @@ else:
     )  # fmt: skip
 
 
+#: What teaches a policy beside its rewards.
+Teacher: TypeAlias = Literal["lookahead"]
+
+
 @dataclass(frozen=True)
 class Primitives(_Derived):
     """What only the recipe perpetual knows."""
@@ -53,12 +57,15 @@ class Primitives(_Derived):
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
+    teacher: Annotated[Teacher | None, arg(metavar="lookahead", help_behavior_hint="")] = None
+    """perpetual: lookahead tells the policy what it should have done where it comes to; the policy
+    learns from that alone, and PPO trains the critic. With --from the policy comes to observe more."""
     style: Flag = True
     """perpetual: reward the task alone; by default a discriminator rewards motion like the library's."""
 
 
 #: Options that stand for a policy or for other settings than their names say.
-BY_HAND = ("recovery_clips", "going_on", "paths", "style")
+BY_HAND = ("recovery_clips", "going_on", "paths", "style", "teacher")
 
 
 def settings(
@@ -83,6 +90,8 @@ def settings(
         values["style"] = None
     additive = values.get("action") == "additive"
     default = perpetual.Perpetual.additive() if additive else perpetual.Perpetual()
+    if primitives.teacher:
+        default = default.taught()
     return training.settings("perpetual", default, body, values)
 
 
@@ -94,7 +103,7 @@ def check_going_on(primitives: Primitives, body: Body, library: Library, returns
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    free = {"recovery", "recovery_clips", "single", "going_on"}
+    free = {"recovery", "recovery_clips", "single", "going_on", "teacher"}
     if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.add("max_primitives")
     names = [name for name in given(primitives, body) if name not in free]
@@ -130,14 +139,21 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         if o.recipe_settings.num_envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
         config = going_on(tracker.config, config, returns)
+        if primitives.teacher:
+            asked = o.recipe_settings.num_envs
+            config = config.taught() if asked is None else replace(config.taught(), num_envs=asked)
     imitation = begin(library, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
-    t, result = training, None
+    t, result, trained = training, None, None
+    if tracker is not None and not held:
+        from poise.jobs.warm_start import widened
+
+        trained = widened(tracker, imitation)
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
         result = train(
             imitation, out, until, show, t.threads, device=t.device, beginning=beginning(),
-            trained=tracker and tracker.policy,
+            trained=trained,
         )  # fmt: skip
     if result is None or result.interrupted:
         where = "" if result is None or result.last is None else f" in {result.last.stage.name}"

@@ -310,6 +310,16 @@ class Perpetual:
         }  # fmt: skip
         return cls(**(_PHC | own | changes))
 
+    def taught(self) -> Perpetual:
+        """The same settings with a teacher that looks ahead. What is observed and done suits it: the
+        heading of the hips, later frames, a filter of actions. Most time is the teacher's, and few
+        worlds train the critic."""
+        recovering = replace(self.recovering, demonstration_share=0.15)
+        return replace(
+            self, heading="hips", window=(2, 4, 8), filter=0.5, root=0.2, num_envs=128,
+            recovering=recovering, teacher=TeacherConfig(),
+        )  # fmt: skip
+
     @property
     def widens(self) -> bool:
         """Whether ranges of hinges may grow after training: absolute targets are shares of them."""
