@@ -137,8 +137,8 @@ def _shared(passage: Passage, turned: Tensor, share: bool) -> dict[int, Tensor]:
     """World turns `(T, 4)` from the common pose of the target's spine, neck and head.
 
     A chain's joints have places in [0, 1] from what carries it (0) to its last joint (1); between the
-    source's joints the turn is interpolated, or without `share` that of the joint below where the target's
-    spine has more of them.
+    source's joints the turn is interpolated, or without `share` that of the joint below where the spine
+    of the target has more of them.
     """
     out: dict[int, Tensor] = {}
     joints = passage.joints

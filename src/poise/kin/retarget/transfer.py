@@ -23,8 +23,8 @@ class RetargetConfig:
     contacts: hold planted feet and hands where the source's are, scaled. clear: lift what would sink
     deeper into the floor than in the source. scale: size of the path, by default the ratio of the
     heights of the hips. share: where the target's spine has more joints than the source's, they share
-    its bend out; without, those that lie on a bone of the source move as that bone. rigid: roles that keep
-    to what carries them.
+    its bend out; without, those that lie on a bone of the source move as that bone. rigid: roles that
+    keep to what carries them.
     """
 
     contacts: bool = True
