@@ -103,7 +103,8 @@ class Tracker:
         Raises:
             PoiseError: see `own_body`.
         """
-        humanoid, example = own_body(clip, self.humanoid, self.example, self.config.body)
+        table, example = own_body(clip, self.humanoid.table, self.example, self.config.body)
+        humanoid = make_humanoid(example.skeleton, table)
         self.config.sim.apply(humanoid.model)
         return replace(self, humanoid=humanoid, example=example, onto=onto_own(humanoid.table))
 

@@ -24,6 +24,13 @@ def core() -> tuple[Humanoid, Clip]:
     return make_humanoid(example.skeleton, generate_table(example.skeleton, None, (example,))), example
 
 
+def own(clip: Clip) -> tuple[Humanoid, Clip]:
+    """The core with the bones of a clip, and the example on it."""
+    base, example = core()
+    table, there = own_body(clip, base.table, example)
+    return make_humanoid(there.skeleton, table), there
+
+
 def other() -> Clip:
     """A motion of a human with one spine joint, other proportions, and fingers."""
     small = human(0.8)
@@ -50,9 +57,9 @@ def apart(a: Clip, b: Clip) -> float:
 
 
 def test_it_keeps_the_topology_and_takes_the_bones():
-    base, example = core()
+    base, _ = core()
     clip = other()
-    body, there = own_body(clip, base, example)
+    body, there = own(clip)
     assert (body.bodies, body.hinges) == (base.bodies, base.hinges)
     assert [r.frame for r in body.table.rows] == [r.frame for r in base.table.rows]
     bone = np.linalg.norm(body.skeleton.offsets, axis=-1)
@@ -60,19 +67,18 @@ def test_it_keeps_the_topology_and_takes_the_bones():
     for name in ("LeftLeg", "RightFoot", "LeftForeArm", "RightHand"):
         assert bone[body.skeleton.index(name)] == pytest.approx(wanted[clip.skeleton.index(name)])
     # As tall as its legs say, as heavy as that height says, and as strong.
-    own = generate_table(clip.skeleton, None, (clip,))
-    assert body.table.height_m == pytest.approx(own.height_m)
-    assert body.mass == pytest.approx(own.mass, rel=1e-6)
+    alone = generate_table(clip.skeleton, None, (clip,))
+    assert body.table.height_m == pytest.approx(alone.height_m)
+    assert body.mass == pytest.approx(alone.mass, rel=1e-6)
     assert there.skeleton is body.skeleton
     # The feet stand as the clip's do.
-    soles = [t.rows[t.index("LeftFoot")].geoms[0].size for t in (body.table, own)]
+    soles = [t.rows[t.index("LeftFoot")].geoms[0].size for t in (body.table, alone)]
     np.testing.assert_allclose(soles[0], soles[1], rtol=1e-3)
 
 
 def test_a_motion_goes_there_and_back_without_error():
-    base, example = core()
     clip = other()
-    body, there = own_body(clip, base, example)
+    body, there = own(clip)
     how = onto_own(body.table)
     moved, report = retarget(clip, there, config=how)
     assert apart(clip, moved) < 0.01 and report.scale == 1.0
@@ -84,14 +90,13 @@ def test_a_motion_goes_there_and_back_without_error():
 
 def test_the_same_bones_are_the_same_body():
     base, example = core()
-    assert own_body(example, base, example) == (base, example)
+    assert own_body(example, base.table, example) == (base.table, example)
     # Without the short cut the skeleton comes out as it went in.
     made = own_skeleton(example, example)
     np.testing.assert_allclose(made.offsets[1:], base.skeleton.offsets[1:], atol=1e-9)
 
 
 def test_a_spine_with_fewer_joints_moves_as_its_bones_do():
-    base, example = core()
     clip = swing(2.0, 30.0)
     skeleton, names = clip.skeleton, [n for n in clip.skeleton.names if n != "Spine"]
     keep = [skeleton.index(n) for n in names]
@@ -100,7 +105,7 @@ def test_a_spine_with_fewer_joints_moves_as_its_bones_do():
     rot = clip.rot[:, keep].copy()
     rot[:, names.index("Chest")] = (np.cos(0.2), 0.0, np.sin(0.2), 0.0)
     few = Clip(Skeleton(tuple(names), parents, skeleton.offsets[keep]), clip.root_pos, rot, 30.0)
-    body, there = own_body(few, base, example)
+    body, there = own(few)
     shared, _ = retarget(few, there, config=replace(onto_own(body.table), share=True))
     exact, _ = retarget(few, there, config=onto_own(body.table))
     assert apart(few, exact) < 0.01 and apart(few, shared) > 5.0
@@ -108,7 +113,7 @@ def test_a_spine_with_fewer_joints_moves_as_its_bones_do():
 
 def test_the_mass_can_be_stated_and_a_body_from_a_file_stays():
     base, example = core()
-    body, _ = own_body(other(), base, example, BodyConfig(mass_kg=40.0))
+    body, _ = own_body(other(), base.table, example, BodyConfig(mass_kg=40.0))
     assert body.mass == pytest.approx(40.0)
     with pytest.raises(PoiseError, match="keeps its lengths"):
-        own_body(other(), base, example, BodyConfig(mjcf="body.xml"))
+        own_body(other(), base.table, example, BodyConfig(mjcf="body.xml"))
