@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from poise.body import generate_table, make_humanoid
 from poise.env import ObsTerm, RewardTerm
-from poise.env.frame import Frame, Pose
+from poise.env.frame import Frame, PointGoal, Pose
 from poise.env.terms import done, phc_obs, phc_reward
 from poise.errors import PoiseError
 from poise.spatial import axis_angle_to_quat, heading_quat, normalize, quat_mul, quat_rotate
@@ -27,6 +27,7 @@ OBSERVATIONS = [
     (phc_obs.keypoint_goal, {}),
     (phc_obs.keypoint_goal, {"bodies": torch.tensor([3, 0])}),
     (phc_obs.motion_features, {"tips": TIPS}),
+    (phc_obs.goal_later, {"step": 1, "bodies": torch.tensor([3, 1])}),
 ]
 REWARDS = [
     phc_reward.body_positions,
@@ -54,7 +55,8 @@ def a_frame(
 ) -> Frame:
     ones = torch.ones(N)
     given = {"phase": ones, "residual": torch.zeros(N, 0), "reg": ones, "min_height": ones}
-    return Frame.given(sim=sim, ref=ref or sim, ahead=ahead, **(given | more))
+    window = ahead and Pose(*(torch.stack((x, x), 1) for x in vars(ahead).values()))
+    return Frame.given(sim=sim, ref=ref or sim, ahead=ahead, window=window, **(given | more))
 
 
 def moved(pose: Pose, yaw: float, shift: tuple[float, float]) -> Pose:
@@ -114,6 +116,13 @@ def naive(name: str, sim: Pose, goal: Pose, bodies: list[int], world: int) -> np
         parts = [h @ (to["pos"][b] - at["pos"][b]) for b in bodies]
         parts += [h @ (to["linvel"][b] - at["linvel"][b]) for b in bodies]
         parts += [h @ (to["pos"][b] - root) for b in bodies]
+    elif name == "goal_later":
+        begin = to["pos"][0]
+        yaw = (Rotation.from_matrix(facing(goal.quat[world, 0].double().numpy())).inv() * turn).as_euler(
+            "ZYX"
+        )[0]
+        parts = [h @ (begin - root), *(h @ (to["pos"][b] - begin) for b in bodies)]
+        parts += [np.array([math.cos(yaw), math.sin(yaw)])]
     else:
         parts = [root[2:], sixd(turn * now[0]), h @ at["linvel"][0], h @ at["angvel"][0]]
         parts += [h @ (at["pos"][b] - root) for b in TIPS.tolist()]
@@ -171,6 +180,16 @@ def test_a_keypoint_goal_never_looks_at_rotations():
     for term in (phc_obs.rotation_goal, phc_obs.keypoint_goal):
         with pytest.raises(ValueError, match="next reference frame"):
             term(a_frame(sim))
+
+
+def test_a_later_goal_tells_keypoints_no_turn_and_a_point_nothing():
+    frame = a_frame(a_pose(0), a_pose(1))
+    bodies = torch.tensor([1, 2])
+    whole = phc_obs.goal_later(frame, 0, bodies)
+    assert torch.equal(phc_obs.goal_later(frame, 0, bodies, turns=False), whole[:, :-2])
+    far = PointGoal(torch.tensor([True, False, False]), torch.ones(N), torch.ones(N))
+    told = phc_obs.goal_later(frame.replaced(point=far), 0, bodies)
+    assert not told[0].any() and torch.equal(told[1:], whole[1:])
 
 
 def test_the_shape_is_limb_lengths_and_masses():
@@ -251,6 +270,47 @@ def test_the_energy_is_not_halved_by_the_prior():
     assert phc_reward.energy_term(1.0, "paper").params["form"] == "paper"
     with pytest.raises(PoiseError, match="cost"):
         RewardTerm("energy", phc_reward.energy, -1.0)
+
+
+def test_the_roots_place_by_hand():
+    sim = a_pose(0)
+    error = torch.zeros(N, B, 3)
+    error[:, 0] = torch.tensor([0.06, 0.0, 0.08])
+    close(phc_reward.root_position(a_frame(sim)), 1.0)
+    close(phc_reward.root_position(a_frame(sim, ref=replace(sim, pos=sim.pos + error))), math.exp(-1))
+
+
+def test_prices_of_changes_by_hand_and_the_first_step_is_free():
+    before, now = torch.zeros(N, H), torch.zeros(N, H)
+    before[:, 0], now[:, 1] = 0.3, 0.4
+    age = torch.tensor([1, 2, 9])
+    frame = a_frame(a_pose(0), age=age, action=now, action_before=before)
+    torch.testing.assert_close(phc_reward.action_rate(frame), torch.tensor([0.0, 0.25 / H, 0.25 / H]))
+    limits = torch.tensor([3.0, 2.0, 1.0, 1.0, 1.0, 1.0])
+    frame = a_frame(a_pose(0), age=age, torque=now, torque_before=before)
+    want = (0.01 + 0.04) / H
+    torch.testing.assert_close(
+        phc_reward.torque_rate(frame, limits), torch.tensor([0.0, want, want]), atol=1e-7, rtol=0
+    )
+    with pytest.raises(ValueError, match="before"):
+        phc_reward.torque_rate(a_frame(a_pose(0)), limits)
+    term = phc_reward.cost_term(phc_reward.torque_rate, 0.2, 0.5, limits=limits)
+    assert term.name == "torque_rate" and term.weight == -0.4 and not term.imitation
+
+
+def test_only_soles_that_touch_the_ground_slide():
+    still = a_pose(0)
+    pos, quat = torch.zeros(N, B, 3), torch.tensor([1.0, 0, 0, 0]).expand(N, B, 4)
+    linvel, angvel = torch.zeros(N, B, 3), torch.zeros(N, B, 3)
+    pos[:, 3:, 2] = 0.05
+    pos[2, 4, 2] = 0.5  # A lifted foot.
+    linvel[:, 3:, 0] = 0.3
+    angvel[1, 3, 2] = 1.0  # It turns on the spot, too: the points 10 cm ahead move sideways.
+    linvel[1, 4, 2] = 0.5  # A foot that rises.
+    sim = replace(still, pos=pos, quat=quat, linvel=linvel, angvel=angvel)
+    points = torch.tensor([[0.1, 0.0, -0.05], [0.0, 0.0, 0.05]] * 2)
+    told = phc_reward.foot_slide(a_frame(sim), torch.tensor([3, 3, 4, 4]), points)
+    torch.testing.assert_close(told, torch.tensor([0.3, math.hypot(0.3, 0.1) / 2, 0.15]))
 
 
 # --- early termination -----------------------------------------------------------------------------

@@ -37,6 +37,7 @@ def perpetual(recovers: str | None = None, **settings: object) -> Imitation:
     return replace(made, task=replace(task, horizon=20, adaptive=0.5, first=0.2))
 
 
+RATES = {"action_rate": 2.0, "torque_rate": 2.0}
 #: The tasks of every recipe, as training has them.
 TASKS: dict[str, Callable[[], Imitation]] = {
     "imitate": imitation,
@@ -49,6 +50,7 @@ TASKS: dict[str, Callable[[], Imitation]] = {
     "shapes": lambda: perpetual(shapes=BodyShapes(count=3), recovery=False),
     "keypoints": lambda: perpetual(goal="keypoints"),
     "additive": lambda: perpetual(action="additive", style=None),
+    "filtered": lambda: perpetual(filter=0.6, window=(2, 4), root=0.2, foot_slide=0.1, **RATES),
 }
 
 

@@ -152,7 +152,7 @@ def test_no_step_mixes_devices(make_task, settings):
         env.pose()
         ids = torch.arange(2, device=ELSEWHERE)
         ahead = env.goal.ahead()[ids]
-        env._terms.observe(env._sources.of(ahead, ahead, ids))
+        env._terms.observe(env._sources.of({"goal": ahead, "ahead": ahead}, ids))
         env.reset()
 
 

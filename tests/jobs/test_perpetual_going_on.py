@@ -13,9 +13,12 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import begin, going_on, train
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.jobs.tracker import load_tracker, save_tracker
-from poise.learn import Until
+from poise.jobs.tracker import Tracker, load_tracker, save_tracker
+from poise.jobs.warm_start import widened
+from poise.learn import Until, Value
 from poise.motion import ClipLibrary
+from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import build
 from poise.spatial import quat_mul
 from toy_human import swing
 from toy_library import library, tiny
@@ -84,3 +87,55 @@ def test_another_body_and_a_composer_are_refused(policy: Path, tmp_path: Path) -
     assert not (tmp_path / "run").exists()
     with pytest.raises(PoiseError, match="primitives and a composer"):
         going_on(replace(ONE, single=False), ONE)
+
+
+WIDER = {"heading": "twist", "window": (2, 4), "filter": 0.5}
+
+
+def wider(tracker: Tracker, **changes: object) -> Imitation:
+    config = replace(going_on(tracker.config, tiny()), **changes)
+    return build(library(), config, tracker.target.table)
+
+
+def test_a_wider_observation_changes_nothing_at_first(policy: Path, tmp_path: Path) -> None:
+    tracker = load_tracker(policy)
+    tracker = replace(tracker, config=replace(tracker.config, heading="twist"))
+    known, task = wider(tracker, heading="twist"), wider(tracker, **WIDER)
+    start = widened(tracker, task)
+    assert start.critic is not None and tracker.value is not None
+    value = Value(start.policy, start.critic, tracker.config.ppo.activation)
+    narrow, wide = (t.env(3, threads=1, auto_reset=False) for t in (known, task))
+    zero = torch.arange(3)
+    obs, more = narrow.reset_to(zero, zero), wide.reset_to(zero, zero)
+    for _ in range(4):
+        action = tracker.policy.act(obs)
+        torch.testing.assert_close(start.policy.act(more), action, atol=1e-5, rtol=0)
+        torch.testing.assert_close(value(more), tracker.value(obs), atol=1e-4, rtol=0)
+        obs = narrow.step(action).final_obs.clone()
+        more = wide.step(wide.unfiltered(action)).final_obs.clone()
+    assert more.shape[1] > obs.shape[1] and start.policy.num_obs == more.shape[1]
+    # What is new has been measured, and is learned.
+    added = start.policy.norm.std[obs.shape[1] :]
+    assert bool(((added > 0) & (added < 1)).any())
+    narrow.close()
+    wide.close()
+    write = begin(tmp_path, library(), task.config, earlier=tracker)
+    stages = StageTrainer(write, tmp_path, Until(iterations=4), 1, tensorboard=False, trained=start)
+    critic = stages.trainer.ppo.state()
+    assert all(torch.equal(critic[k], v) for k, v in start.critic.items() if k.startswith("critic/"))
+    # The critic learns alone at first.
+    for _ in range(4):
+        stages.iterate()
+    stages.save()
+    stages.close()
+    again = open_run(tmp_path).tracker
+    assert again.policy.num_obs == start.policy.num_obs
+    first = next(v for k, v in again.policy.state().items() if k.endswith("layers.0.weight"))
+    assert bool(first[:, tracker.policy.num_obs :].any())
+    # It goes on widening from there; a narrower task, and another goal, are refused.
+    longer = widened(again, wider(again, window=(2, 4, 8)), steps=0)
+    assert longer.policy.num_obs > again.policy.num_obs
+    with pytest.raises(PoiseError, match="observes 'goal_in_4'"):
+        widened(again, wider(again, window=(2,)))
+    with pytest.raises(PoiseError, match="observes 'rotation_goal'"):
+        widened(tracker, wider(tracker, goal="keypoints"))

@@ -69,8 +69,14 @@ def test_a_seed_repeats_it(task: Imitation, tracker: Tracker) -> None:
     assert not torch.equal(run(env, made(task, tracker, replace(FEW, seed=1))), first)
 
 
-def test_what_it_predicts_happens(task: Imitation, tracker: Tracker) -> None:
+def filtered(task: Imitation, keep: float) -> Imitation:
+    return replace(task, task=replace(task.task, filter=keep))
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.6])
+def test_what_it_predicts_happens(task: Imitation, tracker: Tracker, keep: float) -> None:
     """The character comes to where the chosen copy came; but for rounding."""
+    task = filtered(task, keep)
     env = alone(task)
     control = made(task, tracker)
     zero = torch.zeros(1, dtype=torch.long)
@@ -127,6 +133,28 @@ def test_without_anything_to_try_it_is_the_policy(task: Imitation, tracker: Trac
     for action in actions:
         torch.testing.assert_close(action, tracker.policy.act(obs), atol=1e-6, rtol=1e-5)
         obs = other.step(action).final_obs
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_its_shares_replace_those_of_a_filter(task: Imitation, tracker: Tracker, share: float) -> None:
+    nothing = LookaheadConfig(
+        candidates=4, horizon=4, noise_range=(1e-12, 1e-12), smoothing=(share,), corrections=(1.0,)
+    )
+    env, zero = alone(filtered(task, 0.6)), torch.zeros(1, dtype=torch.long)
+    control = made(filtered(task, 0.6), tracker, nothing)
+    # The first copy does what the policy does, and not what was asked of the others.
+    assert control._keep.flatten().tolist() == pytest.approx([0.6, share, share, share])
+    control._keep[0] = share
+    obs = env.reset_to(zero, zero)
+    control.watch(env)
+    last = None
+    for _ in range(6):
+        own = tracker.policy.act(obs)
+        given = control.act(obs)
+        obs = env.step(given).final_obs
+        want = own if last is None else (1 - share) * own + share * last
+        torch.testing.assert_close(env.action, want, atol=1e-5, rtol=1e-4)
+        last = env.action.clone()
 
 
 def test_several_worlds_and_the_end_of_a_clip(task: Imitation, tracker: Tracker) -> None:

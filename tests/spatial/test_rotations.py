@@ -174,6 +174,27 @@ def test_slerp_of_near_neighbours_stays_unit_and_between(gap):
     same_rotation(mid, half, 1e-12)
 
 
+@pytest.mark.parametrize("left", [(0.0, 1.0, 0.0), (0.6, 0.7, 0.2)])
+def test_the_lateral_heading_is_steady_upside_down(left):
+    axis = torch.tensor(left, dtype=torch.float64)
+    axis = axis / axis.norm()
+    flat = torch.tensor([axis[0], axis[1], 0.0]).double() / axis[:2].norm()
+    turn = spatial.axis_angle_to_quat
+    up = torch.tensor([0.0, 0, 1]).double()
+    pure = turn(up, torch.tensor(0.7).double())
+    angles = torch.linspace(0, 2 * math.pi, 37).double()
+    # A somersault about the level axis leaves it where it is.
+    over = turn(flat.expand(37, 3), angles)
+    level = spatial.lateral_heading(spatial.quat_mul(pure.expand(37, 4), over), flat)
+    same_rotation(level, pure.expand(37, 4), 1e-9)
+    # Upright both headings are the same, and a turn of the world turns it by as much.
+    same_rotation(spatial.lateral_heading(pure[None], axis), pure[None], 1e-12)
+    more = turn(up, torch.tensor(2.0).double())[None].expand(37, 4)
+    again = spatial.lateral_heading(spatial.quat_mul(more, over), axis)
+    same_rotation(again, spatial.quat_mul(more, spatial.lateral_heading(over, axis)), 1e-9)
+    assert spatial.lateral_heading(over, torch.tensor([0.0, 0.0, 1.0]).double()).isfinite().all()
+
+
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-3.0, 3.0), st.floats(-1.5, 1.5))
 def test_heading_is_the_turn_about_z(yaw, tilt):

@@ -70,6 +70,24 @@ class Humanoid:
         return (*self.rows_of("foot"), *self.rows_of("hand"), *head)
 
     @property
+    def left(self) -> tuple[float, float, float]:
+        """Unit axis in the root's frame from the right hip to the left one, at zero angles.
+
+        Raises:
+            PoiseError: the body has no thigh on either side.
+        """
+        rows = self.table.rows
+        sides = {rows[i].side: i + 1 for i in self.rows_of("thigh")}
+        if not {"left", "right"} <= sides.keys():
+            raise PoiseError("the body has no two thighs, between which its left is", "Humanoid")
+        data = mujoco.MjData(self.model)
+        data.qpos[:], data.qpos[3] = 0.0, 1.0
+        mujoco.mj_kinematics(self.model, data)
+        axis = data.xpos[sides["left"]] - data.xpos[sides["right"]]
+        x, y, z = (float(a) for a in axis / np.linalg.norm(axis))
+        return x, y, z
+
+    @property
     def identity(self) -> str:
         """A short hash of names, hinges and sizes: checkpoints carry it and refuse another body."""
         text = repr([(r.name, r.order, r.parent, np.round(r.pos, 6).tolist()) for r in self.table.rows])

@@ -54,6 +54,18 @@ def _drop_whole_slices(graph: Any) -> None:
             node.destroy()
 
 
+def keep_actions(actions: Tensor, last: Tensor, kept: Tensor, hinges: int) -> None:
+    """Filters the hinges' part of `actions (N, A)` in place, by the share `kept (N, 1)` of the `last`:
+    a_t = (1 - f) u_t + f a_(t-1)."""
+    actions[:, :hinges] = torch.lerp(actions, last, kept)[:, :hinges]
+
+
+def unkept_actions(actions: Tensor, last: Tensor, kept: Tensor, hinges: int) -> Tensor:
+    """What `keep_actions` makes `actions (N, A)` of, u_t = (a_t - f a_(t-1)) / (1 - f)."""
+    joints = ((actions - kept * last) / (1.0 - kept))[:, :hinges]
+    return torch.cat((joints, actions[:, hinges:]), 1)
+
+
 class Actuation:
     """Fills a backend's drive from actions of `hinges` joint actions followed by the residual's.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypeVar
 
 import torch
@@ -10,13 +10,13 @@ from torch import Tensor
 
 from poise.control import Wrench
 from poise.env import observables
-from poise.env.actuation import Actuation
+from poise.env.actuation import Actuation, keep_actions, unkept_actions
 from poise.env.frame import FIELDS, Frame, Pose, placed
 from poise.env.goals.goal import Goal
 from poise.env.make import goal_of, plugins_of
-from poise.env.plugins import Ended, Plugin, combined
+from poise.env.plugins import Ended, Plugin, combined, ends_of
 from poise.env.reference import Reference
-from poise.env.snapshot import Snapshot, put, take
+from poise.env.snapshot import Snapshot, put, put_state, state_of, take
 from poise.env.style import ClipFeatures, ClipWindows
 from poise.env.task import EnvStep, StepLog, TaskConfig
 from poise.env.terms.evaluate import Sources, Terms, seen_by
@@ -44,7 +44,8 @@ class ImitationEnv:
         plugins: help, adaptive sampling, recovery, bodies, ... as far as the task has them.
         help: what is left of the residual force, see `HelpBudget`.
         age: `(N,)` control steps since the episode began.
-        action: `(N, A)` the last one.
+        action: `(N, A)` the last one, as it acted.
+        given: `(N, A)` the last one, as it was given; the same without `TaskConfig.filter`.
         wrench: what the residual force was.
         terms, imitation: values of the last step's rewards by name, and the imitation reward `(N,)`.
     """
@@ -74,6 +75,10 @@ class ImitationEnv:
         n, here = self.num_envs, self.device
         self.age = torch.zeros(n, dtype=torch.long, device=here)
         self.action = torch.zeros(n, self.num_actions, device=here)
+        self.given = torch.zeros_like(self.action)
+        # What acted in the step before, and the hinges' torques at the begin of the last one.
+        self._action_before = torch.zeros_like(self.action)
+        self._torque_before = torch.zeros(n, self.hinges, device=here)
         self.wrench: Wrench | None = None
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
@@ -90,7 +95,7 @@ class ImitationEnv:
         self._terms = self._make_terms(fused)
         self.goal.aim(None, None)
         # Once as they are, so that it is known which tensors the terms read.
-        self._terms.check(self._sources.live(self.goal.now(), self.goal.ahead()), n)
+        self._terms.check(self._sources.live(self._told()), n)
         self._sources.settle()
         # Worlds stand on their goals where these are known already.
         obs = self._set_down(None) if self.goal.begins else self.observe()
@@ -102,16 +107,19 @@ class ImitationEnv:
         task, model, here = self.task, self.backend.model, self.device
         named = {**observables.STANDARD, **task.observables}
         held: dict[str, Tensor] = {"action": self.action, "age": self.age}
+        held |= {"action_before": self._action_before, "torque_before": self._torque_before}
         for plugin in self.plugins:
             named |= plugin.observables
             held |= plugin.sources()
         self._sources = Sources(self.backend, held)
         roots = torch.as_tensor(model.body_rootid[1:], dtype=torch.long).to(here)
+        self._left = None if task.left is None else task.left.to(here)
         context = observables.Context(
-            self.goal.layout, self.goal.local, roots, self.hinges, task.residual
+            self.goal.layout, self.goal.local, roots, self.hinges, task.residual, self._left
         )
+        ends = partial(ends_of, self.plugins, task.horizon)
         kinds = placed(task.obs, here), placed(task.rewards, here), placed(task.dones, here)
-        return Terms(*kinds, placed(task.style, here), named, context, self._ends, here, fused)
+        return Terms(*kinds, placed(task.style, here), named, context, ends, here, fused)
 
     # --- what is followed ---------------------------------------------------------------------
 
@@ -216,9 +224,16 @@ class ImitationEnv:
             raise PoiseError(
                 f"actions must be ({self.num_envs}, {self.num_actions}), got {tuple(actions.shape)}"
             )
-        # A copy, since a restart clears its rows and the caller's actions are the caller's.
-        self.action.copy_(actions)
         goal, task = self.goal, self.task
+        self._action_before.copy_(self.action)
+        if self._sources.reads("torque_before"):
+            forces = (self.backend.state[k] for k in ("qfrc_actuator", "qfrc_damper"))
+            self._torque_before.copy_(observables.hinge_torques(*forces))
+        # A copy, since a restart clears its rows and the caller's actions are the caller's.
+        self.given.copy_(actions)
+        self.action.copy_(actions)
+        if task.filter:
+            keep_actions(self.action, self._action_before, self._kept(), self.hinges)
         row, group = goal.row(), goal.group(task.help_by)
         targets, rows = goal.targets()
         if self._targeting and task.pd.mode == "additive":
@@ -233,7 +248,8 @@ class ImitationEnv:
         for plugin in self._ticking:
             plugin.tick()
         ref, ahead = goal.advance(waited, self._held())
-        final, scores, ends, self._style = self._terms.judge(self._sources.of(ref, ahead))
+        told = self._told(None, ref, ahead)
+        final, scores, ends, self._style = self._terms.judge(self._sources.of(told))
         reward, self.imitation, *values = scores.unbind(0)
         self.terms = {t.name: v for t, v in zip(task.rewards, values, strict=True)}
         failed, terminated, truncated = ends.unbind(0)
@@ -255,12 +271,21 @@ class ImitationEnv:
             if len(ids):
                 self._restart(ids)
                 obs = self._obs.copy_(final)
-                fresh = self._sources.of(goal.now(ids), goal.ahead(1, ids), ids)
+                fresh = self._sources.of(self._told(ids), ids)
                 obs[ids] = self._terms.observe(fresh)
         if self._watched():
             obs = self._observe()
             final = final if task.auto_reset else obs
         return EnvStep(obs, reward, terminated, truncated, final, log, failed)
+
+    def unfiltered(self, actions: Tensor) -> Tensor:
+        """What to give to the next `step` so that `actions (N, A)` act in spite of the task's filter."""
+        kept = self._kept()
+        return unkept_actions(actions, self.action, kept, self.hinges) if self.task.filter else actions
+
+    def _kept(self) -> Tensor:
+        """`(N, 1)`, the share of the last action that the next one keeps."""
+        return self.task.filter * (self.age > 0).to(self.action).unsqueeze(1)
 
     def _watched(self) -> bool:
         """Whether the goal has changed by what it sees of the characters."""
@@ -271,18 +296,6 @@ class ImitationEnv:
         if changed:
             self.goal.aim(None, self._held())
         return changed
-
-    def _ends(self, frame: Frame, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Which episodes failed, are terminated and are truncated."""
-        # A clip that is done to its end is a finished task, and its remaining return is stated: as many
-        # steps like the last as `completion_bonus` says, since with nothing to come the last steps
-        # would not matter and characters would fall in them. To bootstrap there would rest on a state
-        # with a value that is never learned, and the policy comes to exploit it.
-        done = frame.place.end > 0
-        for plugin in self.plugins:
-            failed, done = plugin.ends(frame, failed, done)
-        terminated = failed | done
-        return failed, terminated, (frame.source("age") >= self.task.horizon) & ~terminated
 
     # --- views --------------------------------------------------------------------------------
 
@@ -298,7 +311,7 @@ class ImitationEnv:
 
     def goal_pose(self) -> Pose:
         """What the goal asks for now."""
-        return self.goal.layout.unpacked(self.goal.now())
+        return observables.headed(self.goal.layout.unpacked(self.goal.now()), self._left)
 
     def where(self, env: int) -> str:
         """What world `env` is at, for messages."""
@@ -306,10 +319,22 @@ class ImitationEnv:
 
     def _frame(self) -> Frame:
         """What the terms see of all worlds, from nothing but where they are."""
-        return self._terms.frame(self._sources.live(self.goal.now(), self.goal.ahead()))
+        return self._terms.frame(self._sources.live(self._told()))
+
+    def _told(self, ids: Tensor | None = None, *known: Tensor) -> dict[str, Tensor]:
+        """What the goal tells worlds `ids (n,)`, see `Sources.of`. known: now and one step later."""
+        goal, steps = self.goal, self.task.window
+        now, ahead = known or (goal.now(ids), goal.ahead(1, ids))
+        told = {"goal": now, "ahead": ahead}
+        return {**told, "window": goal.window(steps, ids)} if steps else told
 
     def _observe(self) -> Tensor:
         return seen_by(self._terms.obs, self._frame())
+
+    @property
+    def obs_widths(self) -> dict[str, int]:
+        """How many numbers each term of the observation gives, by name and in order."""
+        return self._terms.widths(self._frame())
 
     # --- motion prior -------------------------------------------------------------------------
 
@@ -337,7 +362,7 @@ class ImitationEnv:
 
     @cached_property
     def _clip_features(self) -> ClipFeatures:
-        return ClipFeatures(self.reference, self._terms.style)
+        return ClipFeatures(self.reference, self._terms.style, left=self._left)
 
     # --- copies and persistence ---------------------------------------------------------------
 
@@ -362,32 +387,12 @@ class ImitationEnv:
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a bit-exact continuation needs; what another kind of backend needs, too."""
-        return {
-            "sim": self.backend.snapshot(),
-            "qpos": self.backend.state.qpos.clone(),
-            "qvel": self.backend.state.qvel.clone(),
-            "age": self.age.clone(),
-            "action": self.action.clone(),
-            **self.goal.state(),
-            **{k: v for plugin in self.plugins for k, v in plugin.state().items()},
-        }
+        return state_of(self)
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continues from `state()`: exactly, or from the same positions and velocities where the state
         is that of another kind of backend (another number format), such as the GPU's."""
-        self.goal.load_state(state)
-        for plugin in self.plugins:
-            plugin.assign(None, self.goal.body(None))
-        if state["sim"].dtype == self.backend.state.qpos.dtype:
-            self.backend.restore(state["sim"])
-        else:
-            self.backend.write(None, state["qpos"], state["qvel"])
-        for name in ("age", "action"):
-            getattr(self, name).copy_(state[name])
-        for plugin in self.plugins:
-            plugin.load_state(state)
-        if self.goal.begins:
-            self.weights = self.weights
+        put_state(self, state)
         self.goal.aim(None, self._held())
 
     def close(self) -> None:

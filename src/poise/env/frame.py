@@ -20,7 +20,8 @@ class Pose:
     qpos `(N, 7 + n)`, qvel `(N, 6 + n)` in MuJoCo's convention (root angular velocity in the root's
     frame); pos `(N, B, 3)` m, quat `(N, B, 4)` wxyz, linvel `(N, B, 3)` m/s and angvel `(N, B, 3)`
     rad/s of every body's origin; com `(N, 3)` m; local `(N, J, 4)` wxyz, each hinged joint's turn.
-    heading `(N, 4)`: the root's turn about +Z.
+    heading `(N, 4)`: the root's turn about +Z: its twist; in frames and poses of an environment by what
+    `TaskConfig.left` says.
     """
 
     qpos: Tensor
@@ -124,12 +125,16 @@ class Frame:
         sim: the character now.
         ref: the reference at the same time.
         ahead: the reference one control step later, None where it is not known.
+        window: the reference at the steps of `TaskConfig.window`; fields are `(N, K, ...)`.
         phase: `(N,)` in [0, 1], place in the clip.
+        action, action_before: `(N, n)` hinges' actions of the last step, as they acted, and of the one
+            before it, 0 at first.
         residual: `(N, k)` unscaled residual action of the last step.
         reg: `(N,)` the regularizer of the residual.
         min_height: `(N,)` m, lowest root height of the reference clip.
         age: `(N,)` control steps since the episode began.
-        torque: `(N, n)` N m that servos and damping exert on each hinge at the end of the step.
+        torque, torque_before: `(N, n)` N m that servos and damping exert on each hinge at the end of the
+            step, and at its begin.
         point: where the reference's root is, in a task with recovery; else None.
         sizes: `(N, K)` of each character's body, see `phc_obs.shape_of`; None where all have one.
     """
@@ -137,12 +142,16 @@ class Frame:
     sim: Pose
     ref: Pose
     ahead: Pose | None
+    window: Pose
     phase: Tensor
+    action: Tensor
+    action_before: Tensor
     residual: Tensor
     reg: Tensor
     min_height: Tensor
     age: Tensor | None
     torque: Tensor | None
+    torque_before: Tensor | None
     point: PointGoal | None
     sizes: Tensor | None
     #: What frames of one environment share, see `env.observables.Context`.

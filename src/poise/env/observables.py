@@ -12,7 +12,7 @@ A field of MuJoCo's state that a `source` names is fetched for tasks that ask fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FunctionType
 
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from poise.control import Residual
 from poise.env.frame import Frame, Layout, LazyPose, Observable, Place, PointGoal, Pose
-from poise.spatial import heading_quat
+from poise.spatial import heading_quat, lateral_heading
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,7 @@ class Context:
     roots: `(B,)` each body's root, as a body of the model.
     hinges: how many there are; the rest of an action is the residual's.
     residual: the kind of residual force, None without.
+    left: `(3,)` the root's axis by which headings are taken, see `TaskConfig.left`; None: its twist.
     """
 
     layout: Layout
@@ -39,6 +40,18 @@ class Context:
     roots: Tensor
     hinges: int
     residual: Residual | None
+    left: Tensor | None
+
+
+def headed(pose: Pose, left: Tensor | None) -> Pose:
+    """Poses as an environment sees them, with headings by the root's axis `left (3)`; packed ones hold
+    the twist."""
+    return pose if left is None else replace(pose, heading=lateral_heading(pose.qpos[..., 3:7], left))
+
+
+def hinge_torques(servos: Tensor, damping: Tensor) -> Tensor:
+    """What both of MuJoCo's generalized forces `(N, 6 + n)` exert on each hinge, N m `(N, n)`."""
+    return (servos + damping)[:, 6:].float()
 
 
 def sim(frame: Frame) -> Pose:
@@ -49,6 +62,10 @@ def sim(frame: Frame) -> Pose:
         arm = pose.pos - frame.source("subtree_com").index_select(1, frame.context.roots).float()
         return frame.source("cvel")[:, 1:, 3:].float() + torch.linalg.cross(pose.angvel, arm)
 
+    def heading() -> Tensor:
+        root, left = pose.qpos[:, 3:7], frame.context.left
+        return heading_quat(root) if left is None else lateral_heading(root, left)
+
     pose = LazyPose(
         qpos=lambda: frame.source("qpos").float(),
         qvel=lambda: frame.source("qvel").float(),
@@ -58,19 +75,24 @@ def sim(frame: Frame) -> Pose:
         angvel=lambda: frame.source("cvel")[:, 1:, :3].float(),
         com=lambda: frame.source("subtree_com")[:, 1].float(),
         local=lambda: frame.context.local(pose.qpos),
-        heading=lambda: heading_quat(pose.qpos[:, 3:7]),
+        heading=heading,
     )
     return pose
 
 
 def ref(frame: Frame) -> Pose:
     """What the goal asks for now."""
-    return frame.context.layout.unpacked(frame.source("goal"))
+    return headed(frame.context.layout.unpacked(frame.source("goal")), frame.context.left)
 
 
 def ahead(frame: Frame) -> Pose | None:
     """What the goal asks for one control step later."""
-    return frame.context.layout.unpacked(frame.source("ahead"))
+    return headed(frame.context.layout.unpacked(frame.source("ahead")), frame.context.left)
+
+
+def window(frame: Frame) -> Pose:
+    """What the goal asks for at the steps of the task's window, fields `(N, K, ...)`."""
+    return headed(frame.context.layout.unpacked(frame.source("window")), frame.context.left)
 
 
 def place(frame: Frame) -> Place:
@@ -86,6 +108,16 @@ def phase(frame: Frame) -> Tensor:
 def min_height(frame: Frame) -> Tensor:
     """The clip's lowest root height, m `(N,)`."""
     return frame.place.low
+
+
+def action(frame: Frame) -> Tensor:
+    """The hinges' part of the last action, as it acted `(N, n)`."""
+    return frame.source("action")[:, : frame.context.hinges]
+
+
+def action_before(frame: Frame) -> Tensor:
+    """The same of the step before `(N, n)`."""
+    return frame.source("action_before")[:, : frame.context.hinges]
 
 
 def residual(frame: Frame) -> Tensor:
@@ -106,8 +138,12 @@ def age(frame: Frame) -> Tensor | None:
 
 def torque(frame: Frame) -> Tensor | None:
     """What servos and damping exert on each hinge at the end of the step, N m `(N, n)`."""
-    # The hinges' part of the generalized forces, after the root's six.
-    return (frame.source("qfrc_actuator") + frame.source("qfrc_damper"))[:, 6:].float()
+    return hinge_torques(frame.source("qfrc_actuator"), frame.source("qfrc_damper"))
+
+
+def torque_before(frame: Frame) -> Tensor | None:
+    """The same at the begin of the step `(N, n)`."""
+    return frame.source("torque_before")
 
 
 def point(frame: Frame) -> PointGoal | None:
@@ -124,5 +160,7 @@ def sizes(frame: Frame) -> Tensor | None:
 STANDARD: dict[str, Observable] = {
     name: fn
     for name, fn in vars().copy().items()
-    if getattr(fn, "__module__", "") == __name__ and isinstance(fn, FunctionType)
+    if getattr(fn, "__module__", "") == __name__
+    and isinstance(fn, FunctionType)
+    and name not in ("headed", "hinge_torques")
 }

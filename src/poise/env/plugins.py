@@ -137,3 +137,21 @@ def combined(masks: Iterable[Tensor | None], how: Callable[[Tensor, Tensor], Ten
         if mask is not None:
             out = mask if out is None else how(out, mask)
     return out
+
+
+def ends_of(
+    plugins: Iterable[Plugin], horizon: int, frame: Frame, failed: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which episodes failed, are terminated and are truncated, `(N,)` bool each.
+
+    failed: what a task's terms call a failure. horizon: control steps until an episode times out.
+    """
+    # A clip that is done to its end is a finished task, and its remaining return is stated: as many
+    # steps like the last as `completion_bonus` says, since with nothing to come the last steps
+    # would not matter and characters would fall in them. To bootstrap there would rest on a state
+    # with a value that is never learned, and the policy comes to exploit it.
+    done = frame.place.end > 0
+    for plugin in plugins:
+        failed, done = plugin.ends(frame, failed, done)
+    terminated = failed | done
+    return failed, terminated, (frame.source("age") >= horizon) & ~terminated

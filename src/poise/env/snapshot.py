@@ -92,6 +92,36 @@ def put(env: ImitationEnv, snapshot: Snapshot, rows: Tensor | None) -> None:
         env.goal.rng.set_state(snapshot.shared["rng"])
 
 
+def state_of(env: ImitationEnv) -> dict[str, Tensor]:
+    """Everything that a bit-exact continuation of an environment needs."""
+    return {
+        "sim": env.backend.snapshot(),
+        "qpos": env.backend.state.qpos.clone(),
+        "qvel": env.backend.state.qvel.clone(),
+        "age": env.age.clone(),
+        "action": env.action.clone(),
+        **env.goal.state(),
+        **{k: v for plugin in env.plugins for k, v in plugin.state().items()},
+    }
+
+
+def put_state(env: ImitationEnv, state: Mapping[str, Tensor]) -> None:
+    """Makes an environment what `state_of` told; see `ImitationEnv.load_state`."""
+    env.goal.load_state(state)
+    for plugin in env.plugins:
+        plugin.assign(None, env.goal.body(None))
+    if state["sim"].dtype == env.backend.state.qpos.dtype:
+        env.backend.restore(state["sim"])
+    else:
+        env.backend.write(None, state["qpos"], state["qvel"])
+    for name in ("age", "action"):
+        getattr(env, name).copy_(state[name])
+    for plugin in env.plugins:
+        plugin.load_state(state)
+    if env.goal.begins:
+        env.weights = env.weights
+
+
 def _rows(env: ImitationEnv) -> dict[str, Tensor]:
     """The tensors `(N, ...)` of an environment beside its physics, by name."""
     goal = {f"goal/{k}": v for k, v in env.goal.rows().items()}

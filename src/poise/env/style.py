@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from poise.env.frame import Frame, ObsTerm
+from poise.env.observables import headed
 from poise.env.reference import Reference
 from poise.env.terms.evaluate import seen_by
 from poise.errors import PoiseError
@@ -27,10 +28,18 @@ class ClipFeatures:
     Args:
         reference: the clips. terms: what is seen of a frame, side by side.
         most_bytes: up to this size the features of all frames are kept.
+        left: by which headings are taken, see `TaskConfig.left`.
     """
 
-    def __init__(self, reference: Reference, terms: tuple[ObsTerm, ...], most_bytes: int = MOST_BYTES):
+    def __init__(
+        self,
+        reference: Reference,
+        terms: tuple[ObsTerm, ...],
+        most_bytes: int = MOST_BYTES,
+        left: Tensor | None = None,
+    ):
         self.reference, self.terms, self.most_bytes = reference, terms, most_bytes
+        self.left = left
         self._all: Tensor | None = None
 
     def __call__(self, rows: Tensor) -> Tensor:
@@ -46,7 +55,8 @@ class ClipFeatures:
 
     def _of(self, rows: Tensor) -> Tensor:
         packed = self.reference.packed(rows)
-        pose, place = self.reference.layout.unpacked(packed), self.reference.layout.place(packed)
+        layout = self.reference.layout
+        pose, place = headed(layout.unpacked(packed), self.left), layout.place(packed)
         frame = Frame.given(sim=pose, ref=pose, phase=place.phase, min_height=place.low)
         return seen_by(self.terms, frame)
 

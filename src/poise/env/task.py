@@ -54,6 +54,13 @@ class TaskConfig:
         them.
     help_by: whether "all" worlds have one share of help left, or each "clip" or each motion "bin" its
         own, see `HelpBudget`.
+    left: `(3,)` the root's local axis that points to the body's left (`Humanoid.left`): the heading of
+        every pose that a term sees is where it points on the ground, see `spatial.lateral_heading`; None
+        takes the root's twist about +Z.
+    filter: share f of the last action that the hinges' actions keep, a_t = (1 - f) u_t + f a_(t-1) for
+        what is given, u_t; what acts, counts and is copied is a_t. The first of an episode is taken as
+        it is. 0 filters nothing.
+    window: control steps ahead for which terms may ask besides the next one, see `Frame.window`.
     horizon: control steps until an episode times out.
     completion_bonus: what a clip done to its end is worth, in rewards of its last step; a discount g
         makes g / (1 - g) of a character that goes on as it ended.
@@ -76,6 +83,9 @@ class TaskConfig:
     residual: Residual | None = None
     help: HelpSchedule | None = None
     help_by: Literal["all", "clip", "bin"] = "all"
+    left: Tensor | None = None
+    filter: float = 0.0
+    window: tuple[int, ...] = ()
     horizon: int = 300
     completion_bonus: float = 0.0
     first: float = 0.0
@@ -91,6 +101,8 @@ class TaskConfig:
         if self.help_by not in ("all", "clip", "bin"):
             what = f"help is given by 'all', 'clip' or 'bin', got '{self.help_by}'"
             raise PoiseError(what, "TaskConfig")
+        if not 0 <= self.filter < 1:
+            raise PoiseError(f"filter must lie in 0 to below 1, got {self.filter}", "TaskConfig")
         for terms in (self.obs, self.rewards, self.dones):
             names = [t.name for t in terms]
             twice = [n for n in names if names.count(n) > 1]

@@ -1,4 +1,5 @@
-"""How a run starts: a scripted expert is scored and cloned, and PPO goes on from the clone.
+"""How a run starts: a scripted expert is scored and cloned, and PPO goes on from the clone; or a policy
+that was trained before goes on, for observations that tell it more, too.
 
 The clone is saved as the run's first checkpoint, so that a killed run goes on from it bit for bit.
 """
@@ -8,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
+from poise.errors import PoiseError
 from poise.eval import ScoreCard, run_episodes, score_rollouts, start_frames
 from poise.learn import (
     LATEST,
@@ -28,14 +30,22 @@ from poise.learn import (
 )
 from poise.learn.checkpoint import PolicyMeta
 from poise.learn.parallel import ALONE, Comm, any_of, together
+from poise.learn.policy import spread
+from poise.nets import RunningNorm
 from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
 from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual.task import stage_task
 from poise.sim import UnstableError
+
+if TYPE_CHECKING:
+    from poise.jobs.tracker import Tracker
 
 #: Start frames of a first look; the final evaluation takes every one.
 FIRST_STARTS = 64
 #: The expert acts in no more worlds than these; more of them teach little more.
 CLONE_WORLDS = 512
+#: Control steps, and characters, by which what a policy did not observe before is measured.
+MEASURED, MEASURED_IN = 64, 128
 
 
 @dataclass(frozen=True)
@@ -138,6 +148,76 @@ def clone_expert(
         )[0]
     finally:
         env.close()
+
+
+def widened(tracker: Tracker, imitation: Imitation, steps: int = MEASURED) -> WarmStart:
+    """A trained policy and its critic as what a run may start from that observes more.
+
+    What it knows already goes to its places by the names of the observation's terms. What is new has
+    weights of 0, so that the policy acts as before, and a mean and deviation as measured.
+
+    Args:
+        tracker: the policy, on the same body.
+        imitation: what it is to learn, see `recipes.perpetual.build`.
+        steps: control steps of `MEASURED_IN` characters by which new inputs are measured; 0 takes a mean
+            of 0 and a deviation of 1.
+
+    Raises:
+        PoiseError: it observes what the new task does not tell.
+    """
+    known = replace(imitation, task=stage_task(tracker.config, imitation.humanoid, None)).bare()
+    told, asked = _observed(known), _observed(imitation.bare())
+    missing = [n for n, columns in told.items() if len(asked.get(n, ())) != len(columns)]
+    if missing:
+        name = missing[0]
+        there = f", but {len(asked[name])} of them" if name in asked else ""
+        raise PoiseError(
+            f"the policy observes '{name}' of {len(told[name])} numbers, and the task does not{there}",
+            hint="Take the policy's own settings of what is observed; more may be added to them",
+        )
+    columns, wide = torch.cat([asked[n] for n in told]), sum(map(len, asked.values()))
+    if len(columns) != tracker.policy.num_obs:
+        what = f"it observes {tracker.policy.num_obs} numbers, and on this body they are {len(columns)}"
+        raise PoiseError(what, hint="A policy goes on with the body that it was trained on")
+    policy, critic = tracker.policy.widened(wide, columns), None
+    if tracker.value is not None:
+        own = tracker.value.state()
+        first = next(k for k in own if k.startswith("critic/") and k.endswith("weight"))
+        critic = spread(own, {first: own[first].new_zeros(len(own[first]), wide)}, columns)
+    if steps and wide > len(columns):
+        _measure(policy, imitation, columns, steps)
+    return WarmStart(policy, critic)
+
+
+def _observed(imitation: Imitation) -> dict[str, Tensor]:
+    """The columns of each of a task's observations, by name and in order."""
+    env = imitation.env(1, threads=1)
+    try:
+        widths = env.obs_widths
+    finally:
+        env.close()
+    columns = torch.arange(sum(widths.values())).split(list(widths.values()))
+    return dict(zip(widths, columns, strict=True))
+
+
+def _measure(policy: PolicyBundle, imitation: Imitation, columns: Tensor, steps: int) -> None:
+    """Sets mean and deviation of the inputs beside `columns` to those of what the policy meets."""
+    env = imitation.env(MEASURED_IN, threads=1, help_scale=0.0, guard=False)
+    norm = RunningNorm(env.num_obs)
+    try:
+        obs = env.reset()
+        for _ in range(steps):
+            norm.observe(obs)
+            action = policy.act(obs)
+            obs = env.step(torch.nn.functional.pad(action, (0, env.num_actions - action.shape[1]))).obs
+    finally:
+        env.close()
+    norm.freeze()
+    fresh = torch.ones(env.num_obs, dtype=torch.bool)
+    fresh[columns] = False
+    policy.norm.shift[fresh], policy.norm.std[fresh] = norm.shift[fresh], norm.std[fresh]
+    policy.norm.mean[fresh] = norm.mean[fresh]
+    policy.norm.m2[fresh] = norm.m2[fresh] / norm.count * policy.norm.count
 
 
 def score_expert(imitation: Imitation, plan: Plan | None = None) -> ScoreCard:

@@ -139,6 +139,19 @@ class PolicyBundle:
         )
         return out
 
+    def widened(self, num_obs: int, columns: Tensor) -> PolicyBundle:
+        """The same policy for observations of `num_obs` numbers, of which it reads those at `columns
+        (O,)`. What it does not read yet has weights of 0, a mean of 0 and a deviation of 1."""
+        out = PolicyBundle.rebuild(num_obs, self.num_actions, self.shape)
+        state = spread(self.state(), out.state(), columns)
+        fresh = torch.ones(num_obs, dtype=torch.bool)
+        fresh[columns] = False
+        state["norm/std"][fresh] = 1.0
+        state["norm/m2"][fresh] = state["norm/count"]
+        out.load_state(state)
+        out.meta = dict(self.meta)
+        return out
+
     def clipped(self, at: float) -> PolicyBundle:
         """The same policy with observations clipped so many deviations from their means."""
         out = self.copy()
@@ -166,6 +179,17 @@ class PolicyBundle:
         """Writes the policy alone as a checkpoint of the kind "policy"."""
         meta = {"kind": "policy", **self.identity(character), "metadata": dict(metadata or {})}
         save_checkpoint(path, self.state(), meta)
+
+
+def spread(state: Mapping[str, Tensor], like: Mapping[str, Tensor], columns: Tensor) -> State:
+    """Copies of tensors that are as large as those of `like`: those that are narrower fill `columns`
+    of zeros."""
+    out = {k: v.clone() for k, v in state.items()}
+    for name, value in like.items():
+        if out[name].shape != value.shape:
+            out[name] = torch.zeros_like(value)
+            out[name][..., columns] = state[name]
+    return out
 
 
 class Value:

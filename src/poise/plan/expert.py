@@ -124,7 +124,9 @@ class Expert:
         env = self.env
         rows = env.reference.rows(env.clip, env.frame)
         joints = self._joints(rows)
-        return joints if self._residual is None else torch.cat((joints, self._help(rows)), -1)
+        if self._residual is not None:
+            joints = torch.cat((joints, self._help(rows)), -1)
+        return env.unfiltered(joints)
 
     def _joints(self, rows: Tensor) -> Tensor:
         """Targets u = q_ref + tau / kp, with kp (u - q) inside the torque limits, as actions."""

@@ -58,7 +58,9 @@ class LookaheadConfig:
             its logarithm.
         warm: share of the copies with offsets about those that the last decision had planned to go on
             with; the others have theirs about none.
-        smoothing: shares of the last action that actions keep; the copies take them in turns.
+        smoothing: shares of the last action that actions keep; the copies take them in turns. They
+            replace the share of an environment that filters (`TaskConfig.filter`), which only the first
+            copy keeps, since it does what the policy does.
         corrections: shares of the policy's own action that the copies add their offsets to; they take
             them in turns, too. Less of it is less jerk, where the policy corrects more than it must.
         jerk_price: cost of a control step as jerky as the goal, see `Roughness.price`.
@@ -185,6 +187,8 @@ class Lookahead:
         shares = torch.tensor(c.smoothing)
         turn = torch.arange(c.candidates)
         self._keep = shares[turn % len(shares)].unsqueeze(1)
+        if copies.task.filter:
+            self._keep[0] = copies.task.filter
         much = torch.tensor(c.corrections)
         self._much = much[turn // len(shares) % len(much)].unsqueeze(1)
         # Held, then fading to nothing at the horizon.
@@ -236,7 +240,7 @@ class Lookahead:
             much[i] = world.choice.correction
             world.step += 1
             world.past = [*world.past, pos[i].clone()][-PAST:]
-        return torch.lerp(much * self.policy.act(obs) + offsets, env.action, keep)
+        return env.unfiltered(torch.lerp(much * self.policy.act(obs) + offsets, env.action, keep))
 
     def _decide(self, i: int, world: _World) -> _Choice:
         """What world i does next."""
@@ -281,7 +285,7 @@ class Lookahead:
                 break
             action = torch.lerp(self._much * self.policy.act(obs) + offsets[:, h], env.action, keep)
             keep = self._keep
-            obs = env.step(action).final_obs
+            obs = env.step(env.unfiltered(action)).final_obs
             pose = env.pose()
             pos.append(pose.pos.clone())
             quat.append(pose.quat.clone())

@@ -45,7 +45,7 @@ class LqrTeacher:
         ahead = reference.rows(env.clip, env.frame + 1)
         action = env.task.pd.action(target, reference.hinges[ahead].float())
         extra = env.num_actions - action.shape[1]
-        return torch.cat((action, action.new_zeros(len(action), extra)), 1)
+        return env.unfiltered(torch.cat((action, action.new_zeros(len(action), extra)), 1))
 
     def _off(self, rows: Tensor) -> Tensor:
         """`(N, 2 nv)` from the trajectories to the characters, as the trajectories' clips see it."""

@@ -95,12 +95,14 @@ class _Kept:
 
     Attributes:
         sim: `(K, S)` snapshots of the worlds.
+        action: `(K, A)` their last actions.
         obs: `(K, O)` their observations.
         cost: `(K,)` discounted cost so far.
         error: `(K,)` m, sum over the steps of the mean distance of the bodies.
     """
 
     sim: Tensor
+    action: Tensor
     obs: Tensor
     cost: Tensor
     error: Tensor
@@ -212,8 +214,9 @@ class SamplingControl:
 
     def _first(self, obs: Tensor) -> _Kept:
         nothing = torch.zeros(self.states)
+        k, env = self.states, self.env
         return _Kept(
-            self.env.backend.snapshot()[: self.states], obs[: self.states].clone(), nothing, nothing
+            env.backend.snapshot()[:k], env.action[:k].clone(), obs[:k].clone(), nothing, nothing
         )
 
     def _extend(self, now: _Kept, done: int) -> tuple[_Choice, _Kept | None]:
@@ -221,6 +224,8 @@ class SamplingControl:
         c, env, n = self.config, self.env, self.env.num_envs
         parent = torch.arange(n) % self.states
         env.backend.restore(now.sim[parent])
+        env.action.copy_(now.action[parent])
+        env.age.fill_(done)
         if int(env.frame[0]) != done:
             env.seek(env.clip, torch.full_like(env.frame, done))
         obs, cost, error = now.obs[parent], c.memory * now.cost[parent], now.error[parent].clone()
@@ -248,7 +253,7 @@ class SamplingControl:
         best = alive[torch.arange(self.states) % len(alive)]
         actions, offsets = (torch.stack([a[best] for a in x]) for x in (made, given))
         choice = _Choice(actions, offsets, parent[best])
-        kept = _Kept(env.backend.snapshot()[best], obs[best], cost[best], error[best])
+        kept = _Kept(env.backend.snapshot()[best], env.action[best], obs[best], cost[best], error[best])
         return choice, kept
 
     def _drawn(self, count: int) -> Tensor:

@@ -231,6 +231,18 @@ def axis_heading(q: Tensor, axis: Tensor) -> Tensor:
     return torch.stack((half.cos(), zero, zero, half.sin()), -1)
 
 
+def lateral_heading(q: Tensor, axis: Tensor) -> Tensor:
+    """The turn about +Z `(..., 4)` by which `q` turns the local `axis (3)` as seen from above.
+
+    With the root's axis from hip to hip it is singular where that axis is vertical alone, while the
+    twist of `heading_quat` is for every body upside down.
+    """
+    there = quat_rotate(q, axis.expand(*q.shape[:-1], 3))
+    half = 0.5 * (torch.atan2(there[..., 1], there[..., 0]) - torch.atan2(axis[1], axis[0]))
+    zero = torch.zeros_like(half)
+    return torch.stack((half.cos(), zero, zero, half.sin()), -1)
+
+
 def into_heading(heading: Tensor, v: Tensor) -> Tensor:
     """Vectors `v (N, K, 3)` of the world in the frames of turns about +Z `heading (N, 4)`."""
     # R^T v, written v R for rows v

@@ -143,6 +143,13 @@ class BufferedGoal(Goal):
         ids = self._every if ids is None else ids
         return self.packed(ids, self.at[ids] + k)
 
+    def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
+        ids = self._every if ids is None else ids
+        at, known = self.at[ids], self.count[ids] - 1
+        # Where nothing follows, what `ahead` tells, which is extrapolated.
+        last = torch.maximum(known, at + 1)
+        return torch.stack([self.packed(ids, torch.minimum(at + k, last)) for k in steps], 1)
+
     def targets(self) -> tuple[Tensor, Tensor]:
         self._look()
         return self._hinges, self._every

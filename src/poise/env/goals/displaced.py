@@ -65,6 +65,9 @@ class DisplacedGoal(Goal):
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         return self._moved(self.goal.ahead(k, ids), ids)
 
+    def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
+        return torch.stack([self._moved(w, ids) for w in self.goal.window(steps, ids).unbind(1)], 1)
+
     def targets(self) -> tuple[Tensor, Tensor]:
         table, rows = self.goal.targets()
         return table[rows] + self.offset[:, 6:], self._every

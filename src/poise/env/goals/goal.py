@@ -101,6 +101,11 @@ class Goal(ABC):
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         """Packed poses `(n, W)` of k control steps later; extrapolated where they are not known."""
 
+    def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
+        """Packed poses `(n, K, W)` of so many control steps later; what a stream does not know yet is
+        told as the last frame that it knows."""
+        return torch.stack([self.ahead(k, ids) for k in steps], 1)
+
     @abstractmethod
     def targets(self) -> tuple[Tensor, Tensor]:
         """Hinge angles of `ahead(1)`, rad float64, as a table `(R, n)` and its rows `(N,)`."""

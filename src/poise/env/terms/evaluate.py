@@ -30,10 +30,14 @@ class Sources(Mapping[str, Tensor]):
         self._names: list[str] = []
         self._known: tuple[str, ...] | None = None
 
-    def live(self, goal: Tensor, ahead: Tensor) -> Sources:
-        """All of them, with packed goals `(N, W)` of now and of one control step later."""
-        self._held |= {"goal": goal, "ahead": ahead}
+    def live(self, told: Mapping[str, Tensor]) -> Sources:
+        """All of them, with what the goal tells, see `of`."""
+        self._held |= told
         return self
+
+    def reads(self, name: str) -> bool:
+        """Whether terms read a tensor, once it is known (`settle`)."""
+        return self._known is not None and name in self._known
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._names:
@@ -52,14 +56,17 @@ class Sources(Mapping[str, Tensor]):
         """What was asked for until now is what terms read, and what `of` gives."""
         self._known = tuple(dict.fromkeys((*self._names, "age")))
 
-    def of(self, goal: Tensor, ahead: Tensor, ids: Tensor | None = None) -> dict[str, Tensor]:
-        """What terms read, of all worlds; or of worlds `ids (n,)`, of which the goals are given."""
+    def of(self, told: Mapping[str, Tensor], ids: Tensor | None = None) -> dict[str, Tensor]:
+        """What terms read, of all worlds; or of worlds `ids (n,)`, of which the goals are given.
+
+        told: packed goals `(N, W)` of now, "goal", and of one control step later, "ahead", and those of
+            the "window" `(N, K, W)`.
+        """
         assert self._known is not None
-        self._held |= {"goal": goal, "ahead": ahead}
+        self._held |= told
         if ids is None:
             return {name: self[name] for name in self._known}
-        own = ("goal", "ahead")
-        return {name: self[name] if name in own else self[name][ids] for name in self._known}
+        return {name: self[name] if name in told else self[name][ids] for name in self._known}
 
 
 def seen_by(terms: tuple[ObsTerm, ...], frame: Frame) -> Tensor:
@@ -163,6 +170,10 @@ class Terms:
         scores = torch.cat((self._weights @ values, values))
         ends = torch.stack(self.ends(frame, failed))
         return seen_by(self.obs, frame), scores, ends, seen_by(self.style, frame)
+
+    def widths(self, frame: Frame) -> dict[str, int]:
+        """How many numbers each observation gives, by name and in order."""
+        return {term.name: seen_by((term,), frame).shape[1] for term in self.obs}
 
     def check(self, sources: Mapping[str, Tensor], worlds: int) -> None:
         """Evaluates every term once, and names one that gives what it must not.

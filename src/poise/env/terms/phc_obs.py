@@ -1,10 +1,13 @@
-"""Observations of Perpetual Humanoid Control (Luo et al. 2023, Sec. 3.1): next reference frame only.
+"""Observations of Perpetual Humanoid Control (Luo et al. 2023, Sec. 3.1): next reference frame only, and
+ours, which see later ones, too.
 
 | PHC                                    | here              | numbers for B bodies, n hinges       |
 |----------------------------------------|-------------------|--------------------------------------|
 | s^p, proprioception                    | `self_state`      | 1 + 3 (B - 1) + 12 B (358 of 24)     |
 | s^g-rot, goal with rotations           | `rotation_goal`   | 24 B (576)                           |
 | s^g-kp, goal of keypoints              | `keypoint_goal`   | 9 B (216)                            |
+| -, a frame of the reference later on   | `goal_later`      | 3 K + 5                              |
+| -, what the filter of actions keeps    | `last_action`     | n                                    |
 | beta, limb lengths (and masses)        | `shape`           | 2 B - 1                              |
 | what the discriminator sees of a frame | `motion_features` | 13 + 3 K + 6 J + n (196)             |
 
@@ -65,6 +68,30 @@ def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
     target, moves = _rows(goal.pos, bodies), _rows(goal.linvel, bodies) - _rows(sim.linvel, bodies)
     places = torch.cat((target - _rows(sim.pos, bodies), moves, target - sim.pos[:, :1]), 1)
     return into_heading(sim.heading, places).flatten(1)
+
+
+def goal_later(frame: Frame, step: int, bodies: Tensor, turns: bool = True) -> Tensor:
+    """Where the reference is at one step of the task's window, in the character's heading frame.
+
+    Its root from the character's, m (3), its bodies from its root, m (3 K), and with `turns` cosine and
+    sine of its heading from the character's (2). All is 0 where the goal is a point.
+
+    step: index into `TaskConfig.window`. bodies: `(K,)` rows.
+    """
+    sim, later = frame.sim, frame.window
+    pos, root = later.pos[:, step], later.pos[:, step, :1]
+    places = torch.cat((root - sim.pos[:, :1], _rows(pos, bodies) - root), 1)
+    out = into_heading(sim.heading, places).flatten(1)
+    if turns:
+        w, _, _, z = quat_between(sim.heading, later.heading[:, step]).unbind(-1)
+        # Of the turn's double angle, whichever sign the quaternion has.
+        out = torch.cat((out, torch.stack((w * w - z * z, 2 * w * z), -1)), -1)
+    return out if frame.point is None else torch.where(frame.point.far.unsqueeze(-1), 0.0, out)
+
+
+def last_action(frame: Frame) -> Tensor:
+    """The hinges' part of the last action, as it acted `(N, n)`; 0 in a new episode."""
+    return frame.action
 
 
 def shape(frame: Frame, sizes: Tensor) -> Tensor:

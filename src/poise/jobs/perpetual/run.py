@@ -25,7 +25,7 @@ from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, write_run
 from poise.jobs.warm_start import TrainingCallbacks
-from poise.learn import LATEST, PolicyBundle, Until, load_checkpoint
+from poise.learn import LATEST, PolicyBundle, Until, WarmStart, load_checkpoint
 from poise.learn.checkpoint import PolicyMeta
 from poise.learn.run import interruptible
 from poise.learn.state import prefixed
@@ -205,7 +205,7 @@ def train(
     device: str = "cpu",
     beginning: TrainingCallbacks | None = None,
     save_s: float = 30.0,
-    trained: PolicyBundle | None = None,
+    trained: PolicyBundle | WarmStart | None = None,
 ) -> PerpetualResult:
     """Trains all stages, or goes on with them, until nothing fails or a limit is reached.
 
@@ -214,7 +214,8 @@ def train(
         on_iteration: called after each; returning False ends the call as Ctrl-C does.
         device: "cpu" or "cuda"; no part of the run.
         save_s: seconds between checkpoints, beside those at evaluations.
-        trained: a policy that a new run goes on from; a run in progress has its own.
+        trained: a policy that a new run goes on from, with its critic if one is given, see
+            `warm_start.widened`; a run in progress has its own.
 
     Ctrl-C ends it after the present iteration with a checkpoint, a second one at once.
     """

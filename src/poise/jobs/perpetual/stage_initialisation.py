@@ -43,7 +43,7 @@ def begin_first(
     threads: int,
     folder: Path,
     tell: TrainingCallbacks,
-    trained: PolicyBundle | None = None,
+    trained: PolicyBundle | WarmStart | None = None,
 ) -> tuple[Stage, WarmStart | None]:
     """The first stage, and the policy it starts from; None starts a single network from nothing.
 
@@ -58,7 +58,9 @@ def begin_first(
     if trained is not None:
         env = own.env(1, threads=1)
         env.close()
-        start = WarmStart(trained.first_actions(env.num_actions).clipped(own.ppo().obs_clip))
+        start = trained if isinstance(trained, WarmStart) else WarmStart(trained)
+        policy = start.policy.first_actions(env.num_actions).clipped(own.ppo().obs_clip)
+        start = replace(start, policy=policy)
         if not config.recovery:
             return stage, start
         if stage.kind == "single":

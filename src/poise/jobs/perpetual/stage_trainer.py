@@ -84,7 +84,7 @@ class StageTrainer:
         tensorboard: bool = True,
         tell: TrainingCallbacks | None = None,
         save_s: float = 30.0,
-        trained: PolicyBundle | None = None,
+        trained: PolicyBundle | WarmStart | None = None,
     ):
         self.imitation, self.folder, self.until = imitation, folder, until
         self.config: Perpetual = imitation.config

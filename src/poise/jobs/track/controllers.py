@@ -209,9 +209,11 @@ class Keeper:
         rows = failed.nonzero().flatten()
         self.fallen += [(int(i), int(env.frame[i])) for i in rows]
         clip, frame, before = env.clip.clone(), env.frame.clone(), env.backend.snapshot()
+        action, age = env.action.clone(), env.age.clone()
         fresh = env.reset_to(clip, frame)
         others = (~failed).nonzero().flatten()
         if len(others):
             # Starting anew is for all worlds at once; the others go on from where they were.
             env.backend.restore(before[others], others)
+            env.action[others], env.age[others] = action[others], age[others]
         return torch.where(failed[:, None], fresh, obs)

@@ -153,7 +153,7 @@ class _Led:
         now, clip = step / self.rate, self._clip
         if step:
             at = self._frame + 1 if self._here else self._frame
-            self.actions.append(env.action.clone())
+            self.actions.append(env.given.clone())
             self.frames.append(self.goal.aimed())
             self.of.append((clip, at))
             if self._here and at >= self.last[clip]:

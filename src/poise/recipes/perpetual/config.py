@@ -78,11 +78,22 @@ class Perpetual:
             alone.
         shape: limb lengths and masses are observed, too.
         shapes: the bodies that are learned; more than one are observed in any case.
+        heading: of which all that is observed is free: where the axis from hip to hip points on the
+            ground ("hips"), which is singular only where that is vertical, or the root's "twist" about
+            +Z, which turns at once where the body is upside down.
+        window: control steps ahead of which the observation tells the reference's place, heading and
+            `KEY_PARTS` besides the next one's whole pose, such as (2, 4, 8); a stream's last known frame
+            is repeated.
+        filter: share of the last action that actions keep, see `TaskConfig.filter`; the policy then
+            observes the last action. 0 for none.
         action: "absolute" as in the paper, or "additive" to the reference's angles.
         faithful: where the paper and its code disagree about Eq. 2 and about recovery.
         energy: weight of the energy penalty, 0 for none; by default that of the code's composer, since
             with ten times as much falling early would pay, see `phc_reward.energy_term`.
         energy_form: of the "paper", squares of the hinges' power, or of the "code", its amount.
+        root: weight of the reward for the root's place alone, see `phc_reward.root_position`.
+        action_rate, torque_rate, foot_slide: prices of changing actions and torques and of feet that
+            slide, see `phc_reward`; with several bodies the soles are those of the first.
         style: the motion prior, None for none.
         termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
             "code".
@@ -124,10 +135,17 @@ class Perpetual:
     goal: Literal["rotations", "keypoints"] = "rotations"
     shape: bool = False
     shapes: BodyShapes = field(default_factory=BodyShapes)
+    heading: Literal["hips", "twist"] = "hips"
+    window: tuple[int, ...] = ()
+    filter: float = 0.0
     action: Literal["absolute", "additive"] = "absolute"
     faithful: Literal["paper", "code"] = "code"
     energy: float = 0.00005
     energy_form: Literal["paper", "code"] = "code"
+    root: float = 0.0
+    action_rate: float = 0.0
+    torque_rate: float = 0.0
+    foot_slide: float = 0.0
     style: AmpConfig | None = field(default_factory=AmpConfig)
     termination: Literal["relaxed", "all", "code"] = "relaxed"
     first: float = 0.1
@@ -194,6 +212,13 @@ class Perpetual:
         if not 0 <= self.adaptive_sampling <= 1:
             what = f"adaptive_sampling must lie in [0, 1], got {self.adaptive_sampling}"
             raise PoiseError(what, "Perpetual")
+        if list(self.window) != sorted({k for k in self.window if k > 1}):
+            what = f"window must rise from 2 or more control steps, got {self.window}"
+            raise PoiseError(what, "Perpetual", "The next step is told in any case")
+        if not 0 <= self.filter < 1:
+            raise PoiseError(f"filter must lie in 0 to below 1, got {self.filter}", "Perpetual")
+        if min(self.root, self.action_rate, self.torque_rate, self.foot_slide) < 0:
+            raise PoiseError("the weight of root and all prices must be at least 0", "Perpetual")
         if not 0 <= self.cooling <= 1:
             raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")
         if self.cooling and self.ppo.kl_target is not None:
@@ -293,7 +318,8 @@ class Perpetual:
 #: What `Perpetual.paper` and `.code` share. The paper: goals, absolute actions, no help, networks of
 #: 1024 and 512 units, three primitives and one for recovery, 60 and 30 Hz. The code: PPO, worlds, steps.
 _PHC: dict[str, Any] = {
-    "goal": "rotations", "shape": False, "action": "absolute", "energy": 0.0005, "first": 0.0,
+    "goal": "rotations", "shape": False, "heading": "twist", "action": "absolute",
+    "energy": 0.0005, "first": 0.0,
     "recovery": True, "recovering": RecoveryPlan(primitive="own", demonstrations=0),
     "multiplicative": True, "progressive": True, "single": False, "max_primitives": 3,
     "composer_hidden": (1024, 512), "composer_clone": False, "expert": False, "trajopt": None,
@@ -321,7 +347,13 @@ MIGRATION = Migration(
         "recovering.way_share": "recovering.demonstration_share",
     },
     values={"help_by": {"moment": "bin"}},
-    absent={"recovery": False, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip"},
+    absent={
+        "recovery": False,
+        "help_by": "all",
+        "adaptive_sampling": 0.0,
+        "adaptive_over": "clip",
+        "heading": "twist",
+    },
 )
 
 

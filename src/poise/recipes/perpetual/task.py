@@ -29,6 +29,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
 from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
@@ -37,12 +38,17 @@ from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_reward import recovery_terms
 from poise.kin import fit_humanoid
 from poise.kin.place import on_own_body
+from poise.kin.solids import shapes_of
+from poise.metrics import foot_points
 from poise.recipes.imitation import Clips, Imitation, as_library
 from poise.recipes.perpetual.config import Perpetual, Recovers, RecoveryPlan
 from poise.recipes.perpetual.recovery import known_recovery_clips
 from poise.recipes.perpetual.shapes import shaped
 
 __all__ = ["RECIPE", "Perpetual", "RecoveryPlan", "build", "stage_task", "task"]
+
+#: Parts of which a window of the reference tells the places.
+KEY_PARTS = ("head", "hand", "shin", "foot")
 
 
 def task(config: Perpetual, humanoid: Humanoid, guided: bool = False) -> TaskConfig:
@@ -57,6 +63,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
     own = (ObsTerm("self_state", phc_obs.self_state),)
     if config.shape or config.shapes.several:
         own += (ObsTerm("shape", phc_obs.shape, {"sizes": phc_obs.shape_of(humanoid)}),)
+    left = None if config.heading == "twist" else torch.tensor(humanoid.left)
     goal = phc_obs.rotation_goal if config.goal == "rotations" else phc_obs.keypoint_goal
     limit, gamma = config.help_start, config.ppo.gamma
     recovery = None
@@ -64,14 +71,17 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         recovery = Recovery.phc(config.faithful, recovers)
         recovery = replace(recovery, drop=replace(recovery.drop, count=config.recovering.falls))
     return TaskConfig(
-        obs=(*own, ObsTerm(goal.__name__, goal)),
-        rewards=_rewards(config, recovers is not None),
+        obs=(*own, ObsTerm(goal.__name__, goal), *_more_seen(config, humanoid)),
+        rewards=_rewards(config, humanoid, recovers is not None),
         dones=(_failure(config, humanoid),),
         pd=_targets(config, humanoid),
         residual=ImplicitResidual(limit, limit) if limit else None,
         # What is learned with recovery is learned without help.
         help=_help(config) if limit and recovers is None else None,
         help_by=config.help_by,
+        left=left,
+        filter=config.filter,
+        window=config.window,
         horizon=config.horizon,
         # As many of the last rewards as a character that goes on would earn: g + g^2 + ...
         completion_bonus=gamma / max(1.0 - gamma, 1.0 / config.horizon),
@@ -83,15 +93,51 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
     )
 
 
-def _rewards(config: Perpetual, recovers: bool) -> tuple[RewardTerm, ...]:
-    """Eqs. 1 and 2, and where recovery is learned Eq. 4."""
+def _more_seen(config: Perpetual, humanoid: Humanoid) -> tuple[ObsTerm, ...]:
+    """What is observed beside the paper's, each term under a name by which it is found again, see
+    `jobs.warm_start.widened`."""
+    given = {
+        "bodies": torch.tensor(humanoid.rows_of(*KEY_PARTS)),
+        # Keypoints tell no rotation.
+        "turns": config.goal == "rotations",
+    }
+    later = tuple(
+        ObsTerm(f"goal_in_{k}", phc_obs.goal_later, {"step": i, **given})
+        for i, k in enumerate(config.window)
+    )
+    return (*((ObsTerm("last_action", phc_obs.last_action),) if config.filter else ()), *later)
+
+
+def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[RewardTerm, ...]:
+    """Eqs. 1 and 2, ours, and where recovery is learned Eq. 4."""
     rewards = phc_reward.imitation_terms(config.faithful)
+    if config.root:
+        rewards += (RewardTerm("root_position", phc_reward.root_position, config.root),)
+    halved = config.style.task_weight if config.style else 1.0
     if config.energy:
-        halved = config.style.task_weight if config.style else 1.0
         rewards += (phc_reward.energy_term(halved, config.energy_form, config.energy),)
+    if config.action_rate:
+        rewards += (phc_reward.cost_term(phc_reward.action_rate, config.action_rate, halved),)
+    if config.torque_rate:
+        limits = torch.tensor(humanoid.model.actuator_forcerange[:, 1]).float()
+        rewards += (
+            phc_reward.cost_term(phc_reward.torque_rate, config.torque_rate, halved, limits=limits),
+        )
+    if config.foot_slide:
+        soles = _soles(humanoid)
+        rewards += (phc_reward.cost_term(phc_reward.foot_slide, config.foot_slide, halved, **soles),)
     if config.help_start:
         rewards += (RewardTerm("residual", reward.residual, 0.1, imitation=False),)
     return recovery_terms(rewards, config.faithful) if recovers else rewards
+
+
+def _soles(humanoid: Humanoid) -> dict[str, Tensor]:
+    """Points of the feet for `phc_reward.foot_slide`."""
+    count, shapes = len(humanoid.bodies), shapes_of(humanoid.table, torch.float32)
+    still = torch.zeros(count, 3), torch.eye(4)[:1].expand(count, 4)
+    points = [foot_points(*still, shapes, [foot]) for foot in humanoid.feet]
+    rows = [torch.full((len(p),), foot) for foot, p in zip(humanoid.feet, points, strict=True)]
+    return {"rows": torch.cat(rows), "points": torch.cat(points)}
 
 
 def _help(config: Perpetual) -> SuccessHelp:
