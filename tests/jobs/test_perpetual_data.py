@@ -112,6 +112,19 @@ def test_onto_a_skeleton_a_clip_or_a_file(folder: Path, tmp_path: Path) -> None:
         assert report.clips[0].scale == pytest.approx(0.9, abs=1e-3)
 
 
+def test_skeletons_keep_their_bones_on_the_joints_of_one(folder: Path) -> None:
+    one, _ = library_of(folder)
+    library, _ = library_of(folder, config=LibraryConfig(own_bones=True))
+    assert library.names == one.names
+    assert len({c.skeleton.names for c in library}) == 1
+    assert len({c.skeleton.offsets.tobytes() for c in one}) == 1
+    tall = library.clips[[n.startswith("cmu-07") for n in library.names].index(True)]
+    low = library.clips[[n.startswith("cmu-02") for n in library.names].index(True)]
+    np.testing.assert_allclose(tall.skeleton.offsets, 1.2 * low.skeleton.offsets, atol=1e-6)
+    with pytest.raises(PoiseError, match="a clip that shows how it stands"):
+        library_of(folder, human(), config=LibraryConfig(own_bones=True))
+
+
 def test_the_second_run_takes_the_same_library_from_the_cache(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

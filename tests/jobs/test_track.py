@@ -24,6 +24,7 @@ from poise.jobs.tracker import Tracker
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, Skeleton, read_clip
 from poise.motion.io.raw import ReadOptions as Options
+from poise.motion.joint_map import map_joints
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Jitter
 from poise.motion.points.fit import JOINT_PLACES
@@ -52,6 +53,37 @@ def points(clip: Clip) -> Keypoints:
         found |= {f"{side}{joint}": f"{side[0]}{name}" for joint, name in names.items()}
     at = [clip.skeleton.index(j) for j in found]
     return Keypoints(tuple(found.values()), clip.positions()[:, at], clip.fps, "points")
+
+
+def test_a_clip_on_a_body_with_its_own_bones(tracker: Tracker, tmp_path: Path) -> None:
+    clip = shorter()
+    own, fixed = (track(clip, tracker, controller="policy", body=b) for b in ("own", "policy"))
+    body = own.imitation.humanoid
+    assert (body.bodies, body.hinges) == (tracker.humanoid.bodies, tracker.humanoid.hinges)
+    assert body.identity != tracker.humanoid.identity and body.mass < tracker.humanoid.mass
+    assert fixed.imitation.humanoid.identity == tracker.humanoid.identity
+    assert own.placed.moved is not None and own.placed.moved.scale == 1.0
+    # Its limbs are where the clip's are, and so are all of its joints when it has come back.
+    joints, there = map_joints(clip.skeleton, body.skeleton), own.placed.clip
+    a, b = joints.limb_pair("left_foot") or (0, 0)
+    np.testing.assert_allclose(there.positions()[:, b], clip.positions()[:, a], atol=1e-6)
+    back = home(own.placed.level.onto(there), own.placed, own.tracker)
+    np.testing.assert_allclose(back.positions(), clip.positions(), atol=1e-4)
+    assert own.clip.skeleton == clip.skeleton
+    assert set(own.save(tmp_path)) >= {"simulated", "body", "score", "report"}
+    with pytest.raises(PoiseError, match="single clip"):
+        track([clip, clip], tracker, body="own")
+    with pytest.raises(PoiseError, match="recovery clips"):
+        TrackConfig(body="own", recover=True)
+
+
+def shorter() -> Clip:
+    """A walk of the toy human with other proportions."""
+    clip = swing(1.5, 30.0, scale=0.85)
+    offsets = clip.skeleton.offsets.copy()
+    for side in ("Left", "Right"):
+        offsets[clip.skeleton.index(f"{side}Leg")] *= 1.1
+    return clip.replaced(skeleton=replace(clip.skeleton, offsets=offsets))
 
 
 def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> None:

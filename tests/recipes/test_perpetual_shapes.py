@@ -17,7 +17,7 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.kin import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
-from poise.motion import ClipLibrary, read_clip
+from poise.motion import ClipLibrary, read_clip, resample
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, build, task
 from poise.recipes.perpetual.shapes import (
@@ -259,3 +259,34 @@ def test_bad_settings_and_bodies(imitation: Imitation) -> None:
     fewer = replace(base.table, contact_exclusions=())
     with pytest.raises(PoiseError, match="differ in more than numbers"):
         differing([base.model, make_humanoid(base.skeleton, fewer).model])
+
+
+def test_clips_stand_on_bodies_of_their_own_bones(tmp_path: Path) -> None:
+    base = library()
+    clips, first = list(base.clips), base.clips[0].skeleton
+    longer = replace(first, offsets=first.offsets * 1.1)
+    # Two millimetres are the same body.
+    nearly = replace(first, offsets=first.offsets * 1.1 + 0.001)
+    clips[1] = clips[1].replaced(skeleton=longer, root_pos=clips[1].root_pos * 1.1)
+    clips[2] = clips[2].replaced(skeleton=nearly, root_pos=clips[2].root_pos * 1.1)
+    config = replace(CONFIG, shape=False, shapes=BodyShapes(own=True))
+    made = build(ClipLibrary.of(clips), config)
+    reference = made.reference
+    assert reference.body.tolist()[:3] == [0, 1, 1] and len(reference.bodies) == 2
+    small, large = reference.bodies
+    assert (small.bodies, small.hinges) == (large.bodies, large.hinges)
+    assert large.table.height_m == pytest.approx(1.1 * small.table.height_m)
+    assert made.library.names == base.names
+    # The motion is that of the clip, not a retargeted one.
+    at = int(reference.length[0])
+    q = reference.qpos[at : at + int(reference.length[1])].numpy()
+    pos = Kinematics(large.table)(torch.tensor(q)).pos[:, large.table.index("LeftFoot")].numpy()
+    joint = clips[1].skeleton.index("LeftFoot")
+    wanted = resample(clips[1], reference.rate_hz).positions()[:, joint]
+    assert np.ptp(np.linalg.norm((pos - wanted)[:, :2], axis=-1)) < 0.02
+    env = made.env(3, threads=1, auto_reset=False)
+    env.reset_to(torch.arange(3), torch.zeros(3, dtype=torch.long))
+    assert env.backend.get_model(1).body_mass.sum() == pytest.approx(large.mass)
+    env.close()
+    with pytest.raises(PoiseError, match="not both"):
+        BodyShapes(count=2, own=True)

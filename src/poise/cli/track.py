@@ -51,6 +51,9 @@ class Options:
     """policy acts alone, at once; lookahead tries in copies of the character before it acts, which is
     nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto
     looks ahead, and searches what is lost so."""
+    body: Literal["policy", "own"] = "policy"
+    """policy is the body that it was trained on, onto which the motion is retargeted; own has the same
+    joints with the lengths and masses of the skeleton that came in."""
     budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
     """Simulated control steps for each that is made, of lookahead; by default 192. More are nearer and
     cleaner, and take longer."""
@@ -119,6 +122,8 @@ def check(o: Options) -> None:
     check_range("rounds", o.rounds, 1, 20)
     check_range("budget", o.budget, 1, 1_000_000)
     check_range("threads", o.threads, 0)
+    if o.learn and o.body == "own":
+        raise PoiseError("the policy learns on its own body", hint="Leave --body own or --learn out")
     if o.learn and o.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
         raise PoiseError(what, hint="Leave one out")
@@ -149,7 +154,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     config = TrackConfig(
         noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
         smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
-        search=search, threads=o.threads,
+        search=search, threads=o.threads, body=o.body,
     )  # fmt: skip
     config.check(len(o.clips))
     given = [read(clip, o.reading) for clip in o.clips]

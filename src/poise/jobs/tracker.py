@@ -25,6 +25,7 @@ from poise.jobs.library.clips import Target
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile
 from poise.jobs.runs import policy_for
+from poise.kin import RetargetConfig, onto_own, own_body
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
 from poise.learn.checkpoint import PolicyMeta
 from poise.learn.policy import policy_in
@@ -79,6 +80,7 @@ class Tracker:
             learned that.
         value: what its critic tells of a state, by which `track.recovering` looks ahead; None where the
             critic was not kept.
+        onto: how motions pass onto the body; None for those of any size, as `retarget` does by itself.
     """
 
     policy: PolicyBundle
@@ -88,11 +90,23 @@ class Tracker:
     about: Mapping[str, Any]
     recovery_clips: RecoveryClips | None = None
     value: Value | None = None
+    onto: RetargetConfig | None = None
 
     @property
     def target(self) -> Target:
         """The body as what a library is brought onto, see `library_of`."""
         return Target(self.humanoid.skeleton, self.example, self.humanoid.table, "the policy's body")
+
+    def with_bones_of(self, clip: Clip) -> Tracker:
+        """The policy on its own bodies and hinges with the lengths and masses of a clip's skeleton.
+
+        Raises:
+            PoiseError: see `own_body`.
+        """
+        table, example = own_body(clip, self.humanoid.table, self.example, self.config.body)
+        humanoid = make_humanoid(example.skeleton, table)
+        self.config.sim.apply(humanoid.model)
+        return replace(self, humanoid=humanoid, example=example, onto=onto_own(humanoid.table))
 
 
 def policy_of_run(file: RunFile) -> Tracker:

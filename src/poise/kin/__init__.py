@@ -21,6 +21,7 @@ from poise.kin.ik.frames import CORRECTIONS, IkConfig
 from poise.kin.ik.polish import polish
 from poise.kin.limbs import limb_of, match_positions, two_bone
 from poise.kin.place import place_on_body
+from poise.kin.retarget.own_body import onto_own, own_body
 from poise.kin.retarget.report import RetargetReport
 from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
@@ -60,6 +61,8 @@ __all__ = [
     "limb_of",
     "lowest_height",
     "match_positions",
+    "onto_own",
+    "own_body",
     "place_on_body",
     "polish",
     "qpos_to_clip",

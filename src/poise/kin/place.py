@@ -17,7 +17,7 @@ from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground
 from poise.kin.hinges import within_turns
 from poise.kin.retarget.report import RetargetReport
-from poise.kin.retarget.transfer import retarget
+from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
 from poise.motion import Clip, ClipLibrary, Skeleton, resample
 
@@ -57,6 +57,7 @@ def place_on_body(
     rate_hz: float | None = None,
     *,
     example: Clip | None = None,
+    how: RetargetConfig | None = None,
     clean: bool = True,
     level: bool = True,
     near: Humanoid | None = None,
@@ -71,6 +72,7 @@ def place_on_body(
         onto: the body's skeleton, or a clip on it that shows how it stands; by default the clip's own.
         rate_hz: of the coordinates; by default the clip's own.
         example: a clip on the source's skeleton that shows how it stands, see `retarget`.
+        how: it is retargeted.
         clean: repair flips and impossible speeds (`clean_clip`).
         level: turn feet that stand on their edge flat (`level_feet`).
         near: shift hinges by whole turns as near to this humanoid's ranges as can be.
@@ -84,7 +86,7 @@ def place_on_body(
     moved, retargeting = clip, None
     skeleton = onto.skeleton if isinstance(onto, Clip) else onto
     if onto is not None and skeleton is not None and not clip.skeleton.same_bones(skeleton):
-        moved, retargeting = retarget(clip, onto, example=example)
+        moved, retargeting = retarget(clip, onto, config=how, example=example)
     made, cleaned = clean_clip(moved) if clean else (moved, CleanReport())
     turned = level_feet(made, table) if level else Levelled({})
     made = turned.onto(made)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.roles import Roles, check_role, find_roles, split_role
@@ -44,6 +44,12 @@ class JointMap:
         """Source and target joint of a role, None where either lacks it."""
         pair = self.source.joint(role), self.target.joint(role)
         return None if pair[0] is None or pair[1] is None else (pair[0], pair[1])
+
+    def without(self, roles: Collection[str]) -> JointMap:
+        """The map with target joints of some roles that nothing moves."""
+        out = {j for j in map(self.target.joint, roles) if j is not None}
+        rows = tuple(r for r in self.rows if r.target not in out)
+        return replace(self, rows=rows, direct=tuple(p for p in self.direct if p[1] not in out))
 
     def unused(self) -> tuple[str, ...]:
         """Source joints with a part of their own that moves nothing in the target."""

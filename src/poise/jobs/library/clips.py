@@ -13,7 +13,7 @@ from poise.body import BodyConfig, BodyTable, generate_table, read_mjcf
 from poise.errors import PoiseError
 from poise.jobs.library.files import MotionFile, check_patterns, matches
 from poise.jobs.library.report import ClipNote
-from poise.kin import place_on_body
+from poise.kin import RetargetConfig, onto_own, own_body, place_on_body
 from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
 from poise.kin.doctor.clean import clean_clip
 from poise.kin.flight import rate_sentence
@@ -48,6 +48,7 @@ class LibraryConfig:
             is not simulated has no need of.
         mirror: each clip is taken in a mirror, too.
         backwards: of clips that are taken backwards, too; see `images`.
+        own_bones: each skeleton keeps its lengths on the target's joints, see `own_body`.
     """
 
     min_frames: int = 10
@@ -63,6 +64,7 @@ class LibraryConfig:
     level: bool = True
     mirror: bool = False
     backwards: tuple[str, ...] = ()
+    own_bones: bool = False
 
     def __post_init__(self) -> None:
         taken = (*self.keep, *self.leave_out, *self.backwards)
@@ -73,12 +75,26 @@ class LibraryConfig:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The skeleton that all clips come onto, a clip that shows how it stands, and its body."""
+    """The skeleton that all clips come onto, a clip that shows how it stands, its body, and how clips
+    come onto it."""
 
     skeleton: Skeleton
     example: Clip | None
     table: BodyTable
     words: str
+    how: RetargetConfig | None = None
+
+    def with_bones_of(self, clip: Clip, body: BodyConfig) -> Target:
+        """The same joints with the lengths of a clip's skeleton.
+
+        Raises:
+            PoiseError: see `own_body`.
+        """
+        assert self.example is not None
+        table, example = own_body(clip, self.table, self.example, body)
+        return replace(
+            self, skeleton=example.skeleton, example=example, table=table, how=onto_own(table)
+        )
 
 
 class Taken(NamedTuple):
@@ -247,8 +263,9 @@ def set_down(
     # As the humanoid can turn its joints: its feet are rigid and turn about two axes alone.
     onto = target.example or target.skeleton
     on = place_on_body(
-        clip, target.table, onto, example=example, clean=False, level=config.level, known=False
-    )
+        clip, target.table, onto, example=example, how=target.how, clean=False, level=config.level,
+        known=False,
+    )  # fmt: skip
     return shifted(on.clip, (0.0, 0.0, on.ground.lift_m)), on
 
 

@@ -8,6 +8,7 @@ a performer sits on furniture, hangs or is carried, by a list made by hand. Here
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
@@ -96,12 +97,21 @@ def library_of(
         return ClipLibrary.of(clips), LibraryReport.from_dict(meta["report"], cached=True)
     read, notes = read_all(files, fps, config, tell)
     target = target_of(onto, [taken.clip for taken in read], body)
+    if config.own_bones and (target.example is None or body.mjcf is not None):
+        what = "clips keep their bones on a body that is generated, from a clip that shows how it stands"
+        raise PoiseError(what, hint="Leave own_bones out, or give a clip to come onto")
     examples: dict[tuple, Clip] = {}
+    own: dict[tuple, Target] = {}
     clips: list[Clip] = []
     for k, taken in enumerate(read, 1):
         example = examples.setdefault(shape_of(taken.clip.skeleton), taken.clip)
-        made, notes[taken.file.name] = place(taken, example, target, config)
-        clips += [] if made is None else images(made, target, config)
+        onto = own.get(shape_of(example.skeleton), target)
+        if config.own_bones and onto is target:
+            # A skeleton that is no human's is left out by `place`, which says why.
+            with suppress(PoiseError):
+                onto = own[shape_of(example.skeleton)] = target.with_bones_of(example, body)
+        made, notes[taken.file.name] = place(taken, example, onto, config)
+        clips += [] if made is None else images(made, onto, config)
         if k % 100 == 0:
             tell(f"{k} of {len(read)} clips placed")
     report = LibraryReport(tuple(notes[f.name] for f in files), target.words, fps)

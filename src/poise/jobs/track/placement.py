@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from poise.body import Humanoid
 from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
@@ -15,6 +16,7 @@ from poise.kin.feet.level import Levelled
 from poise.kin.fit import ClipFit
 from poise.kin.ground import clip_flights
 from poise.motion import Clip, shifted
+from poise.spatial import quat_between, quat_mul
 
 if TYPE_CHECKING:
     from poise.jobs.tracker import Tracker
@@ -50,7 +52,7 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     """
     humanoid, rate = tracker.humanoid, tracker.config.sim.control_hz
     clip = clip.replaced(cyclic=False)
-    on = place_on_body(clip, humanoid.table, tracker.example, rate, near=humanoid)
+    on = place_on_body(clip, humanoid.table, tracker.example, rate, how=tracker.onto, near=humanoid)
     flights = clip_flights(on.moved, humanoid.table)
     fit = ClipFit(clip.name, clip.fps, flights, on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
@@ -106,7 +108,7 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
     motion = placed.level.off(motion)
     if placed.moved is None:
         return motion
-    config = RetargetConfig(scale=1.0 / placed.moved.scale)
+    config = replace(tracker.onto or RetargetConfig(), scale=1.0 / placed.moved.scale)
     back, report = retarget(motion, placed.source, config=config, example=tracker.example)
     moved = {row.target for row in report.joints.rows if row.source}
     moved |= {j for _, j in report.joints.direct}
@@ -119,7 +121,23 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
     own = [j for j in range(len(skeleton)) if j not in carries]
     frames = min(back.frames, placed.source.frames)
     rot[:frames, own] = placed.source.rot[:frames, own]
-    return back.replaced(rot=rot, name=placed.source.name)
+    back = back.replaced(rot=rot, name=placed.source.name)
+    still = [report.joints.target.joint(role) for role in config.rigid]
+    return _turned_under(back, placed.source, [j for j in still if j is not None])
+
+
+def _turned_under(clip: Clip, source: Clip, joints: Sequence[int]) -> Clip:
+    """The clip with some joints turned as in the source, while those that hang on them keep their
+    turns in the world."""
+    rot, parents = torch.tensor(clip.rot), clip.skeleton.parents
+    frames = min(clip.frames, source.frames)
+    for j in joints:
+        own = torch.tensor(source.rot[:frames, j])
+        turn = quat_between(own, rot[:frames, j])
+        rot[:frames, j] = own
+        for child in (c for c, p in enumerate(parents) if p == j):
+            rot[:frames, child] = quat_mul(turn, rot[:frames, child])
+    return clip.replaced(rot=rot.numpy())
 
 
 def _notes(

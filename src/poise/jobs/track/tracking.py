@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -63,6 +63,8 @@ class TrackConfig:
         lookahead: how it looks ahead; its seed is `seed`.
         search: how it searches; its seed is `seed`.
         threads: cores of lookahead and search, 0 is all of them.
+        body: "policy" is the one that it was trained on, onto which motions are retargeted; "own" has
+            the same bodies and hinges with the lengths and masses of the skeleton that came in.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -75,6 +77,7 @@ class TrackConfig:
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     search: SamplingConfig = field(default_factory=SamplingConfig)
     threads: int = 0
+    body: Literal["policy", "own"] = "policy"
 
     def __post_init__(self) -> None:
         validate(self)
@@ -87,6 +90,9 @@ class TrackConfig:
             what = "several characters" if self.count > 1 else "one that comes or is put back"
             raise PoiseError(f"a motion is searched for a single character, not {what}")
 
+        if self.body == "own" and self.recover:
+            raise PoiseError("recovery clips are those of the policy's body, so body='own' has none")
+
     def check(self, clips: int) -> None:
         """Refuses what cannot be done with so many clips one after another.
 
@@ -96,7 +102,7 @@ class TrackConfig:
         alone = {
             "several characters are": self.count > 1, "noise is": bool(self.noise),
             "putting a character back is": self.reset_on_fail,
-            "a search is": self.controller == "search",
+            "a search is": self.controller == "search", "a body of its own is": self.body == "own",
         }  # fmt: skip
         if not clips:
             raise PoiseError("there is no clip to track")
@@ -158,6 +164,7 @@ def track(
     if config.recover or several:
         all_placed = place_all([given, *(_input(m, config)[0] for m in motions[1:])], tracker)
     else:
+        tracker = tracker.with_bones_of(given) if config.body == "own" else tracker
         all_placed = [place(given, tracker)]
     placed = all_placed[0]
     imitation = imitation_of(tracker, all_placed)

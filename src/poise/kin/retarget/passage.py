@@ -92,8 +92,11 @@ class Passage:
             there = common_pose(joints.target, shown)
         return Passage(joints, here, there, Scale.between(world, clip.fps, here, there, factor))
 
-    def transfer(self, world_in: World) -> tuple[Tensor, Tensor]:
-        """Local rotations `(T, J, 4)` and root path `(T, 3)` of the target, contacts as they come."""
+    def transfer(self, world_in: World, share: bool = True) -> tuple[Tensor, Tensor]:
+        """Local rotations `(T, J, 4)` and root path `(T, 3)` of the target, contacts as they come.
+
+        share: see `RetargetConfig`.
+        """
         joints, here, there = self.joints, self.here, self.there
         target = joints.target.skeleton
         source_pos, source_quat = world_in
@@ -101,7 +104,7 @@ class Passage:
         turned = quat_mul(source_quat, quat_conj(torch.tensor(here.rot)))
         rest = torch.tensor(there.rot)
         moves = dict((b, a) for a, b in joints.direct)
-        shared = _shared(self, turned)
+        shared = _shared(self, turned, share)
         hips = joints.target.joint("hips")
         above = target.ancestors(hips if hips is not None else 0)
         world: list[Tensor] = []
@@ -130,11 +133,12 @@ def hip_middle(joints: JointMap, pos: Tensor, side: int) -> Tensor:
     return sum((pos[:, p[side]] for p in pairs if p is not None), torch.zeros(())) / 2
 
 
-def _shared(passage: Passage, turned: Tensor) -> dict[int, Tensor]:
+def _shared(passage: Passage, turned: Tensor, share: bool) -> dict[int, Tensor]:
     """World turns `(T, 4)` from the common pose of the target's spine, neck and head.
 
     A chain's joints have places in [0, 1] from what carries it (0) to its last joint (1); between the
-    source's joints the turn is interpolated.
+    source's joints the turn is interpolated, or without `share` that of the joint below where the spine
+    of the target has more of them.
     """
     out: dict[int, Tensor] = {}
     joints = passage.joints
@@ -151,8 +155,9 @@ def _shared(passage: Passage, turned: Tensor) -> dict[int, Tensor]:
             (0.0, carrier),
             *zip(_places(passage.here, source), [turned[:, j] for j in source], strict=True),
         ]
+        shares = share or kinds != SHARED[:1] or len(source) >= len(target)
         for j, at in zip(target, _places(passage.there, target), strict=True):
-            out[j] = _between(knots, at)
+            out[j] = (_between if shares else _below)(knots, at)
         chest = knots[-1][1]
         carrier = chest
     return out
@@ -182,3 +187,8 @@ def _between(knots: list[tuple[float, Tensor]], at: float) -> Tensor:
                 return high
             return slerp(low, high, torch.full((len(low),), share, dtype=low.dtype))
     return knots[-1][1]
+
+
+def _below(knots: list[tuple[float, Tensor]], at: float) -> Tensor:
+    """The turn of the bone that carries a place: that of the last joint at or below it."""
+    return [turn for place, turn in knots if place <= at + 1e-9][-1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -22,12 +22,16 @@ class RetargetConfig:
 
     contacts: hold planted feet and hands where the source's are, scaled. clear: lift what would sink
     deeper into the floor than in the source. scale: size of the path, by default the ratio of the
-    heights of the hips.
+    heights of the hips. share: where the target's spine has more joints than the source's, they share
+    its bend out; without, those that lie on a bone of the source move as that bone. rigid: roles that
+    keep to what carries them.
     """
 
     contacts: bool = True
     clear: bool = True
     scale: float | None = None
+    share: bool = True
+    rigid: tuple[str, ...] = ()
 
 
 def retarget(
@@ -63,7 +67,9 @@ def retarget(
     config = config or RetargetConfig()
     target = onto if isinstance(onto, Skeleton) else onto.skeleton
     world, passage = World.of(clip), Passage.between(clip, onto, mapping, example, config.scale)
-    rot, root = passage.transfer(world)
+    if config.rigid:
+        passage = replace(passage, joints=passage.joints.without(config.rigid))
+    rot, root = passage.transfer(world, config.share)
     feet = feet_of(passage)
     contacts = source_contacts(world, clip.fps, feet, passage.scale.ground)
     if config.contacts or config.clear:

@@ -236,7 +236,7 @@ class Perpetual:
         if self.cooling and self.ppo.kl_target is not None:
             what = "cooling is for steps of a fixed size, and kl_target adapts them"
             raise PoiseError(what, "Perpetual", "Set kl_target=None, or leave cooling out")
-        if self.trajopt is not None and self.shapes.count > 1:
+        if self.trajopt is not None and self.shapes.several:
             what = "trajectories are optimised for one body, and there are several shapes"
             raise PoiseError(what, "Perpetual", "Leave one of the two out")
         if self.ppo.learn_std:

@@ -67,6 +67,6 @@ def _standing(heights: Tensor) -> Tensor:
 
 def known_recovery_clips(config: Perpetual, reference: Reference) -> RecoveryClips | None:
     """The recovery clips of a library; None where recovery is not learned by it."""
-    if not (config.recovery and config.recovering.demonstrations) or config.shapes.count > 1:
+    if not (config.recovery and config.recovering.demonstrations) or config.shapes.several:
         return None
     return find_recovery_clips(reference, standing(reference), walking_clips(reference))

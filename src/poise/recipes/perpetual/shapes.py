@@ -31,6 +31,7 @@ from poise.env.terms import phc_obs
 from poise.errors import PoiseError
 from poise.kin import clean_clip, place_on_body
 from poise.kin.fit import widen
+from poise.kin.retarget.own_body import own_table
 from poise.motion import Clip, ClipLibrary, Skeleton
 from poise.recipes.imitation import Imitation
 
@@ -44,6 +45,10 @@ GROUPS: tuple[tuple[str, ...], ...] = (
 )
 
 
+#: Skeletons with no bone that differs by more (m) share a body.
+SAME_BODY_M = 0.003
+
+
 @dataclass(frozen=True)
 class BodyShapes:
     """The bodies of a training.
@@ -54,6 +59,8 @@ class BodyShapes:
         per_clip: on how many bodies each clip is done, the first among them; 0 for all. Memory goes with
             it: about 2 kB a frame.
         seed: of the draws.
+        own: in place of draws, each clip is done on the body of its own skeleton, in a library of one
+            hierarchy with bones of several lengths; bodies within `SAME_BODY_M` are one.
     """
 
     count: int = 1
@@ -61,8 +68,11 @@ class BodyShapes:
     high: float = 1.15
     per_clip: int = 0
     seed: int = 0
+    own: bool = False
 
     def __post_init__(self) -> None:
+        if self.own and self.count > 1:
+            raise PoiseError("bodies are drawn or the clips' own, not both", "BodyShapes")
         if not 1 <= self.count <= 1000:
             raise PoiseError(f"there can be 1 to 1000 bodies, got {self.count}", "BodyShapes")
         if not 0.5 <= self.low <= self.high <= 2.0:
@@ -73,6 +83,11 @@ class BodyShapes:
             raise PoiseError(
                 f"a clip can be done on 1 to {self.count} bodies, got {self.per_clip}", "BodyShapes"
             )
+
+    @property
+    def several(self) -> bool:
+        """Whether there may be more than one body."""
+        return self.own or self.count > 1
 
     def factors(self) -> np.ndarray:
         """`(S, len(GROUPS))` sizes of the parts; the first row is 1."""
@@ -105,8 +120,10 @@ def shaped(
     Raises:
         PoiseError: the task does not observe the shape, or a clip that cannot be retargeted.
     """
-    if shapes.count == 1:
+    if not shapes.several:
         return imitation
+    if shapes.own:
+        return _finished(imitation, *_own_bodies(imitation), make_task)
     rate, base = imitation.reference.rate_hz, imitation.humanoid
     sizes = shapes.factors()
     tables = [base.table, *(scaled_table(base.table, s) for s in sizes[1:])]
@@ -127,16 +144,60 @@ def shaped(
             weights.append(imitation.library.weights[c])
             body.append(k)
             cyclic.append(False)
+    library = ClipLibrary(tuple(clips), tuple(weights))
+    return _finished(imitation, library, tables, skeletons, motions, cyclic, body, make_task)
+
+
+def _own_bodies(imitation: Imitation) -> tuple[
+    ClipLibrary, list[BodyTable], list[Skeleton], list[np.ndarray], list[bool], list[int]
+]:  # fmt: skip
+    """The library with each clip on the body of its own bones; tables and skeletons of the bodies,
+    coordinates, which clips go on in cycles, and which body each has."""
+    base, clips, body = imitation.humanoid, list[Clip](), list[int]()
+    tables, skeletons = [base.table], [base.skeleton]
+    motions = _motions(imitation.reference)
+    cyclic = cast("list[bool]", imitation.reference.cyclic.tolist())
+    example = imitation.library.clips[0]
+    for c, clip in enumerate(imitation.library.clips):
+        same = (k for k, s in enumerate(skeletons) if clip.skeleton.same_bones(s, SAME_BODY_M))
+        k = next(same, len(skeletons))
+        if k == len(skeletons):
+            skeletons.append(clip.skeleton)
+            there = example.replaced(skeleton=clip.skeleton)
+            tables.append(own_table(there, base.table, imitation.config.body))
+        body.append(k)
+        clip = clip.replaced(skeleton=skeletons[k])
+        if k:
+            there = example.replaced(skeleton=skeletons[k])
+            rate = imitation.reference.rate_hz
+            clip, motions[c] = _on_body(clip, example, there, tables[k], base, rate)
+            cyclic[c] = False
+        clips.append(clip)
+    library = ClipLibrary(tuple(clips), imitation.library.weights)
+    return library, tables, skeletons, motions, cyclic, body
+
+
+def _finished(
+    imitation: Imitation,
+    library: ClipLibrary,
+    tables: Sequence[BodyTable],
+    skeletons: Sequence[Skeleton],
+    motions: list[np.ndarray],
+    cyclic: list[bool],
+    body: list[int],
+    make_task: Callable[[Humanoid], TaskConfig],
+) -> Imitation:
+    """The task of a library on its bodies."""
+    rate = imitation.reference.rate_hz
     tables = _widened(tables, motions, imitation.config.body.margin)
     bodies = [make_humanoid(s, t) for s, t in zip(skeletons, tables, strict=True)]
     for humanoid in bodies:
         imitation.config.sim.apply(humanoid.model)
-    library = ClipLibrary(tuple(clips), tuple(weights))
     reference = Reference(bodies[0], motions, rate, library.names, cyclic, bodies, body)
     task = make_task(bodies[0])
     if not any(term.fn is phc_obs.shape for term in task.obs):
         raise PoiseError(
-            f"a policy for {shapes.count} bodies must observe them", hint="Set Perpetual(shape=True)"
+            f"a policy for {len(bodies)} bodies must observe them", hint="Set Perpetual(shape=True)"
         )
     return replace(imitation, library=library, humanoid=bodies[0], reference=reference, task=task)
 

@@ -61,7 +61,7 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
     """The task of a stage that learns to recover as PHC's recovery "primitive" or as its "composer", or
     tracks alone (None). The observations are of the same size in all of them."""
     own = (ObsTerm("self_state", phc_obs.self_state),)
-    if config.shape or config.shapes.count > 1:
+    if config.shape or config.shapes.several:
         own += (ObsTerm("shape", phc_obs.shape, {"sizes": phc_obs.shape_of(humanoid)}),)
     left = None if config.heading == "twist" else torch.tensor(humanoid.left)
     goal = phc_obs.rotation_goal if config.goal == "rotations" else phc_obs.keypoint_goal
