@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -72,12 +73,14 @@ def bench_engine(
     repeats: int = 5,
     steps: int = 16,
     tell: Progress | None = None,
+    until: float = math.inf,
 ) -> dict[str, Any]:
     """Stepping and training against the raw limit, interleaved in one process.
 
     Every repeat measures, one right after the other: `steps` control steps of the environment with
     observations, rewards and resets; MuJoCo's batch alone on the same number of states, recorded from
     that environment; one training iteration. Ratios are taken within a repeat, and medians over them.
+    After `until` (`time.monotonic()`) no further repeat begins.
     """
     threads = threads or cores()
     before = memory_mb()
@@ -97,6 +100,8 @@ def bench_engine(
         ):
             stack.enter_context(clock.on(owner, method, name))
         for k in range(repeats):
+            if rows and time.monotonic() > until:
+                break
             if tell is not None:
                 tell(f"engine, {k + 1} of {repeats}")
             actions = exploring(imitation, env, steps, seed=k)
@@ -134,6 +139,7 @@ def bench_engine(
     out = {
         "envs": env.num_envs,
         "threads": threads,
+        "repeats": len(rows),
         "rate_hz": sim.rate_hz,
         "control_hz": sim.control_hz,
         "integrator": sim.integrator,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any, cast
@@ -72,12 +73,14 @@ def bench_gpu(
     repeats: int = 5,
     steps: int = 16,
     tell: Progress | None = None,
+    until: float = math.inf,
 ) -> dict[str, Any]:
     """Stepping and training on a GPU against `mujoco_warp.step` alone, interleaved in one process.
 
     Every repeat measures, one right after the other: `steps` control steps of the environment with
     observations, rewards and resets; as many raw control steps from where the environment began; one
-    training iteration. Ratios are taken within a repeat, and medians over them.
+    training iteration. Ratios are taken within a repeat, and medians over them. After `until`
+    (`time.monotonic()`) no further repeat begins.
     """
     sim = imitation.config.sim
 
@@ -94,6 +97,8 @@ def bench_gpu(
     _walk(env, exploring(imitation, env, 2))
     trainer.iterate()
     for k in range(repeats):
+        if rows and time.monotonic() > until:
+            break
         if tell is not None:
             tell(f"gpu, {k + 1} of {repeats}")
         raw.load(backend)
@@ -117,6 +122,7 @@ def bench_gpu(
     return {
         "device": _name(backend.device),
         "envs": num_envs,
+        "repeats": len(rows),
         "rate_hz": sim.rate_hz,
         "control_hz": sim.control_hz,
         "integrator": sim.integrator,
