@@ -141,7 +141,7 @@ def _is_setting(option: str) -> bool:
         return not path or (hasattr(value, path[0]) and inside(getattr(value, path[0]), path[1:]))
 
     path = option.removeprefix("--").replace("-", "_").split(".")
-    return len(path) > 1 and any(inside(c, path) for c in (Perpetual(), ResidualForce()))
+    return len(path) > 1 and any(inside(c, path) for c in (Perpetual().taught(), ResidualForce()))
 
 
 def test_named_files_and_keys_exist() -> None:
