@@ -21,7 +21,7 @@ import perpetual_rows
 from tracker import SIXTY
 
 from poise.body import BodyConfig
-from poise.cli.train_perpetual import shown
+from poise.cli.perpetual_report import shown
 from poise.cli.training import beginning
 from poise.jobs import runs
 from poise.jobs.library.clips import LibraryConfig

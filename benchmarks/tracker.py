@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from poise.body import BodyConfig
-from poise.cli.train_perpetual import shown
+from poise.cli.perpetual_report import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.perpetual.run import begin, clips_of, resume, train

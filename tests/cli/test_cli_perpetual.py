@@ -114,7 +114,7 @@ def test_all_stages_by_one_command(
 def test_ctrl_c_saves_and_says_how_to_go_on(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from poise.cli import train_perpetual as perpetual_shown
+    from poise.cli import perpetual_report as perpetual_shown
 
     plain = perpetual_shown.events
 

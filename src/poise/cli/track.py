@@ -231,7 +231,7 @@ def follow(tracker: Tracker, given: Sequence[Clip | Keypoints], config: TrackCon
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
-    from poise.cli.train_perpetual import times
+    from poise.cli.perpetual_report import times
     from poise.jobs.track.learning import learn
 
     o, when, rate = options, tracked.failures[0][1], tracker.config.sim.control_hz

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from tyro.conf import arg
 
 from poise.cli import progress
 from poise.cli.answer import Answer
-from poise.cli.console import launched, notes, say, table, tell
+from poise.cli.console import launched, notes, say, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Flag, Training
 from poise.cli.output import claimed
-from poise.cli.progress import clock, left, showing
+from poise.cli.perpetual_report import report, shown
+from poise.cli.progress import clock
 from poise.cli.settings import derived, given
 from poise.cli.training import beginning, held_already, stopped
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.cli.train import Options
-    from poise.eval import RecoveryCard
-    from poise.jobs.perpetual.run import PerpetualResult
-    from poise.jobs.perpetual.stage_order import Progress
     from poise.jobs.tracker import Tracker
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual import Perpetual
@@ -39,8 +37,8 @@ else:
     )  # fmt: skip
 
 
-#: What teaches a policy beside its rewards.
-Teacher: TypeAlias = Literal["lookahead"]
+#: The teacher that is no policy.
+LOOKAHEAD = "lookahead"
 
 
 @dataclass(frozen=True)
@@ -57,9 +55,11 @@ class Primitives(_Derived):
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
-    teacher: Annotated[Teacher | None, arg(metavar="lookahead", help_behavior_hint="")] = None
+    teacher: Annotated[str | None, arg(metavar="lookahead|POLICY", help_behavior_hint="")] = None
     """perpetual: lookahead tells the policy what it should have done where it comes to; the policy
-    learns from that alone, and PPO trains the critic. With --from the policy comes to observe more."""
+    learns from that alone, and PPO trains the critic. With --from the policy comes to observe more.
+    A POLICY, a file or a run, is imitated at first, with its settings and body but for what is stated,
+    such as --goal keypoints."""
     style: Flag = True
     """perpetual: reward the task alone; by default a discriminator rewards motion like the library's."""
 
@@ -90,8 +90,17 @@ def settings(
         values["style"] = None
     additive = values.get("action") == "additive"
     default = perpetual.Perpetual.additive() if additive else perpetual.Perpetual()
-    if primitives.teacher:
+    if primitives.teacher == LOOKAHEAD:
         default = default.taught()
+    elif primitives.teacher:
+        from poise.jobs.open import open_run
+        from poise.jobs.perpetual.distillation import taught_by
+
+        if primitives.going_on is not None:
+            what = "--teacher POLICY is imitated by a new network, and --from goes on with one"
+            raise PoiseError(what, hint="Leave one out, or take --teacher lookahead")
+        goal = {"goal": values["goal"]} if "goal" in values else {}
+        default = taught_by(open_run(Path(primitives.teacher)).tracker.config, **goal)
     return training.settings("perpetual", default, body, values)
 
 
@@ -139,16 +148,22 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         if o.recipe_settings.num_envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
         config = going_on(tracker.config, config, returns)
-        if primitives.teacher:
+        if primitives.teacher == LOOKAHEAD:
             asked = o.recipe_settings.num_envs
             config = config.taught() if asked is None else replace(config.taught(), num_envs=asked)
+    elif primitives.teacher not in (None, LOOKAHEAD):
+        tracker = _teacher(primitives, library)
     imitation = begin(library, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result, trained = training, None, None
     if tracker is not None and not held:
+        from poise.jobs.perpetual.distillation import distilled
         from poise.jobs.warm_start import widened
 
-        trained = widened(tracker, imitation)
+        if primitives.going_on is None:
+            trained = distilled(tracker, imitation, t.threads, out / "dumps", beginning())
+        else:
+            trained = widened(tracker, imitation)
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
         result = train(
@@ -159,6 +174,17 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         where = "" if result is None or result.last is None else f" in {result.last.stage.name}"
         return stopped(out, again, where)
     return report(imitation, result, out)
+
+
+def _teacher(primitives: Primitives, library: Library) -> Tracker:
+    """The policy that teaches, onto whose body the clips are brought."""
+    from poise.jobs.open import open_run
+
+    if library.onto is not None:
+        what = "--teacher POLICY brings the clips onto its body, and --onto onto another skeleton"
+        raise PoiseError(what, hint="Leave --onto out")
+    assert primitives.teacher is not None
+    return open_run(Path(primitives.teacher)).tracker
 
 
 def begin(
@@ -172,7 +198,7 @@ def begin(
     """Reads the folder, tries the run folder, builds the task; nothing stays if that fails.
 
     held: the run folder holds a run already, which then is all that is read. tracker: the policy that it
-    goes on from.
+    goes on from or is taught by.
     """
     from poise.jobs.perpetual import run as perpetual_run
 
@@ -193,93 +219,3 @@ def begin(
     notes(said)
     with claimed(out), progress.working("making the body"):
         return perpetual_run.begin(out, clips, config, source, training.device, tracker)
-
-
-# --- what is shown ------------------------------------------------------------------------------
-
-#: Clips that are named in the end.
-NAMED = 10
-
-
-def report(imitation: Imitation, result: PerpetualResult, out: Path) -> Answer:
-    """What the run came to, and which clips are the hardest."""
-    if result.last is None:
-        say(f"{out} had reached its limit before; nothing was trained.")
-    else:
-        stats = result.last.stats
-        say(f"Trained {clock(stats.seconds)}, {stats.samples:,} samples, {parts(result)}")
-    r, names = result.results, imitation.library.names
-    assert r is not None
-    won, total = int(r.succeeded.sum()), len(r.clip)
-    say(f"Without help {won} of {total} clips succeed ({100 * r.rate:.1f} %), {r.error_mm:.0f} mm")
-    if result.recovery is not None:
-        say(recovered(result.recovery))
-    if hard := r.hardest(NAMED):
-        rows = []
-        for c in hard:
-            k = r.clip.tolist().index(c)
-            rows.append((names[c], f"{int(r.tracked[k])} of {int(r.frames[k])}"))
-        table(f"The hardest of {total - won} that fail", ("clip", "frames tracked"), rows)
-    figures = {"succeeded": won, "clips": total, "succ": r.rate, "error_mm": r.error_mm}
-    return Answer(figures, {"run": out})
-
-
-def recovered(card: RecoveryCard) -> str:
-    """What trials of recovery came to: "Recovery: fallen 95 % within 5 s and 99 % within 10 s; ..."."""
-    rows = []
-    for row in card.rows:
-        each = (f"{100 * x:.0f} % within {t:g} s" for x, t in zip(row.within, card.seconds, strict=True))
-        rows.append(f"{row.kind} {' and '.join(each)}")
-    return f"Recovery, {card.rows[0].trials} trials each: {'; '.join(rows)}"
-
-
-def parts(result: PerpetualResult) -> str:
-    """What was trained, in words."""
-    n = result.primitives
-    made = f"{n} primitive{'s' if n > 1 else ''}" if n else "one network"
-    return f"{made}; nothing fails any more" if result.solved else made
-
-
-def figures(p: Progress) -> str:
-    """What one iteration says: the stage, its clips, the speed."""
-    what = "trials" if p.stage.kind == "recovery" else "clips"
-    won = "" if p.succeeded is None else f"  {p.succeeded} of {p.clips} {what}"
-    helped = f"  help at most {p.help_n:.0f} N" if p.help_n else "  no help"
-    reward = p.stats.terms.get("imitation", p.stats.reward)
-    speed = f"{p.stats.samples_per_s:,.0f} samples/s"
-    return f"{p.stage.name}{won}  {speed}  imitation {reward:.3f}{helped}"
-
-
-def times(p: Progress) -> str:
-    """How far it is: "1:20, 8:40 left"."""
-    return f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)}"
-
-
-def events(p: Progress) -> None:
-    """A line for each evaluation, where another stage begins, and for what went wrong."""
-    if p.trouble:
-        tell(
-            f"Gone on from the last checkpoint with other draws, since a simulation failed: {p.trouble}"
-        )
-    if p.results is not None:
-        won, total = int(p.results.succeeded.sum()), len(p.results.clip)
-        tell(
-            f"{clock(p.stats.seconds)}  {p.stage.name}: {won} of {total} clips succeed, "
-            f"{p.results.error_mm:.0f} mm"
-        )
-    if p.recovery is not None:
-        tell(f"{clock(p.stats.seconds)}  {p.stage.name}: {recovered(p.recovery)}")
-    if p.following is not None:
-        tell(f"{clock(p.stats.seconds)}  {p.following.name} begins")
-
-
-@contextlib.contextmanager
-def shown() -> Iterator[Callable[[Progress], None]]:
-    """A bar in a terminal, a line now and then elsewhere, and `events`."""
-    with showing("training") as show:
-
-        def one(p: Progress) -> None:
-            show(p.share, f"{times(p)}  {figures(p)}")
-            events(p)
-
-        yield one

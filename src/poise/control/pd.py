@@ -32,14 +32,18 @@ class PDTargets:
 
     def apply(self, action: Tensor, q_ref_next: Tensor, drive: Drive) -> None:
         """Add the targets for `action (N, n)` to `drive.ctrl`."""
+        drive.ctrl.add_(self.target(action, q_ref_next))
+
+    def target(self, action: Tensor, q_ref_next: Tensor) -> Tensor:
+        """The targets `(N, n)` rad of `action (N, n)`."""
         base = q_ref_next if self.mode == "additive" else self.offset
         scale = self.scale.to(action) if isinstance(self.scale, Tensor) else self.scale
         plain = not isinstance(scale, Tensor) and scale == 1.0
         target = action if plain else action * scale
-        drive.ctrl.add_(target if base is None else target + base.to(target.device))
+        return target if base is None else target + base.to(target.device)
 
     def action(self, target: Tensor, q_ref_next: Tensor) -> Tensor:
-        """The actions `(N, n)` that give the targets `target (N, n)` rad: the inverse of `apply`."""
+        """The actions `(N, n)` that give the targets `target (N, n)` rad: the inverse of `target`."""
         base = q_ref_next if self.mode == "additive" else self.offset
         return (target if base is None else target - base) / self.scale
 
