@@ -177,7 +177,7 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
 
 
 def _teacher(primitives: Primitives, library: Library) -> Tracker:
-    """The policy that teaches, onto whose body the clips are brought."""
+    """The policy that teaches; the clips are brought onto its body."""
     from poise.jobs.open import open_run
 
     if library.onto is not None:
