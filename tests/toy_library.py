@@ -81,6 +81,7 @@ class Scripted:
         clips: Tensor | None,
         scale: float | Tensor,
         *_: object,
+        starts: int = 1,
     ) -> ClipResults:
         length = imitation.reference.length
         clips = torch.arange(len(length)) if clips is None else clips

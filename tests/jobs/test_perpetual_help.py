@@ -75,9 +75,9 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[float | Tensor]:
     made = Scripted(lambda *_: False)
 
     def watch(imitation: Imitation, policy: PolicyBundle, clips: Tensor | None,
-              scale: float | Tensor, *more: object) -> ClipResults:  # fmt: skip
+              scale: float | Tensor, *more: object, starts: int = 1) -> ClipResults:  # fmt: skip
         asked.append(scale)
-        return made(imitation, policy, clips, scale, *more)
+        return made(imitation, policy, clips, scale, *more, starts=starts)
 
     for module in (stage_evaluation, result):
         monkeypatch.setattr(module, "evaluate_clips", watch)

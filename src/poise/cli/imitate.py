@@ -1,4 +1,7 @@
-"""`poise imitate`: a clip in, the same motion physically simulated out, with a score card."""
+"""`poise imitate`: a clip in, the same motion physically simulated out, with a score card.
+
+A policy that knows many motions learns the clip, see `cli.practice`; or one learns it from nothing.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
-from poise.cli.console import print_card
+from poise.cli.console import launched, print_card
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
 from poise.cli.output import may_deliver, places
 from poise.cli.progress import working
@@ -24,14 +27,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Give one clip a body: train, simulate every start frame, write the motion, score.json,
-    report.html and the run itself."""
+    """Give one clip a body: train a policy for it, simulate every start frame, write the motion,
+    score.json, report.html and the run itself.
+
+    A policy that knows many motions begins, on its own joints with the bones of the clip: a first result
+    comes in seconds by lookahead, and training ends where the motion is done from all over. Any setting
+    of the body or the recipe trains from nothing, with a residual force as help."""
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
+    going_on: Annotated[str | None, arg(name="from", metavar="POLICY|none", help_behavior_hint="")] = (
+        None
+    )
+    """The policy that begins, a file or a run; by default the one that comes with Poise. none trains
+    from nothing."""
     hold_feet: Flag = True
     """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     force: Flag = False
@@ -42,6 +54,10 @@ class Options:
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+#: Where no policy begins.
+NOTHING = "none"
 
 
 def blank() -> Options:
@@ -57,6 +73,22 @@ def config_of(o: Options) -> ResidualForce:
 
     clip = o.reading.read(o.clip) if t.by_clip else None
     return t.settings("residual-force", ResidualForce(), o.body, given(o.recipe_settings), clip)
+
+
+def from_nothing(o: Options, run: Path) -> bool:
+    """Whether no policy begins: as the run does that is there, or by what the command line states."""
+    from poise.jobs.run_file import RUN_FILE, read_run
+    from poise.recipes import RECIPE
+
+    recipe = {k for k in given(o.recipe_settings, o.body) if k != "seed"}
+    recipe |= {k for k in ("preset", "config") if getattr(o.training, k) is not None}
+    policy = o.going_on not in (None, NOTHING)
+    if recipe and policy:
+        what = f"--from goes on with the policy's own settings, and there is {', '.join(sorted(recipe))}"
+        raise PoiseError(what, hint="Leave it out, or train from nothing: --from none")
+    if o.training.resume and (run / RUN_FILE).exists():
+        return read_run(run).recipe == RECIPE["name"]
+    return bool(recipe) or o.going_on == NOTHING or launched()
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
@@ -76,6 +108,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     held = (out / "run" / RUN_FILE).exists()
     may_deliver(out, motion, o.force or held, o.clip)
     job = Job((o.clip,), out, out / "run", o.training, config, o.reading, again)
+    if not from_nothing(o, out / "run"):
+        from poise.cli.practice import practise
+
+        if (answer := practise(job, o.going_on, motion, o.hold_feet)) is not None:
+            return answer
     from poise.learn.parallel import joined
 
     with joined() as comm:

@@ -233,6 +233,7 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
     """The policy after it has learned the motion; None where Ctrl-C ended that."""
     from poise.cli.perpetual_report import times
     from poise.jobs.track.learning import learn
+    from poise.learn import Until
 
     o, when, rate = options, tracked.failures[0][1], tracker.config.sim.control_hz
     tell(f"The policy loses the motion at {when:.1f} s and learns it now, {o.learn:g} minutes at most.")
@@ -244,7 +245,8 @@ def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path)
                 came, whole = (float(x) / rate for x in (p.results.tracked, p.results.frames))
                 tell(f"{clock(p.stats.seconds)}  it gets to {came:.1f} of {whole:.1f} s")
 
-        learned = learn(tracker, tracked.placed, folder, o.learn, show, o.threads, o.seed)
+        until = Until(minutes=o.learn)
+        learned = learn(tracker, tracked.placed, folder, until, show, o.threads, o.seed)
     if learned.result.interrupted:
         tell("Stopped; what was learned is saved. The same command goes on.")
         return None

@@ -21,7 +21,7 @@ LOOK = 16
 
 @dataclass(frozen=True, eq=False)
 class ClipResults:
-    """What E clips came to, from frame 0; one row per clip.
+    """What E clips came to, from frame 0 or from several; one row per clip.
 
     clip: its index. succeeded: bool. frames: its frames. tracked: those before it failed, or all.
     mpjpe_mm, global_mm: means over the frames up to the one that failed, with the root's error and
@@ -39,6 +39,11 @@ class ClipResults:
     def rate(self) -> float:
         """Share of the clips that succeeded."""
         return float(self.succeeded.double().mean())
+
+    @property
+    def tracked_share(self) -> float:
+        """Share of the frames of all clips before they failed."""
+        return float(self.tracked.sum() / self.frames.sum())
 
     @property
     def error_mm(self) -> float:

@@ -1,6 +1,7 @@
 """One motion, or several, imitated by a policy that is trained on them: what `poise imitate` does.
 
-made = imitate("walk.bvh", minutes=3)
+made = imitate("walk.bvh", minutes=3)           # a policy that knows many motions learns this one
+made = imitate("walk.bvh", ResidualForce())     # from nothing, with residual force as help
 made.card, made.clip, made.save("out")
 """
 
@@ -15,11 +16,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from poise.errors import PoiseError
 from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, deliver, finished
+from poise.jobs.open import Run, open_run
+from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
+from poise.jobs.track import Tracked, write
+from poise.jobs.track.learning import from_every_start, learn
+from poise.jobs.track.placement import place
+from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, PolicyBundle, Until
 from poise.motion import Clip, ClipLibrary
@@ -29,6 +37,8 @@ from poise.settings import changed
 
 #: The run folder in a result folder.
 RUN = "run"
+#: Start frames from which a motion is to be done before its training ends.
+STARTS = 32
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,6 +51,7 @@ class Imitated(Result):
         evaluation: every start frame simulated.
         run: the run folder.
         interrupted: whether Ctrl-C ended the training early; it was evaluated all the same.
+        tracked: the same as a policy's tracking of the motion, where one began; else None.
     """
 
     task: Imitation
@@ -48,6 +59,7 @@ class Imitated(Result):
     evaluation: Evaluation
     run: Path
     interrupted: bool = False
+    tracked: Tracked | None = None
 
     @cached_property
     def _finished(self) -> Delivery:
@@ -56,6 +68,8 @@ class Imitated(Result):
     @property
     def clips(self) -> tuple[Clip, ...]:
         """The simulated motion of every clip, standing feet held."""
+        if self.tracked is not None:
+            return (self.tracked.clip,)
         return tuple(self._finished.clips.values())
 
     @property
@@ -72,13 +86,20 @@ class Imitated(Result):
     def notes(self) -> tuple[str, ...]:
         """What was repaired in the motion, and what holding the feet did."""
         own = [n for clip in self.task.library for n in clip.skeleton.source.notes]
+        if self.tracked is not None:
+            own += self.tracked.notes
         return (*own, *self.task.report.sentences(), *self._finished.notes)
 
     def _shown(self) -> Shown:
-        return Shown(self.clip, self.task.library.clips[0], self.card, self.notes)
+        source = self.tracked.placed.source if self.tracked else self.task.library.clips[0]
+        return Shown(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
-        paths = deliver(self.task, self.evaluation, folder, learning_curve(self.run)).paths
+        curve = learning_curve(self.run)
+        if self.tracked is not None:
+            paths = write(self.tracked, folder, curve=curve).paths
+        else:
+            paths = deliver(self.task, self.evaluation, folder, curve).paths
         kept = folder / RUN
         if kept.resolve() != self.run.resolve():
             shutil.copytree(self.run, kept, dirs_exist_ok=True)
@@ -90,6 +111,7 @@ def imitate(
     minutes: float = 3.0,
     config: ResidualForce | None = None,
     *,
+    policy: Tracker | Run | str | Path | None = None,
     folder: str | Path | None = None,
     iterations: int | None = None,
     threads: int = 0,
@@ -100,37 +122,89 @@ def imitate(
 ) -> Imitated:
     """Trains a policy on a motion, simulates it from every start frame, and scores it.
 
+    By default a policy that knows many motions learns this one, on its own joints with the bones of the
+    clip, without any help, until it succeeds from `STARTS` start frames or the time is over. Several
+    clips, or any setting of the recipe but the seed, are learned from nothing by the recipe
+    `ResidualForce`, on a body with every joint of the clip.
+
     Args:
         clip: a clip or a file; or several on one skeleton, which one policy learns.
         minutes: of training; with `iterations` whichever ends first.
         config: the recipe's settings; `settings` are those that differ, such as help_limit=50.0 or
             num_envs=64.
+        policy: which begins, see `track`; by default the one that comes with Poise.
         folder: keeps the run (the same again goes on with it); by default it is gone with the result,
             unless that is saved.
         threads: of the physics; 0 takes all cores.
         device: "cpu" or "cuda".
         on_iteration: is called after each iteration; returning False ends the training.
-        callbacks: are told what happens before PPO begins.
+        callbacks: are told what happens before PPO begins, where nothing is there to begin with.
 
     Raises:
         PoiseError: a motion that cannot be read or has no human body, an unknown setting, a folder that
-            holds another run.
+            holds another run, or a policy beside settings of the recipe.
     """
-    config = changed(config or ResidualForce(), settings)
     several = [clip] if isinstance(clip, Clip | str | Path) else list(clip)
+    stated = config is not None or set(settings) - {"seed"} or callbacks is not None
+    if policy is not None and (stated or len(several) > 1):
+        what = "several clips are" if len(several) > 1 else "settings of the recipe are for what is"
+        raise PoiseError(f"{what} learned from nothing, and a policy was given", hint="Leave one out")
+    config = changed(config or ResidualForce(), settings)
     library = ClipLibrary.of([clip_of(c) for c in several])
+    until = Until(minutes=minutes, iterations=iterations)
     run = Path(tempfile.mkdtemp(prefix="poise-")) if folder is None else Path(folder) / RUN
     try:
+        tracker = None if stated or len(several) > 1 else _tracker(policy, library.clips[0])
+        if tracker is not None:
+            how = (run, until, config.seed, threads, device, on_iteration)
+            return _kept(_practised(library.clips[0], tracker, *how), folder)
         task = begin(run, library, config, device)
-        until, log = Until(minutes=minutes, iterations=iterations), False
-        done = train(task, run, until, on_iteration, threads, log, beginning=callbacks, device=device)
-        policy, meta = trained_policy(run, task)
-        made = Imitated(task, policy, evaluate(task, policy, meta, device=device), run, done.interrupted)
+        done = train(task, run, until, on_iteration, threads, False, beginning=callbacks, device=device)
+        learned, meta = trained_policy(run, task)
+        scored = evaluate(task, learned, meta, device=device)
+        return _kept(Imitated(task, learned, scored, run, done.interrupted), folder)
     except BaseException:
         if folder is None:
             shutil.rmtree(run, ignore_errors=True)
         raise
+
+
+def _tracker(policy: Tracker | Run | str | Path | None, clip: Clip) -> Tracker | None:
+    """The policy with the bones of the clip; None where that which comes with Poise does not fit."""
+    run = open_run(policy) if policy is None or isinstance(policy, str | Path) else policy
+    tracker = run.tracker if isinstance(run, Run) else run
+    try:
+        return tracker.with_bones_of(clip)
+    except PoiseError:
+        if policy is None:
+            return None
+        raise
+
+
+def _practised(
+    clip: Clip,
+    tracker: Tracker,
+    run: Path,
+    until: Until,
+    seed: int,
+    threads: int,
+    device: str,
+    on_iteration: Callable[[IterationStats], bool | None] | None,
+) -> Imitated:
+    """What came of a policy that learned a motion on its own joints with the bones of the clip."""
+
+    def tell(p: Progress) -> bool | None:
+        return None if on_iteration is None else on_iteration(p.stats)
+
+    placed = place(clip, tracker)
+    learned, result = learn(tracker, placed, run, until, tell, threads, seed, STARTS, device)
+    done = from_every_start(learned, clip, device)
+    task, evaluation = done.imitation, done.evaluation
+    return Imitated(task, learned.policy, evaluation, run, result.interrupted, done)
+
+
+def _kept(made: Imitated, folder: str | Path | None) -> Imitated:
+    """The same; a run without a folder is deleted with its result."""
     if folder is None:
-        # A run without a folder is deleted with its result.
-        weakref.finalize(made, shutil.rmtree, run, True)
+        weakref.finalize(made, shutil.rmtree, made.run, True)
     return made

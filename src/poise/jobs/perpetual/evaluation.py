@@ -45,47 +45,57 @@ def evaluate_clips(
     device: str = "cpu",
     worlds: int = WORLDS,
     on_batch: Callable[[int, int], None] | None = None,
+    starts: int = 1,
 ) -> ClipResults:
     """Simulates `clips (E,)`, all by default, from their first frames with the deterministic policy.
 
     Args:
+        starts: from so many frames of each, evenly spread; a clip succeeds where it does from all of
+            them, and its frames are those of all.
         help_scale: what is left of the residual force's limits, or of those of each clip or motion bin
             of the library, as the task's `help_by` says.
         on_batch: told how many of how many clips are done.
     """
     reference = imitation.reference
-    clips = torch.arange(len(reference.length)) if clips is None else clips
+    length, second = reference.length.cpu(), round(reference.rate_hz)
+    clips = torch.arange(len(length)) if clips is None else clips.cpu()
     if isinstance(policy, PolicyBundle):
         policy = policy.copy().to(device)
-    # Clips of like length share a batch, so that few worlds wait for others.
-    order = reference.length[clips].argsort(stable=True)
+    # Of what begins in the last second little is seen.
+    spread = (length[clips] - second).clamp(min=1)[:, None] * torch.arange(starts) // starts
+    clip, frame = clips.repeat_interleave(starts), spread.flatten()
+    # Episodes of like length share a batch, so that few worlds wait for others.
+    order = (length[clip] - frame).argsort(stable=True)
     parts: list[tuple[Tensor, ...]] = []
     for rows in order.split(worlds):
-        parts.append(_batch(imitation, policy, clips[rows], help_scale, threads, device))
+        parts.append(_batch(imitation, policy, clip[rows], frame[rows], help_scale, threads, device))
         if on_batch is not None:
-            on_batch(sum(len(p[0]) for p in parts), len(clips))
+            on_batch(sum(len(p[0]) for p in parts) // starts, len(clips))
     back = order.argsort()
-    succeeded, tracked, local, far = (torch.cat(x)[back] for x in zip(*parts, strict=True))
-    return ClipResults(clips, succeeded, reference.length[clips].cpu(), tracked, local, far)
+    won, tracked, local, far = (torch.cat(x)[back].view(-1, starts) for x in zip(*parts, strict=True))
+    seen = (tracked + (~won).long()).double()
+    local, far = ((x * (seen / seen.sum(1, keepdim=True))).sum(1) for x in (local, far))
+    frames = (length[clips][:, None] - spread).sum(1)
+    return ClipResults(clips, won.all(1), frames, tracked.sum(1), local, far)
 
 
 def _batch(
     imitation: Imitation,
     policy: Acts,
     clip: Tensor,
+    frame: Tensor,
     scale: float | Tensor,
     threads: int,
     device: str,
 ) -> tuple[Tensor, ...]:
-    """Success, frames tracked, mean errors `(E,)` of clips that are simulated together."""
+    """Success, frames tracked, mean errors `(E,)` of episodes that are simulated together."""
     task = imitation.bare(groups=isinstance(scale, Tensor))
     env = task.env(len(clip), None, False, threads, None, scale, device, guard=False)
-    last = imitation.reference.length[clip].to(env.device) - 1
+    clip, frame = clip.to(env.device), frame.to(env.device)
+    last = imitation.reference.length.to(env.device)[clip] - 1 - frame
     judge = ClipJudge(last)
     try:
-        clip = clip.to(env.device)
-        obs = env.reset_to(clip, torch.zeros_like(clip))
-        simulate(env, policy, obs, int(last.max()), judge)
+        simulate(env, policy, env.reset_to(clip, frame), int(last.max()), judge)
     finally:
         env.close()
     return judge.results()

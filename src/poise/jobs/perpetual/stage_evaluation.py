@@ -111,7 +111,8 @@ class Judge:
         self, stage: Stage, policy: PolicyBundle, scale: float | Tensor, iteration: int
     ) -> tuple[ClipResults, RecoveryCard | None]:
         own, clips = staged(self.imitation, stage), self.stage_record.clips
-        results, card, recovered = evaluate_clips(own, policy, clips, scale, *self.where), None, 0.0
+        starts, card, recovered = self.config.starts, None, 0.0
+        results = evaluate_clips(own, policy, clips, scale, *self.where, starts=starts)
         if stage.mixed:
             card = self.trials(stage, policy, self.config.recovering.trials)
             won, tried = back(card)

@@ -88,11 +88,12 @@ class StageRecord:
         each clip of the library its own `(C,)`.
 
         The best policy is the one with the least `mean_help`, of those the one with the most clips, of
-        those the one with the smallest error. What was done without help counts before all that was
-        not, and since a stage ends with an evaluation without, its best policy is of those. Which clips
-        have help makes no difference; as the scales of clips go up and down each on its own, means are
-        compared in steps of `LESS_HELP`. A clip that fails with the help that it has left counts as
-        failed for mining and, unless a stage's end shows something else, for the next primitive.
+        those the one with the most frames before a failure, of those the one with the smallest error.
+        What was done without help counts before all that was not, and since a stage ends with an
+        evaluation without, its best policy is of those. Which clips have help makes no difference; as
+        the scales of clips go up and down each on its own, means are compared in steps of `LESS_HELP`.
+        A clip that fails with the help that it has left counts as failed for mining and, unless a
+        stage's end shows something else, for the next primitive.
 
         recovered: the share of its trials that were back, where the stage learns recovery, too.
         """
@@ -100,10 +101,11 @@ class StageRecord:
         won = results.spread(results.succeeded, len(member))
         self.mining.record(won, member)
         self.seen = (int(won.sum()), len(results.clip))
-        # Less help counts before more clips, more clips before a smaller error.
+        # Less help counts before more clips, more clips before more frames and a smaller error.
         own = isinstance(scale, Tensor)
         left = _in_steps(mean_help(scale, results.clip)) if own else scale
-        key = (-left, results.rate + RECOVERY_WORTH * recovered, -results.error_mm)
+        won_share = results.rate + RECOVERY_WORTH * recovered
+        key = (-left, won_share, results.tracked_share, -results.error_mm)
         if not self.best or key > self.best_key:
             self.best, self.best_key, self.best_failed = policy.state(), key, member & ~won
 

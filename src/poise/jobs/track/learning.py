@@ -2,7 +2,7 @@
 
     tracked = track(clip, tracker)
     if tracked.failures:
-        tracker = learn(tracker, tracked.placed, Path("out/learned"), minutes=10)
+        tracker = learn(tracker, tracked.placed, Path("out/learned"), minutes=10).tracker
 
 What a policy knows of a thousand motions makes the next one cheap: it begins by following most of it.
 """
@@ -15,20 +15,30 @@ from pathlib import Path
 from typing import NamedTuple
 
 from poise.env import Reference
+from poise.eval.rolloutset import judge
 from poise.jobs.perpetual.result import PerpetualResult
 from poise.jobs.perpetual.run import begin, going_on, train
 from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.run_file import read_run
+from poise.jobs.runs import evaluate
+from poise.jobs.track.controllers import RULE
+from poise.jobs.track.missing import needs_of
 from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.tracked import Tracked
+from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker, policy_of_run
+from poise.jobs.warm_start import widened
 from poise.kin.doctor.clean import clean_clip
-from poise.learn import Until
-from poise.motion import ClipLibrary
+from poise.learn import LATEST, Until
+from poise.metrics import success_rule
+from poise.motion import Clip, ClipLibrary
 from poise.recipes.perpetual import Perpetual
 
 #: Worlds, samples of a gradient step, and iterations from one evaluation to the next: a motion of
 #: seconds has fewer hard motion bins than a library.
 WORLDS, MINIBATCH, EVERY = 512, 2048, 5
+#: Step size, which stays: one that follows the KL divergence shrinks where much is to be learned.
+STEP = 1e-4
 #: Evaluations without success after which training would end by itself.
 NEVER = 1_000_000
 
@@ -40,43 +50,65 @@ class Learned(NamedTuple):
     result: PerpetualResult
 
 
-def settings(policy: Perpetual, seed: int = 0) -> Perpetual:
+def settings(policy: Perpetual, seed: int = 0, starts: int = 1) -> Perpetual:
     """The policy's own settings, for one motion."""
     config = going_on(policy, Perpetual(num_envs=WORLDS, seed=seed, recovery=False))
-    ppo = replace(config.ppo, minibatch=MINIBATCH)
+    ppo = replace(config.ppo, minibatch=MINIBATCH, policy_lr=STEP, kl_target=None)
     # One motion is lost or not: that is no curve by which to tell that nothing is gained any more.
     convergence = replace(config.convergence, patience=NEVER)
-    return replace(config, evaluate_every=EVERY, cooling=0.0, ppo=ppo, convergence=convergence)
+    config = replace(config, ppo=ppo, convergence=convergence, teacher=None, cooling=0.0)
+    return replace(config, evaluate_every=EVERY, starts=starts)
 
 
 def learn(
     tracker: Tracker,
     placed: Placed,
     folder: Path,
-    minutes: float,
+    until: Until,
     on_iteration: Callable[[Progress], bool | None] | None = None,
     threads: int = 0,
     seed: int = 0,
+    starts: int = 1,
+    device: str = "cpu",
 ) -> Learned:
-    """Trains until the motion is tracked from its first frame to its last, or the time is over.
+    """Trains until the motion is tracked from its first frame to its last, or a limit is reached.
 
     Args:
         folder: of the run, `perpetual.run`; one that holds a run of this motion is gone on with.
-        on_iteration, threads: see `perpetual.run.train`.
+        on_iteration, threads, device: see `perpetual.run.train`.
+        starts: the motion is to be tracked from so many frames, evenly spread, see `Perpetual.starts`.
 
     Raises:
         PoiseError: a policy of primitives, which cannot go on, or a folder with another run.
     """
     clip = placed.level.onto(clean_clip(placed.clip)[0]).replaced(cyclic=False)
-    config = settings(tracker.config, seed)
-    imitation = begin(folder, ClipLibrary.of(clip), config, clip.name, earlier=tracker)
+    config = settings(tracker.config, seed, starts)
+    imitation = begin(folder, ClipLibrary.of(clip), config, clip.name, device, tracker)
     # Exactly what `track` will ask of the policy, on the same body.
     body, rate = imitation.humanoid, config.sim.control_hz
     qpos = place(placed.source, replace(tracker, humanoid=body)).qpos
     imitation = replace(imitation, reference=Reference(body, [qpos], rate, imitation.library.names))
-    result = train(
-        imitation, folder, Until(minutes=minutes), on_iteration, threads, False, trained=tracker.policy
-    )
-    # It tracks its recovery motions as before, or nearly.
-    learned = replace(policy_of_run(read_run(folder)), recovery_clips=tracker.recovery_clips)
+    # The critic goes on as well: it knows what a state is worth.
+    trained = None if (folder / LATEST).exists() else widened(tracker, imitation, 0)
+    result = train(imitation, folder, until, on_iteration, threads, False, device, trained=trained)
+    # It tracks its recovery motions as before, or nearly; where bones are a clip's own there are none.
+    learned = policy_of_run(read_run(folder))
+    learned = replace(learned, recovery_clips=tracker.recovery_clips, onto=tracker.onto)
     return Learned(learned, result)
+
+
+def from_every_start(tracker: Tracker, source: Clip, device: str = "cpu") -> Tracked:
+    """A motion as the policy alone does it from every start frame: `Tracked.card` is that of all.
+
+    The failures are those of the episode from the first frame, which is the motion that is delivered.
+
+    Raises:
+        PoiseError: see `place`.
+    """
+    placed = place(source, tracker)
+    task = imitation_of(tracker, [placed])
+    done = evaluate(task, tracker.policy, {**tracker.about, "help_limit": 0.0}, device=device)
+    done = replace(done, card=replace(done.card, needs=tuple(n.to_dict() for n in needs_of(task))))
+    failed = judge(done.rollouts, success_rule(RULE)).failed_at[done.recordings[0].row].item()
+    lost = ((0, failed / task.reference.rate_hz),) if failed >= 0 else ()
+    return Tracked(tracker, task, done, placed, lost, None, placed.notes)

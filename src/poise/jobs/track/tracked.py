@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from poise.errors import PoiseError
 from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, deliver, finished, simulated_clip
@@ -104,7 +106,13 @@ class Tracked(Result):
         return simulated_clip(self.imitation, self.evaluation, character)
 
 
-def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
+def write(
+    tracked: Tracked,
+    out: Path,
+    motion: Path | None = None,
+    hold: bool = True,
+    curve: dict[str, np.ndarray] | None = None,
+) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`, see `deliver`.
 
     The motion is on the skeleton that came in; where that is not the body's, the motion on the body's
@@ -112,6 +120,7 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
 
     Args:
         motion: the file of the motion, in place of one in `out`. hold: see `deliver`.
+        curve: of a training, which the report draws.
     """
     t, placed, count = tracked, tracked.placed, len(tracked.evaluation.recordings)
     if count > 1 and motion is not None:
@@ -124,7 +133,7 @@ def write(tracked: Tracked, out: Path, motion: Path | None = None, hold: bool = 
     )
     said = tuple(p.sentence() for p in t.parts) or said
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
-    done = deliver(t.imitation, t.evaluation, out, {}, inner, hold, placed.source, said)
+    done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said)
     if not other:
         return done
     paths: dict[str, Path] = {}

@@ -134,6 +134,8 @@ class Perpetual:
             of what `recovering.share` leaves.
         evaluate_every: iterations between evaluations of the stage's clips; 0 has them take a tenth of
             the control steps.
+        starts: frames of each clip from which evaluations begin, evenly spread; a clip succeeds where it
+            does from all of them.
         cooling: share of a stage's longest time, at its end, in which the policy's step size falls
             evenly to a tenth; for steps of a fixed size, `ppo.kl_target=None`.
         mining, convergence: what fails is trained more; when a stage has learned what it can.
@@ -182,6 +184,7 @@ class Perpetual:
     residual_std: float = 0.3
     shares: tuple[float, float] = (0.5, 0.8)
     evaluate_every: int = 0
+    starts: int = 1
     cooling: float = 0.0
     num_envs: int = 512
     horizon: int = 300
@@ -205,6 +208,8 @@ class Perpetual:
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.starts < 1:
+            raise PoiseError(f"starts must be at least 1, got {self.starts}", "Perpetual")
         if self.max_primitives < 1:
             raise PoiseError(f"there must be at least 1 primitive, got {self.max_primitives}")
         first, last = self.shares

@@ -1,0 +1,79 @@
+"""`poise imitate` from a policy: what comes first, what is learned, going on, what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+import poise
+from poise.cli.main import main
+from poise.jobs.open import open_run
+from poise.motion import read_clip, trim, write_clip
+from toy_policy import WALK, toy_run
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second and a half of the embedded walk as a file."""
+    path = tmp_path_factory.mktemp("short") / "short.bvh"
+    write_clip(trim(read_clip(WALK), 0, 45), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on two cuts of the embedded walk."""
+    return toy_run(tmp_path_factory.mktemp("run"))
+
+
+def iterations(run: Path) -> list[int]:
+    with (run / "log.csv").open(newline="") as file:
+        return [int(row["iteration"]) for row in csv.DictReader(file)]
+
+
+def test_a_policy_learns_the_clip_and_goes_on(
+    run: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    argv = ["imitate", str(short), "-o", str(out), "--from", str(run), "--threads", "1"]
+    assert main([*argv, "--iterations", "5"]) == 0
+    said = capsys.readouterr()
+    assert "First result: " in said.err and "the policy tracks" in said.err
+    assert iterations(out / "run") == [1, 2, 3, 4, 5]
+    assert {p.name for p in out.iterdir()} >= {"simulated.bvh", "score.json", "report.html", "run"}
+    made, source = read_clip(out / "simulated.bvh"), read_clip(short)
+    assert made.skeleton.names == source.skeleton.names and made.frames == source.frames
+    opened = open_run(out)
+    assert opened.recipe == "perpetual" and opened.config.starts == 32
+    # The bones are the clip's, the joints the policy's.
+    tracker = open_run(run).tracker
+    assert opened.tracker.humanoid.hinges == tracker.humanoid.hinges
+    assert main([*argv, "--iterations", "5"]) == 2
+    assert "already holds a run" in capsys.readouterr().err
+    assert main([*argv, "--iterations", "6", "--resume"]) == 0
+    assert "First result" not in capsys.readouterr().err and iterations(out / "run")[-1] == 6
+    score = json.loads((out / "score.json").read_text())
+    assert score["episodes"] == 15 and score["help"]["force_mean_n"] == 0
+
+
+def test_python_does_the_same(run: Path, short: Path, tmp_path: Path) -> None:
+    made = poise.imitate(short, policy=run, iterations=1, threads=1)
+    assert made.tracked is not None and made.card.method == "perpetual-single"
+    assert made.clip.skeleton.names == read_clip(short).skeleton.names
+    paths = made.save(tmp_path / "made")
+    assert paths["report"].exists() and (paths["run"] / "run.safetensors").exists()
+    with pytest.raises(poise.PoiseError, match="learned from nothing, and a policy was given"):
+        poise.imitate(short, policy=run, help_limit=50.0)
+
+
+def test_a_policy_beside_settings_of_the_recipe(
+    run: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["imitate", str(short), "-o", str(tmp_path / "out"), "--from", str(run)]
+    assert main([*argv, "--help-limit", "50"]) == 2
+    said = capsys.readouterr().err
+    assert "and there is help_limit" in said and "--from none" in said
+    assert not (tmp_path / "out").exists()
