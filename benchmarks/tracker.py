@@ -1,11 +1,13 @@
 """Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
 
     python benchmarks/tracker.py --library FOLDER --onto FOLDER/cmu_amc/02/02_01.amc -o RUN --minutes 60
+    python benchmarks/tracker.py --library FOLDER --from RUN --step 4e-5 -o FINER --minutes 60
 
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
-that need none. Ctrl-C and --resume as in `poise train perpetual`; the policy is written with
-`poise.jobs.tracker.save_tracker` and measured by `perpetual.py`.
+that need none, or goes on from a policy, which then observes more and pays for what slides. Ctrl-C and
+--resume as in `poise train perpetual`; the policy is written with `poise.jobs.tracker.save_tracker` and
+measured by `perpetual.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ from poise.body import BodyConfig
 from poise.cli.perpetual_report import shown
 from poise.cli.training import beginning
 from poise.jobs.library.clips import LibraryConfig
-from poise.jobs.perpetual.run import begin, clips_of, resume, train
+from poise.jobs.open import open_run
+from poise.jobs.perpetual.run import begin, clips_of, going_on, resume, train
+from poise.jobs.tracker import Tracker
+from poise.jobs.warm_start import widened
 from poise.learn import ConvergenceConfig, Until
 from poise.plan import TrajOptConfig
 from poise.recipes.perpetual import Perpetual
@@ -54,27 +59,61 @@ def config(seed: int) -> Perpetual:
     )
 
 
+def finer(tracker: Tracker, step: float, std: float, seed: int) -> Perpetual:
+    """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
+    actions, a nearer root, prices of changing actions and of feet that slide, large batches.
+
+    Args:
+        step: of the policy, fixed; it became smaller from run to run.
+        std: deviation of the noise on its actions, rad.
+    """
+    kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
+    recovering = replace(kept.recovering, demonstration_share=0.15, demonstrations=512)
+    return replace(
+        kept,
+        heading="hips",
+        filter=0.5,
+        window=(2, 4, 8),
+        root=0.2,
+        action_rate=3.0,
+        foot_slide=0.2,
+        recovering=recovering,
+        evaluate_every=12,
+        cooling=0.0,
+        ppo=replace(kept.ppo, policy_lr=step, std=std),
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--library", type=Path, required=True)
-    parser.add_argument("--onto", type=Path, required=True)
+    parser.add_argument("--onto", type=Path, help="a clip on the skeleton of the body that is made")
+    parser.add_argument("--from", type=Path, dest="earlier", help="the policy that goes on")
+    parser.add_argument("--step", type=float, default=1e-4)
+    parser.add_argument("--std", type=float, default=0.05)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resume", action="store_true")
     a = parser.parse_args()
-    settings, source = config(a.seed), str(a.library)
+    if (a.onto is None) == (a.earlier is None):
+        parser.error("give one of --onto and --from")
+    earlier = open_run(a.earlier).tracker if a.earlier else None
+    settings = finer(earlier, a.step, a.std, a.seed) if earlier else config(a.seed)
+    source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source)
     else:
         how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
-        held = (HELD_OUT, TWINS, print, a.onto, how)
+        held = (HELD_OUT, TWINS, print, earlier.target if earlier else a.onto, how)
         library, notes = clips_of(a.library, BodyConfig(), *held)
         print(*notes, sep="\n")
-        imitation = begin(a.out, library, settings, source)
+        imitation = begin(a.out, library, settings, source, earlier=earlier)
+        trained = widened(earlier, imitation) if earlier else None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
-        train(imitation, a.out, Until(minutes=a.minutes), show, a.threads, beginning=beginning())
+        until, first = Until(minutes=a.minutes), beginning()
+        train(imitation, a.out, until, show, a.threads, beginning=first, trained=trained)
 
 
 if __name__ == "__main__":
