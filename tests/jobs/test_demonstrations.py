@@ -207,7 +207,7 @@ def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path
     assert abs(a - b).max() < 1e-9
     assert "lost the motion" in done.losses.sentence()
     # A policy that learned the motion still knows its recovery clips.
-    learned = learn(able, plain.placed, tmp_path / "learned", 0.01, threads=1)
+    learned = learn(able, plain.placed, tmp_path / "learned", Until(minutes=0.01), threads=1)
     assert learned.tracker.recovery_clips is able.recovery_clips
     with pytest.raises(PoiseError, match="a single character"):
         TrackConfig(recover=True, count=2)
