@@ -16,7 +16,7 @@ from speed import bench_latency, machine
 from poise.errors import PoiseError
 from poise.jobs.library.files import motion_files_of
 from poise.jobs.track import TrackConfig, side_by_side, track
-from poise.jobs.track.crowd import Crowd
+from poise.jobs.track.crowd import crowd as in_one_world
 from poise.jobs.track.noise import robustness
 from poise.jobs.track.points import points_of
 from poise.motion import ClipLibrary
@@ -78,7 +78,7 @@ def crowd(run: Run, steps: int, count: int, threads: int) -> dict[str, Any]:
     if count > 1:
         task = side_by_side(task, count)
     before = torch.get_num_threads()
-    backend = Crowd(task.humanoid, task.config.sim, count)
+    backend = in_one_world(task.humanoid, task.config.sim, count)
     env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=backend)
     torch.set_num_threads(threads)
     clip, zero = torch.arange(count), torch.zeros(count, dtype=torch.long)

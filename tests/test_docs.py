@@ -94,7 +94,7 @@ def test_python_snippets_run(
     if 'Path("net")' in code:
         shutil.copytree(request.getfixturevalue("net"), tmp_path / "net")
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, f"{page.name}[{index}]", "exec"), {"__name__": "snippet"})
+    exec(compile(code, f"{page.name}[{index}]", "exec", dont_inherit=True), {"__name__": "snippet"})
     if '.save("out")' in code:
         assert {"score.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
 

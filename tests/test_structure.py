@@ -41,7 +41,9 @@ EXPLAINED = {
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
         "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
-        "sim/guard.py:replay_dump",
+        "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
+        "sim/props/carrier.py:Carrier", "sim/props/door.py:Door", "sim/props/lift.py:Lift",
+        "sim/props/sphere.py:Ball",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

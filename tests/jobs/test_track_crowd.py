@@ -11,7 +11,7 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, side_by_side, track, write
-from poise.jobs.track.crowd import APART_M, Crowd, crowd_model, places
+from poise.jobs.track.crowd import APART_M, crowd, places
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
@@ -36,13 +36,15 @@ def test_places() -> None:
 
 def test_a_model_of_copies(tracker: Tracker) -> None:
     single, sim = tracker.humanoid.model, tracker.config.sim
-    model = crowd_model(tracker.humanoid, sim, 3)
+    rows = crowd(tracker.humanoid, sim, 3)
+    model = rows.get_model(0)
     assert model.nq == 3 * single.nq and model.nexclude == 3 * single.nexclude
     assert model.opt.timestep == sim.timestep and model.opt.integrator == single.opt.integrator
     assert model.body_mass.sum() == pytest.approx(3 * single.body_mass.sum())
     for name in ("jnt_range", "dof_damping", "dof_armature", "actuator_gainprm"):
         np.testing.assert_array_equal(getattr(model, name), np.concatenate([getattr(single, name)] * 3))
-    assert model.body(single.nbody).name == f"2@{tracker.humanoid.bodies[0]}"
+    assert model.body(single.nbody).name == f"2/{tracker.humanoid.bodies[0]}"
+    rows.close()
 
 
 def test_its_state_looks_like_that_of_worlds(tracker: Tracker) -> None:
@@ -51,30 +53,30 @@ def test_its_state_looks_like_that_of_worlds(tracker: Tracker) -> None:
     imitation = side_by_side(imitation_of(tracker, [placed]), 3)
     n = torch.arange(3)
     qpos, qvel = imitation.reference.coordinates(n, 4 * n)
-    crowd = Crowd(tracker.humanoid, tracker.config.sim, 3)
+    rows = crowd(tracker.humanoid, tracker.config.sim, 3)
     alone = CpuBackend(tracker.humanoid.model, 3, threads=1)
     try:
-        for backend in (crowd, alone):
+        for backend in (rows, alone):
             backend.state.bind(("qfrc_damper",))
             backend.write(None, qpos, qvel)
             backend.drive.clear()
             backend.drive.ctrl.add_(qpos[:, 7:] + 0.1)
             backend.step(4)
         for name in ("qpos", "qvel", "qfrc_damper"):
-            assert torch.allclose(crowd.state[name], alone.state[name], atol=1e-7), name
+            assert torch.allclose(rows.state[name], alone.state[name], atol=1e-7), name
         for name in ("xpos", "xquat", "xipos", "subtree_com", "cvel"):
-            a, b = crowd.state[name][:, 1:], alone.state[name][:, 1:]
+            a, b = rows.state[name][:, 1:], alone.state[name][:, 1:]
             assert torch.allclose(a, b, atol=1e-7), name
-        before = crowd.snapshot()
-        crowd.write(torch.tensor([1]), qpos[1:2], qvel[1:2])
-        assert torch.equal(crowd.state.qpos[1], qpos[1])
-        assert torch.equal(crowd.state.qpos[[0, 2]], before[[0, 2], : qpos.shape[1]])
-        crowd.restore(before)
-        assert torch.equal(crowd.snapshot(), before)
+        before = rows.snapshot()
+        rows.write(torch.tensor([1]), qpos[1:2], qvel[1:2])
+        assert torch.equal(rows.state.qpos[1], qpos[1])
+        assert torch.equal(rows.state.qpos[[0, 2]], before[[0, 2], : qpos.shape[1]])
+        rows.restore(before)
+        assert torch.equal(rows.snapshot(), before)
         with pytest.raises(PoiseError, match="not known per character"):
-            crowd.state.bind(("contact",))
+            rows.state.bind(("geom_xpos",))
     finally:
-        crowd.close()
+        rows.close()
         alone.close()
 
 
@@ -97,12 +99,12 @@ def test_each_looks_ahead_in_copies_of_itself_alone(tracker: Tracker) -> None:
     done = track(walk(0, 20), tracker, config)
     assert done.controller == "lookahead" and len(done.evaluation.recordings) == 2
     task = done.imitation
-    crowd = Crowd(task.humanoid, task.config.sim, 2)
-    env = task.env(1, None, False, 1, help_scale=0.0, guard=False, backend=crowd)
+    rows = crowd(task.humanoid, task.config.sim, 2)
+    env = task.env(1, None, False, 1, help_scale=0.0, guard=False, backend=rows)
     copies = task.bare(rewards=True).env(3, auto_reset=False, threads=1, help_scale=0.0, guard=False)
     env.reset_to(torch.arange(2), torch.tensor([0, 5]))
     obs = copies.restore(env.snapshot(torch.tensor([1])))
-    state = crowd.state.qpos[1], crowd.state.qvel[1]
+    state = rows.state.qpos[1], rows.state.qvel[1]
     for k in range(3):
         assert torch.equal(copies.backend.state.qpos[k], state[0])
         assert torch.equal(copies.backend.state.qvel[k], state[1])

@@ -96,8 +96,7 @@ class Humanoid:
 
 
 def make_spec(table: BodyTable) -> mujoco.MjSpec:
-    """The `MjSpec` of a humanoid on a floor; damping sits in the joints, the torque limit on the
-    actuator's proportional part alone (so that saturation never removes damping)."""
+    """The `MjSpec` of a humanoid on a floor; see `add_humanoid`."""
     spec = mujoco.MjSpec()
     spec.modelname = "poise"
     spec.compiler.degree = False
@@ -106,18 +105,25 @@ def make_spec(table: BodyTable) -> mujoco.MjSpec:
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], condim=3
     )
     floor.friction = [table.friction, 0.1, 0.1]
+    add_humanoid(spec, table)
+    return spec
+
+
+def add_humanoid(spec: mujoco.MjSpec, table: BodyTable, prefix: str = "") -> None:
+    """Adds a body to a description, with names that begin with `prefix`; damping sits in the joints, the
+    torque limit on the actuator's proportional part alone (so that saturation never removes damping)."""
     made: list[mujoco.MjsBody] = []
     for row in table.rows:
         parent = spec.worldbody if row.parent < 0 else made[row.parent]
-        body = parent.add_body(name=row.name, pos=list(row.pos), quat=list(row.quat))
+        body = parent.add_body(name=prefix + row.name, pos=list(row.pos), quat=list(row.quat))
         made.append(body)
         if row.parent < 0:
-            body.add_freejoint(name="root")
+            body.add_freejoint(name=f"{prefix}root")
         turn = np.zeros((3, 3))
         mujoco.mju_quat2Mat(turn.reshape(-1), np.array(row.frame))
         for letter, name, limits in zip(row.order, row.hinge_names(), row.ranges, strict=True):
             body.add_joint(
-                name=name,
+                name=prefix + name,
                 type=mujoco.mjtJoint.mjJNT_HINGE,
                 axis=turn[:, "XYZ".index(letter)].tolist(),
                 range=list(limits),
@@ -126,7 +132,7 @@ def make_spec(table: BodyTable) -> mujoco.MjSpec:
             )
         for i, geom in enumerate(row.geoms):
             body.add_geom(
-                name=f"{row.name}_{i}" if i else row.name,
+                name=prefix + (f"{row.name}_{i}" if i else row.name),
                 type=_GEOMS[geom.kind],
                 size=list(geom.size),
                 pos=list(geom.pos),
@@ -136,20 +142,19 @@ def make_spec(table: BodyTable) -> mujoco.MjSpec:
                 friction=[table.friction, 0.1, 0.1],
             )
     for a, b in table.contact_exclusions:
-        spec.add_exclude(bodyname1=a, bodyname2=b)
+        spec.add_exclude(bodyname1=prefix + a, bodyname2=prefix + b)
     for row in table.rows:
         for name in row.hinge_names():
             actuator = spec.add_actuator(
-                name=name,
+                name=prefix + name,
                 trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                target=name,
+                target=prefix + name,
                 gaintype=mujoco.mjtGain.mjGAIN_FIXED,
                 biastype=mujoco.mjtBias.mjBIAS_AFFINE,
                 forcerange=[-row.torque, row.torque],
             )
             actuator.gainprm[0] = row.kp
             actuator.biasprm[1] = -row.kp
-    return spec
 
 
 def make_humanoid(skeleton: Skeleton, table: BodyTable) -> Humanoid:

@@ -12,8 +12,14 @@ from poise.sim.config import CONES, INTEGRATORS, SOLVERS, SimConfig
 from poise.sim.cpu import CpuBackend
 from poise.sim.diagnose import Cause, diagnose
 from poise.sim.drive import Drive
+from poise.sim.floor import Floor, HeightField, Plane, Steps
 from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dump
+from poise.sim.index import Place
+from poise.sim.links import Link
 from poise.sim.make import check_device, make_backend
+from poise.sim.rows import CharacterRows
+from poise.sim.scene import Character, Scene, SceneModel, Touch
+from poise.sim.scene_sim import Contact, SceneSim
 from poise.sim.tangent import difference, displaced
 from poise.sim.warp import WarpBackend
 from poise.sim.worlds import add_contact_sensors, contact_columns
@@ -25,13 +31,26 @@ __all__ = [
     "STANDARD_FIELDS",
     "Backend",
     "Cause",
+    "Character",
+    "CharacterRows",
+    "Contact",
     "CpuBackend",
     "Drive",
     "Failure",
+    "Floor",
+    "HeightField",
+    "Link",
     "NanGuard",
+    "Place",
+    "Plane",
     "Replay",
+    "Scene",
+    "SceneModel",
+    "SceneSim",
     "SimConfig",
     "SimState",
+    "Steps",
+    "Touch",
     "UnstableError",
     "WarpBackend",
     "add_contact_sensors",

@@ -15,7 +15,7 @@ from poise.eval import run_episodes
 from poise.eval.episodes import Recording
 from poise.eval.rolloutset import Judged, RolloutSet, judge
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.track.crowd import Crowd
+from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import Placed
 from poise.jobs.track.recovering import Led, Replay, led_along, look_for, replay, sentence
 from poise.jobs.tracker import Tracker
@@ -154,8 +154,8 @@ def _episode(
     """One episode of all characters."""
     count, task = config.count, imitation
     every = torch.arange(count)
-    crowd = Crowd(task.humanoid, task.config.sim, count) if count > 1 else None
-    env = task.env(1, None, False, 1, help_scale=0.0, guard=crowd is None, backend=crowd)
+    rows = crowd(task.humanoid, task.config.sim, count) if count > 1 else None
+    env = task.env(1, None, False, 1, help_scale=0.0, backend=rows)
     if isinstance(acts, Lookahead):
         acts.watch(env)
     keeper = Keeper(env, acts) if config.reset_on_fail else None

@@ -1,0 +1,11 @@
+"""Props of a scene, one kind a file: whatever is no character."""
+
+from poise.sim.props.box import Box
+from poise.sim.props.carrier import Carrier
+from poise.sim.props.door import Door
+from poise.sim.props.lift import Lift
+from poise.sim.props.mesh import Mesh
+from poise.sim.props.prop import Prop
+from poise.sim.props.sphere import Ball
+
+__all__ = ["Ball", "Box", "Carrier", "Door", "Lift", "Mesh", "Prop"]

@@ -1,0 +1,194 @@
+"""What stands in one world: characters, props, links between them, and the floor.
+
+scene = Scene(
+    things=(Character(humanoid, "anna"), Door(), Ball(pos=(0, 0, 2))),
+    links=(Link("grip", "door", "anna/left_hand", "ball"),),
+    touches=(Touch("hit", "ball", "anna"),),
+)
+world = SceneSim(scene, num_envs=64)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import mujoco
+
+from poise.body import Humanoid
+from poise.body.humanoid import add_humanoid
+from poise.errors import PoiseError, did_you_mean
+from poise.sim.config import SimConfig
+from poise.sim.floor import Floor, Plane
+from poise.sim.index import Place, place_of
+from poise.sim.links import Link
+from poise.sim.props import Prop
+
+#: Things in one scene; more take minutes to compile and are a mistake.
+MOST = 500
+_BITS = ("FOUND", "FORCE", "TORQUE", "POS")
+_DATA = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{bit}")) for bit in _BITS)
+_NETFORCE = 3
+
+
+@dataclass(frozen=True)
+class Character:
+    """A body in a scene. It stands at the origin until a state is written.
+
+    Attributes:
+        humanoid: its body.
+        name: its bodies, joints and actuators are called NAME/..., or by their own names where it is "".
+    """
+
+    humanoid: Humanoid
+    name: str = ""
+
+    @property
+    def prefix(self) -> str:
+        """What its names begin with."""
+        return f"{self.name}/" if self.name else ""
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Contact forces between two groups, which are then measured.
+
+    Attributes:
+        name: how the scene calls it.
+        a: a character or prop with all its bodies, a body such as "anna/left_foot", or "floor".
+        b: likewise; None for whatever touches `a`.
+    """
+
+    name: str
+    a: str
+    b: str | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One world's content.
+
+    Attributes:
+        things: characters and props; the order is that of the model's arrays.
+        links: between bodies.
+        touches: contact forces that are measured.
+        floor: what they stand on; its friction is that of the first character.
+        sim: physics settings.
+    """
+
+    things: tuple[Character | Prop, ...]
+    links: tuple[Link, ...] = ()
+    touches: tuple[Touch, ...] = ()
+    floor: Floor = field(default_factory=Plane)
+    sim: SimConfig = field(default_factory=SimConfig)
+
+    def __post_init__(self) -> None:
+        if len(self.things) > MOST:
+            raise PoiseError(f"a scene holds at most {MOST} things, got {len(self.things)}", "Scene")
+        for what in ("things", "links", "touches"):
+            names = [x.name for x in getattr(self, what)]
+            twice = next((n for n in names if names.count(n) > 1), None)
+            if twice is not None:
+                raise PoiseError(
+                    f"two of its {what} are called '{twice}'", "Scene", "Give each its name"
+                )
+
+    @property
+    def characters(self) -> tuple[Character, ...]:
+        """Its characters, in order."""
+        return tuple(t for t in self.things if isinstance(t, Character))
+
+    @cached_property
+    def spec(self) -> mujoco.MjSpec:
+        """The description that is compiled."""
+        spec = mujoco.MjSpec()
+        spec.modelname = "poise"
+        spec.compiler.degree, spec.compiler.autolimits = False, True
+        characters = self.characters
+        self.floor.add(spec, characters[0].humanoid.table.friction if characters else 1.0)
+        for thing in self.things:
+            if isinstance(thing, Character):
+                add_humanoid(spec, thing.humanoid.table, thing.prefix)
+            else:
+                thing.add(spec)
+        known = [b.name for b in spec.bodies]
+        for link in self.links:
+            for body in (link.a, link.b):
+                _check(body, known, f"Link '{link.name}'")
+            link.add(spec)
+        for touch in self.touches:
+            self._sense(spec, touch, known)
+        self.sim.apply(spec)
+        return spec
+
+    def compile(self) -> SceneModel:
+        """The model and its index.
+
+        Raises:
+            PoiseError: what MuJoCo cannot compile, and links or touches of bodies that are not there.
+        """
+        try:
+            model = self.spec.compile()
+        except ValueError as problem:
+            text = " ".join(str(problem).split()).removeprefix("Error: ")
+            raise PoiseError(f"the scene cannot be compiled: {text}", "Scene") from None
+        first = {t.name: self._first_body(t) for t in self.things}
+        return SceneModel(
+            self, model, {n: place_of(model, n, model.body(body).id) for n, body in first.items()}
+        )
+
+    @staticmethod
+    def _first_body(thing: Character | Prop) -> str:
+        if isinstance(thing, Character):
+            return thing.prefix + thing.humanoid.bodies[0]
+        return thing.name
+
+    def _sense(self, spec: mujoco.MjSpec, touch: Touch, bodies: list[str]) -> None:
+        """Adds the sensor of a touch: the net force and torque about its point, in the world's axes."""
+        ends: list[tuple[mujoco.mjtObj, str]] = []
+        whole = {t.name: self._first_body(t) for t in self.things if t.name}
+        for name in (touch.a, touch.b):
+            if name is None:
+                continue
+            if name == "floor":
+                ends.append((mujoco.mjtObj.mjOBJ_BODY, "world"))
+            elif name in whole:
+                # A body with all below it.
+                ends.append((mujoco.mjtObj.mjOBJ_XBODY, whole[name]))
+            else:
+                _check(name, [*whole, *bodies, "floor"], f"Touch '{touch.name}'")
+                ends.append((mujoco.mjtObj.mjOBJ_BODY, name))
+        sensor = spec.add_sensor(
+            name=touch.name, type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=ends[0][0], objname=ends[0][1], intprm=[_DATA, _NETFORCE, 1],
+        )  # fmt: skip
+        if len(ends) > 1:
+            sensor.reftype, sensor.refname = ends[1]
+
+
+def _check(name: str, known: list[str], where: str) -> None:
+    if name not in known:
+        raise PoiseError(f"there is no body '{name}' in the scene", where, did_you_mean(name, known))
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel:
+    """A compiled scene.
+
+    Attributes:
+        scene: as it was described.
+        model: of all things together.
+        places: of each thing, by its name.
+    """
+
+    scene: Scene
+    model: mujoco.MjModel
+    places: Mapping[str, Place]
+
+    def place(self, name: str) -> Place:
+        """Where a thing stands in the model's arrays."""
+        if name not in self.places:
+            hint = did_you_mean(name, list(self.places))
+            raise PoiseError(f"there is no '{name}' in the scene", "Scene", hint)
+        return self.places[name]
