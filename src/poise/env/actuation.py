@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from poise.control import PDTargets, Residual, Wrench
-from poise.sim import Backend, Drive
+from poise.env.plugins import Plugin
+from poise.sim import Backend, Drive, NanGuard
 
 TensorFunction = Callable[..., tuple[Tensor, ...]]
 
@@ -69,10 +70,20 @@ def unkept_actions(actions: Tensor, last: Tensor, kept: Tensor, hinges: int) -> 
 class Actuation:
     """Fills a backend's drive from actions of `hinges` joint actions followed by the residual's.
 
-    fused: recorded once, with and without help, and replayed as a whole.
+    fused: recorded once, with and without help, and replayed as a whole. pushing, pushing_substeps:
+    plug-ins that add forces, at the control and at the physics rate.
     """
 
-    def __init__(self, backend: Backend, pd: PDTargets, residual: Residual | None, fused: bool):
+    def __init__(
+        self,
+        backend: Backend,
+        pd: PDTargets,
+        residual: Residual | None,
+        fused: bool,
+        pushing: Sequence[Plugin] = (),
+        pushing_substeps: Sequence[Plugin] = (),
+    ):
+        self.pushing, self.pushing_substeps = pushing, pushing_substeps
         self.backend, self.pd, self.residual, self.fused = backend, pd, residual, fused
         self.hinges = backend.model.nu
         #: Bodies of the humanoid's table that the residual may push.
@@ -108,6 +119,24 @@ class Actuation:
             self.functions[helped] = record(plain, given) if self.fused else plain
         force, torque, point = self.functions[helped](*given)
         return None if residual is None else Wrench(force, torque, point, self.bodies)
+
+    def step(self, worlds: Backend | NanGuard, substeps: int) -> None:
+        """One control step of `worlds` with what drives them and the forces of the plug-ins."""
+        drive = self.backend.drive
+        for plugin in self.pushing:
+            plugin.push(drive)
+        if not self.pushing_substeps:
+            worlds.step(substeps)
+            return
+        parts = drive.ctrl, drive.qfrc_applied, drive.xfrc_applied
+        held = [x.clone() for x in parts]
+        for k in range(substeps):
+            if k:
+                for part, value in zip(parts, held, strict=True):
+                    part.copy_(value)
+            for plugin in self.pushing_substeps:
+                plugin.push_substep(drive)
+            worlds.step(1)
 
     def with_help(
         self, action: Tensor, targets: Tensor, rows: Tensor, *state: Tensor

@@ -84,13 +84,13 @@ class ImitationEnv:
         self.imitation = torch.zeros(n, device=here)
         self.help, self.plugins = plugins_of(task, self.goal, backend, seed)
         # Only plug-ins that change a hook are asked by it.
-        self._holding, self._ticking, self._targeting, self._judging, self._logging = (
+        self._holding, self._ticking, self._targeting, self._judging, self._logging, *pushing = (
             tuple(p for p in self.plugins if getattr(type(p), hook) is not getattr(Plugin, hook))
-            for hook in ("held", "tick", "targets", "judged", "log")
+            for hook in ("held", "tick", "targets", "judged", "log", "push", "push_substep")
         )
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        self._actuation = Actuation(backend, task.pd, task.residual, fused)
+        self._actuation = Actuation(backend, task.pd, task.residual, fused, *pushing)
         self._every = torch.arange(n, device=here)
         self._terms = self._make_terms(fused)
         self.goal.aim(None, None)
@@ -242,7 +242,7 @@ class ImitationEnv:
                 targets = plugin.targets(targets)
         help_left = self.help.at(group)
         self.wrench = self._actuation.apply(self.action, targets, rows, help_left, self.help.now > 0)
-        (self._guard or self.backend).step(self.substeps)
+        self._actuation.step(self._guard or self.backend, self.substeps)
         self.age += 1
         waited = self._held()
         for plugin in self._ticking:

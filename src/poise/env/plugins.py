@@ -15,6 +15,7 @@ from torch import Tensor
 
 from poise.env.bins import Outcomes
 from poise.env.frame import Frame, Observable
+from poise.sim import Drive
 
 if TYPE_CHECKING:
     from poise.env.goals import Goal
@@ -85,6 +86,12 @@ class Plugin:
     def targets(self, hinges: Tensor) -> Tensor:
         """What additive actions add to, rad `(N, n)`, made of the goal's `hinges (N, n)`."""
         return hinges
+
+    def push(self, drive: Drive) -> None:
+        """Adds forces to what drives the worlds, held for one control step."""
+
+    def push_substep(self, drive: Drive) -> None:
+        """Adds forces to what drives the worlds, anew before each physics step."""
 
     def tick(self) -> None:
         """One control step has been made."""

@@ -1,0 +1,122 @@
+"""Forces of plug-ins: pushes at the control rate, forces at the physics rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from poise.env.events import Pushes, Pushing
+from poise.env.plugins import Plugin
+from poise.errors import PoiseError
+from poise.motion import ClipLibrary
+from poise.recipes import ResidualForce, build
+from poise.recipes.imitation import Imitation
+from poise.sim import Drive, body_com_velocity_w
+from toy_human import swing
+
+
+@pytest.fixture(scope="module")
+def task() -> Imitation:
+    return build(ClipLibrary.of([swing(1.5, name="calm")]), ResidualForce(num_envs=2, expert=False))
+
+
+def pushed(task: Imitation, *plugins: object) -> Imitation:
+    return replace(task, task=replace(task.task, plugins=plugins, dones=()))
+
+
+class Constant(Plugin):
+    """30 N along +Y on the root, at one of the two rates."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def add(self, drive: Drive) -> None:
+        drive.xfrc_applied[:, 1, 1] += 30.0
+        self.calls += 1
+
+
+class Held(Constant):
+    def push(self, drive: Drive) -> None:
+        self.add(drive)
+
+
+class Anew(Constant):
+    def push_substep(self, drive: Drive) -> None:
+        self.add(drive)
+
+
+def test_a_constant_force_is_the_same_at_either_rate(task: Imitation) -> None:
+    made = [k() for k in (Held, Anew)]
+    envs = [pushed(task, lambda goal, backend, p=p: p).env(3, 1, False, threads=1) for p in made]
+    zero = torch.zeros(3, dtype=torch.long)
+    rng = torch.Generator().manual_seed(0)
+    for env in envs:
+        env.reset_to(zero, zero)
+    for _ in range(10):
+        action = 0.2 * torch.randn(3, envs[0].num_actions, generator=rng)
+        a, b = (env.step(action).obs for env in envs)
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
+    substeps = task.config.sim.substeps
+    assert made[0].calls * substeps == made[1].calls == 10 * substeps
+    for env in envs:
+        env.close()
+
+
+def test_a_push_is_a_change_of_momentum(task: Imitation) -> None:
+    """In free fall nothing else acts along X and Y."""
+    lasts = 3 / 30
+    pushes = Pushes(newtons=(60.0, 60.0), every_s=(0.1, 0.1), lasts_s=lasts, bodies=(0, 2), seed=3)
+    env = pushed(task, pushes).env(4, 1, False, threads=1, help_scale=0.0)
+    plugin = env.plugin(Pushing)
+    assert plugin is not None
+    zero = torch.zeros(4, dtype=torch.long)
+    env.reset_to(zero, zero)
+    qpos, qvel = env.backend.state.qpos.clone(), torch.zeros_like(env.backend.state.qvel)
+    qpos[:, 2] += 10.0
+    env.backend.write(None, qpos, qvel)
+    model, force = env.backend.model, torch.zeros_like(plugin.force)
+    acted = 0
+    for _ in range(6):
+        acted += int(plugin.acting[0])
+        force = torch.where(plugin.acting[:, None], plugin.force, force)
+        env.step(torch.zeros(4, env.num_actions))
+    assert acted == 3 and force.norm(dim=-1).allclose(torch.tensor(60.0).double())
+    mass = torch.tensor(model.body_mass)[:, None]
+    momentum = (body_com_velocity_w(env.backend.state, model) * mass).sum(1)
+    torch.testing.assert_close(momentum[:, :2], force[:, :2] * lasts, rtol=5e-3, atol=2e-2)
+    env.close()
+
+
+def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
+    pushing = pushed(task, Pushes(every_s=(0.1, 0.5), seed=2))
+    env, other = (pushing.env(3, 1, True, threads=1) for _ in range(2))
+    env.reset()
+    actions = torch.zeros(3, env.num_actions)
+    for _ in range(7):
+        env.step(actions)
+    state = env.state()
+    other.load_state(state)
+    for _ in range(12):
+        assert torch.equal(env.step(actions).obs, other.step(actions).obs)
+    one = env.snapshot(torch.tensor([1]))
+    other.restore(one)
+    plugin = other.plugin(Pushing)
+    assert plugin is not None and len(plugin.left.unique()) == 1
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"newtons": (5.0, 1.0)}, "newtons must rise"),
+        ({"every_s": (-1.0, 1.0)}, "every_s must rise from at least 0"),
+        ({"lasts_s": 0.0}, "must be above 0"),
+        ({"bodies": ()}, "at least one body"),
+    ],
+)
+def test_mistakes(settings: dict, message: str) -> None:
+    with pytest.raises(PoiseError, match=message):
+        Pushes(**settings)
