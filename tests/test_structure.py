@@ -43,7 +43,7 @@ EXPLAINED = {
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
         "sim/props/carrier.py:Carrier", "sim/props/door.py:Door", "sim/props/lift.py:Lift",
-        "sim/props/sphere.py:Ball",
+        "sim/props/sphere.py:Ball", "sim/mechanics.py:Mechanics", "sim/mechanics.py:Mechanics.step_map",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

@@ -17,6 +17,7 @@ from poise.sim.guard import Failure, NanGuard, Replay, UnstableError, replay_dum
 from poise.sim.index import Place
 from poise.sim.links import Link
 from poise.sim.make import check_device, make_backend
+from poise.sim.mechanics import Mechanics
 from poise.sim.rows import CharacterRows
 from poise.sim.scene import Character, Scene, SceneModel, Touch
 from poise.sim.scene_sim import Contact, SceneSim
@@ -40,6 +41,7 @@ __all__ = [
     "Floor",
     "HeightField",
     "Link",
+    "Mechanics",
     "NanGuard",
     "Place",
     "Plane",
