@@ -89,8 +89,8 @@ class Mechanics:
         """By how much generalized forces `(N, nv)`, held for one physics step, change `qvel` `(N, nv)`.
 
         It is the simulator's own, with what its integrator makes of stiffness and damping, and with
-        limits and contacts. Two steps are made and taken back, at the cost of about ten. Under "euler", with nothing touched, it
-        is h (M + h D)^-1 f with the time step h and the joints' damping D.
+        limits and contacts. Two steps are made and taken back, at the cost of about ten. Under "euler",
+        with nothing touched, it is h (M + h D)^-1 f with the time step h and the joints' damping D.
         """
         backend, applied = self.backend, self.backend.drive.qfrc_applied
         if force.shape != applied.shape:
