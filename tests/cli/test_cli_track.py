@@ -219,6 +219,13 @@ def test_what_it_refuses(run: Path, file: Path, short: Path, tmp_path: Path, ref
     refused("track", short, *one, words=("several files",))
     refused("track", short, "--policy", file, "-o", tmp_path / "a.fbx", words=("cannot be written",))
     refused("track", tmp_path / "absent.bvh", *given, words=("absent.bvh",))
+    chair = tmp_path / "chair.json"
+    refused("track", short, *given, "--support", chair, words=("chair.json", "cannot be read"))
+    chair.write_text('{"size": [1, 1, 1], "pos": [0, 0, "high"]}')
+    refused("track", short, *given, "--support", chair, words=("support 1: pos must be",))
+    chair.write_text('{"size": [1, 1, 1], "pos": [0, 0, 1]}')
+    refused("track", short, *given, "--support", chair, "--count", "2", words=("a single character",))
+    refused("track", short, *given, "--support", chair, "--no-supports", words=("--no-supports",))
 
 
 def test_motions_that_cannot_be_tracked(

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from fake_report import make_report
 
+from poise.view.data import Shape
 from poise.view.report import render
 
 _CHROMIUM = next(
@@ -54,13 +55,20 @@ addEventListener("load", () => setTimeout(() => {
 @pytest.mark.parametrize(
     ("view", "extra", "suffix", "changes"),
     [
-        ("webgl", (), "", {}),
+        ("webgl", (), "", {"things": (Shape(0, "box", (0.2, 0.2, 0.2), (1.0, 0.0, 0.2)),)}),
         ("2d", ("--disable-3d-apis",), "", {}),
         (
             "2d",
             (),
             "#2d,overlaid",
-            {"force": None, "torque": None, "contacts": None, "score": {}, "curve": {}},
+            {
+                "force": None,
+                "torque": None,
+                "contacts": None,
+                "score": {},
+                "curve": {},
+                "things": (Shape(0, "box", (0.2, 0.2, 0.2), (1.0, 0.0, 0.2)),),
+            },
         ),
     ],
 )

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress
     from poise.jobs.track import TrackConfig, Tracked
     from poise.jobs.tracker import Tracker
+    from poise.kin.supports import Support
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
 
@@ -72,6 +73,10 @@ class Options:
     """A character that is 0.5 m off gets up, walks back and goes on where the motion waits for it."""
     count: Annotated[int, arg(metavar="N")] = 1
     """Characters that do the motion side by side in one world, where they may collide."""
+    supports: Flag = True
+    """Where a single motion sits, leans or steps on something, put a box there; a sentence says what."""
+    support: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Boxes beside the motion that stand there instead (.json), such as a result's supports.json."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -148,13 +153,13 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 
-    noise = noise_of(o.noise)
+    noise, stands = noise_of(o.noise), supports_wanted(o)
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     search = SamplingConfig(o.characters, rounds=o.rounds)
     config = TrackConfig(
         noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
         smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
-        search=search, threads=o.threads, body=o.body,
+        search=search, threads=o.threads, body=o.body, supports=stands,
     )  # fmt: skip
     config.check(len(o.clips))
     given = [read(clip, o.reading) for clip in o.clips]
@@ -190,6 +195,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         "controller": tracked.controller,
         "sentence": said,
         "failures": failures,
+        "supports": [s.to_dict() for s in tracked.supports],
         "clips": [asdict(part) | {"done": part.done} for part in tracked.parts],
         "score": done.card.to_dict(),
     }
@@ -197,6 +203,17 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     told = (*tracked.notes, *done.notes)
     code = LOST if lost or survived else 0
     return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
+
+
+def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support, ...]:
+    """What is to stand beside the motion."""
+    from poise.kin.supports import read_supports
+
+    if options.support is not None:
+        if not options.supports:
+            raise PoiseError("--support states what --no-supports forbids", hint="Leave one out")
+        return read_supports(options.support)
+    return "auto" if options.supports else "none"
 
 
 def is_lost(tracked: Tracked) -> bool:

@@ -14,6 +14,7 @@ from poise.kin import hold_feet, lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
+from poise.sim.props import Box
 from poise.version import __version__
 from poise.view import Report, Shape, Track, write_report
 
@@ -200,4 +201,9 @@ def make_report(
             "seed": str(card.seed),
             "version": __version__,
         },
+        things=tuple(
+            Shape(0, "box", (p.size[0] / 2, p.size[1] / 2, p.size[2] / 2), p.pos, p.quat)
+            for p in imitation.props
+            if isinstance(p, Box)
+        ),
     )

@@ -19,7 +19,8 @@ from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.plan import LookaheadTeacher, TeacherConfig
-from poise.sim import Backend, NanGuard, make_backend
+from poise.sim import Backend, Character, NanGuard, Scene, SceneSim, make_backend
+from poise.sim.props import Prop
 
 #: What a recipe is built of: a clip, the file of one, or a library.
 Clips = Clip | ClipLibrary | str | Path
@@ -47,6 +48,7 @@ class Imitation:
     Attributes:
         config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
         recovery_clips: those of the library, where recovery is learned by them.
+        props: what else stands in every world, such as a chair; fixed to it, or driven by nothing.
     """
 
     library: ClipLibrary
@@ -56,6 +58,7 @@ class Imitation:
     config: Any
     task: TaskConfig
     recovery_clips: RecoveryClips | None = None
+    props: tuple[Prop, ...] = ()
 
     def __repr__(self) -> str:
         clips, seconds = len(self.library), self.library.seconds
@@ -88,7 +91,7 @@ class Imitation:
         """
         if backend is None:
             worlds = num_envs or self.config.num_envs
-            backend = make_backend(self.humanoid.model, worlds, device, threads=threads)
+            backend = self._worlds(worlds, device, threads)
         seed = int(self.config.seed if seed is None else seed)
         task, substeps = replace(self.task, auto_reset=auto_reset), self.config.sim.substeps
         watch = NanGuard(backend, dumps, seed=seed) if guard else None
@@ -97,6 +100,13 @@ class Imitation:
             watch.where = env.where
         env.help.set(help_scale)
         return env
+
+    def _worlds(self, count: int, device: str, threads: int) -> Backend:
+        """Fresh worlds with a character and the props."""
+        if not self.props:
+            return make_backend(self.humanoid.model, count, device, threads=threads)
+        scene = Scene((Character(self.humanoid), *self.props), sim=self.config.sim)
+        return SceneSim(scene, count, device, threads).characters()
 
     def bare(self, rewards: bool = False, groups: bool = False) -> Imitation:
         """The same task with what a policy needs alone: no ends, no style, and without rewards but for

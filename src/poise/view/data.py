@@ -77,6 +77,7 @@ class Report:
         curve: columns of the learning curve, e.g. samples, seconds, reward.
         notes: sentences on what was guessed, repaired or limited.
         facts: name to text.
+        things: what stands in the world, such as a chair; their `body` counts for nothing.
     """
 
     title: str
@@ -95,6 +96,7 @@ class Report:
     curve: dict[str, np.ndarray]
     notes: tuple[str, ...]
     facts: dict[str, str]
+    things: tuple[Shape, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fps) and self.fps > 0):
@@ -229,6 +231,9 @@ def payload(report: Report) -> dict[str, Any]:
         "shapes": [
             {"body": s.body, "kind": s.kind, "size": s.size, "pos": s.pos, "quat": s.quat}
             for s in report.shapes
+        ],
+        "things": [
+            {"kind": s.kind, "size": s.size, "pos": s.pos, "quat": s.quat} for s in report.things
         ],
         "feet": foot_bodies(report.bodies),
         "weight": body_weight(report),

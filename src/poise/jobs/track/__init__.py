@@ -1,9 +1,9 @@
 """Tracking any motion with a trained policy: one simulated episode, nothing is trained."""
 
+from poise.jobs.track.config import TrackConfig
 from poise.jobs.track.controllers import Keeper, look_ahead
 from poise.jobs.track.tracked import Clean, Tracked, write
 from poise.jobs.track.tracking import (
-    TrackConfig,
     imitation_of,
     side_by_side,
     track,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,9 +24,8 @@ from poise.plan import Lookahead, LookaheadConfig, SamplingResult
 from poise.recipes.imitation import Imitation
 
 if TYPE_CHECKING:
-    from poise.jobs.track.tracking import TrackConfig
+    from poise.jobs.track.config import TrackConfig
 
-Controller = Literal["auto", "policy", "lookahead", "search"]
 #: Is told what is done, and how many control steps of how many are done.
 Show = Callable[[str, int, int], None]
 #: Which failure ends tracking: a mean distance of 0.5 m.

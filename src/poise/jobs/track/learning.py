@@ -24,6 +24,7 @@ from poise.jobs.runs import evaluate
 from poise.jobs.track.controllers import RULE
 from poise.jobs.track.missing import needs_of
 from poise.jobs.track.placement import Placed, place
+from poise.jobs.track.supports import Wanted, with_supports
 from poise.jobs.track.tracked import Tracked
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker, policy_of_run
@@ -70,6 +71,7 @@ def learn(
     seed: int = 0,
     starts: int = 1,
     device: str = "cpu",
+    supports: Wanted = "auto",
 ) -> Learned:
     """Trains until the motion is tracked from its first frame to its last, or a limit is reached.
 
@@ -77,6 +79,7 @@ def learn(
         folder: of the run, `perpetual.run`; one that holds a run of this motion is gone on with.
         on_iteration, threads, device: see `perpetual.run.train`.
         starts: the motion is to be tracked from so many frames, evenly spread, see `Perpetual.starts`.
+        supports: see `TrackConfig`.
 
     Raises:
         PoiseError: a policy of primitives, which cannot go on, or a folder with another run.
@@ -88,6 +91,7 @@ def learn(
     body, rate = imitation.humanoid, config.sim.control_hz
     qpos = place(placed.source, replace(tracker, humanoid=body)).qpos
     imitation = replace(imitation, reference=Reference(body, [qpos], rate, imitation.library.names))
+    imitation = with_supports(imitation, supports, placed)[1]
     # The critic goes on as well: it knows what a state is worth.
     trained = None if (folder / LATEST).exists() else widened(tracker, imitation, 0)
     result = train(imitation, folder, until, on_iteration, threads, False, device, trained=trained)
@@ -106,9 +110,12 @@ def from_every_start(tracker: Tracker, source: Clip, device: str = "cpu") -> Tra
         PoiseError: see `place`.
     """
     placed = place(source, tracker)
-    task = imitation_of(tracker, [placed])
+    supports, task = with_supports(imitation_of(tracker, [placed]), "auto", placed)
     done = evaluate(task, tracker.policy, {**tracker.about, "help_limit": 0.0}, device=device)
-    done = replace(done, card=replace(done.card, needs=tuple(n.to_dict() for n in needs_of(task))))
+    done = replace(
+        done, card=replace(done.card, needs=tuple(n.to_dict() for n in needs_of(task, supports)))
+    )
     failed = judge(done.rollouts, success_rule(RULE)).failed_at[done.recordings[0].row].item()
     lost = ((0, failed / task.reference.rate_hz),) if failed >= 0 else ()
-    return Tracked(tracker, task, done, placed, lost, None, placed.notes)
+    notes = (*placed.notes, *(s.sentence() for s in supports))
+    return Tracked(tracker, task, done, placed, lost, None, notes, supports=supports)

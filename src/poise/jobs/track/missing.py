@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from poise.eval import ScoreCard
 from poise.kin.doctor.needs import Need, find_needs
+from poise.kin.supports import Support
 from poise.metrics import LASTING_S
 from poise.recipes.imitation import Imitation
 
 
-def needs_of(imitation: Imitation) -> tuple[Need, ...]:
-    """What a task's first motion needs besides a floor."""
+def needs_of(imitation: Imitation, supports: Sequence[Support] = ()) -> tuple[Need, ...]:
+    """What a task's first motion needs besides a floor and its supports."""
     reference = imitation.reference
     frames = int(reference.length[0])
     pose = reference.pose
-    return find_needs(imitation.humanoid.table, pose.pos[:frames], pose.quat[:frames], reference.rate_hz)
+    table, rate = imitation.humanoid.table, reference.rate_hz
+    needs = find_needs(table, pose.pos[:frames], pose.quat[:frames], rate)
+    return tuple(
+        n for n in needs if not any(s.start_s < n.stop_s and n.start_s < s.stop_s for s in supports)
+    )
 
 
 def shortfalls(card: ScoreCard) -> tuple[str, ...]:

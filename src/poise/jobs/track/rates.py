@@ -18,7 +18,7 @@ from poise.plan import Lookahead
 from poise.recipes.imitation import Imitation
 
 if TYPE_CHECKING:
-    from poise.jobs.track.tracking import TrackConfig
+    from poise.jobs.track.config import TrackConfig
 
 #: The rates that a lost motion is tried at, over its own, if files have them within `USUAL`.
 TRIED, USUAL = (0.5, 2.0), 0.02

@@ -17,8 +17,10 @@ from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
 from poise.jobs.track.recovering import Losses
+from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
 from poise.kin import hold_feet
+from poise.kin.supports import Support
 from poise.motion import Clip
 from poise.motion.io import home_suffix, write_clip
 from poise.plan import SamplingResult
@@ -56,7 +58,8 @@ class Tracked(Result):
     without noise. notes: sentences on the input and the noise. losses: with `recover`, when the motion
     was lost and found again; None where it was not. found: what a search came to; None where
     nothing was searched. controller: which did the motion: "policy", "lookahead" or "search". parts:
-    what became of each of several clips; none where it was one.
+    what became of each of several clips; none where it was one. supports: what stands in the world for
+    the motion to rest on, in the world of the body.
     """
 
     tracker: Tracker
@@ -70,6 +73,7 @@ class Tracked(Result):
     found: SamplingResult | None = None
     controller: str = "policy"
     parts: tuple[Part, ...] = ()
+    supports: tuple[Support, ...] = ()
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -135,7 +139,7 @@ def write(
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said)
     if not other:
-        return done
+        return _with_supports(t, done, out, hold)
     paths: dict[str, Path] = {}
     for k, (name, path) in enumerate(done.paths.items()):
         if k >= count:
@@ -146,4 +150,13 @@ def write(
         paths[body] = path.rename(out / f"{body}{path.suffix}")
         paths[name] = motion or out / f"{name}{home_suffix(back)}"
         write_clip(back, paths[name])
-    return replace(done, paths=paths)
+    return _with_supports(t, replace(done, paths=paths), out, hold)
+
+
+def _with_supports(t: Tracked, done: Delivery, out: Path, hold: bool) -> Delivery:
+    """Writes what the motion rests on beside it."""
+    if not t.supports:
+        return done
+    first = next(iter(p for name, p in done.paths.items() if name.startswith("simulated")))
+    stands = at_home(t.supports, t.placed)
+    return replace(done, paths=done.paths | write_supports(stands, t.delivered(0, hold), out, first))

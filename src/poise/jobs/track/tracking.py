@@ -7,9 +7,9 @@ tracked.card, tracked.clip, tracked.save("out")
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,109 +17,32 @@ from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
 from poise.env import Reference
-from poise.errors import PoiseError
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
-from poise.jobs.track.controllers import RULE, Controller, Show, done_by, led_by
+from poise.jobs.track.config import TrackConfig
+from poise.jobs.track.controllers import RULE, Show, done_by, led_by
 from poise.jobs.track.crowd import places
 from poise.jobs.track.missing import needs_of
 from poise.jobs.track.parts import Span, cut, parts_of, with_parts
 from poise.jobs.track.placement import Placed, place, place_all
 from poise.jobs.track.points import fitted, follow, points_of
 from poise.jobs.track.rates import rate_notes
+from poise.jobs.track.supports import with_supports
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
+from poise.kin.supports import Support
 from poise.metrics import mpjpe_global, success_rule
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
-from poise.motion.noise import Noise, perturb_clip, perturb_points
-from poise.plan import LookaheadConfig, SamplingConfig
+from poise.motion.noise import perturb_clip, perturb_points
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
-from poise.settings import changed, validate
+from poise.settings import changed
 
-#: Characters in one world.
-MOST = 64
 #: What is tracked.
 Motion = Clip | Keypoints | str | Path
-
-
-@dataclass(frozen=True)
-class TrackConfig:
-    """How a motion is tracked.
-
-    Attributes:
-        noise, seed: what is done to the input first, see `motion.noise`.
-        reset_on_fail: a character that failed is put back onto the reference.
-        recover: it gets up, comes back and goes on, while the motion waits, see `env.goals.led`; for one
-            character.
-        smooth_hz: cut-off of a low-pass on keypoints.
-        count: characters that do the motion side by side in one world, see `track.crowd`.
-        controller: "policy" acts alone, "lookahead" simulates what it may do before it acts
-            (`plan.lookahead`), "search" looks for the whole motion (`plan.sampling`), for one character;
-            "auto" looks ahead, and searches what is lost so, but for `recover` and several clips.
-        lookahead: how it looks ahead; its seed is `seed`.
-        search: how it searches; its seed is `seed`.
-        threads: cores of lookahead and search, 0 is all of them.
-        body: "policy" is the one that it was trained on, onto which motions are retargeted; "own" has
-            the same bodies and hinges with the lengths and masses of the skeleton that came in.
-    """
-
-    noise: tuple[Noise, ...] = ()
-    seed: int = 0
-    reset_on_fail: bool = False
-    recover: bool = False
-    smooth_hz: float | None = None
-    count: int = 1
-    controller: Controller = "auto"
-    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
-    search: SamplingConfig = field(default_factory=SamplingConfig)
-    threads: int = 0
-    body: Literal["policy", "own"] = "policy"
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if not 1 <= self.count <= MOST:
-            raise PoiseError(f"there can be 1 to {MOST} characters, got {self.count}")
-        if self.recover and (self.reset_on_fail or self.count > 1):
-            what = "several characters" if self.count > 1 else "one that is put back onto the motion"
-            raise PoiseError(f"only a single character comes back by itself, not {what}")
-        if self.controller == "search" and (self.recover or self.reset_on_fail or self.count > 1):
-            what = "several characters" if self.count > 1 else "one that comes or is put back"
-            raise PoiseError(f"a motion is searched for a single character, not {what}")
-
-        if self.body == "own" and self.recover:
-            raise PoiseError("recovery clips are those of the policy's body, so body='own' has none")
-
-    def check(self, clips: int) -> None:
-        """Refuses what cannot be done with so many clips one after another.
-
-        Raises:
-            PoiseError: no clips, or several with what is for a single one.
-        """
-        alone = {
-            "several characters are": self.count > 1, "noise is": bool(self.noise),
-            "putting a character back is": self.reset_on_fail,
-            "a search is": self.controller == "search", "a body of its own is": self.body == "own",
-        }  # fmt: skip
-        if not clips:
-            raise PoiseError("there is no clip to track")
-        if clips > 1 and any(alone.values()):
-            what = next(name for name, asked in alone.items() if asked)
-            raise PoiseError(f"{what} for a single clip, and {clips} were given")
-
-    @property
-    def looks_ahead(self) -> bool:
-        """Whether lookahead is wanted."""
-        return self.controller in ("auto", "lookahead")
-
-    @property
-    def searches(self) -> bool:
-        """Whether what is lost is searched."""
-        single = not (self.recover or self.reset_on_fail or self.count > 1)
-        return self.controller == "search" or (self.controller == "auto" and single)
 
 
 def track(
@@ -173,6 +96,10 @@ def track(
         reference, said = follow(tracker, placed, points, imitation.reference, config.smooth_hz)
         imitation, notes = replace(imitation, reference=reference), [*notes, *said]
     goals = imitation.reference.pose.pos
+    supports: tuple[Support, ...] = ()
+    if not several and not config.recover and config.count == 1:
+        supports, imitation = with_supports(imitation, config.supports, placed)
+        notes += [s.sentence() for s in supports]
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
     losses, replayed, apart, spans = None, None, imitation.reference, list[Span]()
@@ -196,7 +123,7 @@ def track(
     if several:
         card = with_parts(card, parts)
     else:
-        card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation)))
+        card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation, supports)))
     clean = None
     if config.noise:
         seen = rollouts.pos[0], goals
@@ -215,7 +142,7 @@ def track(
         times = tuple((0, p.lost) for p in parts if p.lost is not None)
     return Tracked(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
-        done.controller, parts,
+        done.controller, parts, supports,
     )  # fmt: skip
 
 

@@ -126,6 +126,15 @@ Poise.stage2D = (host, data, extent) => {
     g.restore();
   }
 
+  // What stands in the world, behind the characters.
+  function things(shift) {
+    const still = { pos: [0, 0, 0], quat: [1, 0, 0, 0] };
+    for (const shape of data.things || []) {
+      const at = corners({ ...shape, body: 0 }, still, shift).map(project);
+      if (at.every(Boolean)) paint(g, shape.kind, at, shape.size[0], colors.thing, colors.ink);
+    }
+  }
+
   function character(pose, shift, color, rim, alpha, lit) {
     const items = [];
     wipe();
@@ -163,7 +172,7 @@ Poise.stage2D = (host, data, extent) => {
     canvas,
     theme() {
       const names = { bg: "--stage", ink: "--ink", ref: "--ref", refRim: "--ref-rim", sim: "--sim",
-        simRim: "--sim-rim", help: "--help", lit: "--contact" };
+        simRim: "--sim-rim", help: "--help", thing: "--thing", lit: "--contact" };
       for (const key in names) colors[key] = Poise.css(names[key]);
     },
     resize(w, h) {
@@ -183,6 +192,9 @@ Poise.stage2D = (host, data, extent) => {
       g.fillStyle = colors.bg;
       g.fillRect(0, 0, width, height);
       grid();
+      things(frame.shift[1]);
+      if (Math.hypot(frame.shift[0][0] - frame.shift[1][0], frame.shift[0][1] - frame.shift[1][1]) > 1e-3)
+        things(frame.shift[0]);
       character(frame.simulated, frame.shift[1], colors.sim, colors.simRim, 1, frame.lit);
       character(frame.reference, frame.shift[0], colors.ref, colors.refRim, 0.3 + 0.3 * frame.blend, [false, false]);
       if (frame.arrow) {

@@ -96,6 +96,20 @@ Poise.stageGL = (host, data, extent) => {
     scene.add(root);
     return { root, parts, mats };
   }
+  // What stands in the world, beside each character where they are apart.
+  const wood = new T.MeshStandardMaterial({ roughness: 0.9, metalness: 0.0 });
+  const things = [0, 1].map(() => {
+    const group = new T.Group();
+    for (const shape of data.things || []) {
+      const mesh = new T.Mesh(geometry(shape), wood);
+      mesh.position.set(...shape.pos);
+      mesh.quaternion.set(shape.quat[1], shape.quat[2], shape.quat[3], shape.quat[0]);
+      mesh.castShadow = mesh.receiveShadow = true;
+      group.add(mesh);
+    }
+    scene.add(group);
+    return group;
+  });
   const reference = character(true);
   const simulated = character(false);
 
@@ -131,6 +145,7 @@ Poise.stageGL = (host, data, extent) => {
       ghost.uniforms.tint.value.set(Poise.css("--ref"));
       ghost.uniforms.rim.value.set(Poise.css("--ref-rim"));
       arrowMaterial.color.set(Poise.css("--help"));
+      wood.color.set(Poise.css("--thing"));
       colors.sim = new T.Color(Poise.css("--sim"));
       colors.lit = new T.Color(Poise.css("--contact"));
     },
@@ -165,6 +180,8 @@ Poise.stageGL = (host, data, extent) => {
       pose(reference, frame.reference, rx, ry);
       pose(simulated, frame.simulated, sx, sy);
       ghost.visible = true;
+      things.forEach((group, k) => group.position.set(frame.shift[k][0], frame.shift[k][1], 0));
+      things[0].visible = Math.hypot(rx - sx, ry - sy) > 1e-3;
       simulated.mats[0].color.copy(colors.sim);
       for (const side of [0, 1]) simulated.mats[side + 1].color.copy(frame.lit[side] ? colors.lit : colors.sim);
       arrow.visible = Boolean(frame.arrow);

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 
 from poise.motion.clip import Clip
 from poise.motion.io.figure import bone_figure
+from poise.motion.io.gltf.boxes import SceneBox, box_mesh
 from poise.motion.io.gltf.file import BIN_CHUNK, JSON_CHUNK, MAGIC
 from poise.motion.io.nodes import base_of, place_of_travel, tips_from_z_up
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
@@ -30,6 +32,7 @@ _FLOAT, _UBYTE, _USHORT = 5126, 5121, 5123
 _DTYPES = {_FLOAT: "<f4", _UBYTE: "<u1", _USHORT: "<u2"}
 _ARRAY = 34962
 _COLOUR = [0.85, 0.45, 0.15, 1.0]
+_WOOD = [0.62, 0.58, 0.52, 1.0]
 _IDENTITY = [1.0, 0.0, 0.0, 0.0]
 
 
@@ -53,7 +56,7 @@ class _Plan:
     take: str
 
 
-def write_gltf(clip: Clip, path: str | Path) -> None:
+def write_gltf(clip: Clip, path: str | Path, boxes: Sequence[SceneBox] = ()) -> None:
     """Writes a clip as .glb, or as .gltf with its buffer embedded.
 
     A clip that came from glTF gets back its nodes above the root, scales, rest pose, unit and the
@@ -61,12 +64,15 @@ def write_gltf(clip: Clip, path: str | Path) -> None:
     octahedra to the joints, so that viewers show the motion at once. Keys stand at the clip's own
     frames; bone tips, the exact frame rate and `cyclic` are kept in `extras`.
 
+    Args:
+        boxes: what stands beside the motion, each a node with a mesh.
+
     Raises:
         PoiseError: the folder is missing or cannot be written to.
     """
     path = Path(path)
     plan = _plan(clip)
-    document, blob = _document(clip, plan)
+    document, blob = _document(clip, plan, boxes)
     buffer: dict[str, Any] = {"byteLength": len(blob)}
     document["buffers"] = [buffer]
     if path.suffix.lower() == ".gltf":
@@ -158,13 +164,17 @@ class _Document:
         return index
 
 
-def _document(clip: Clip, plan: _Plan) -> tuple[dict[str, Any], bytes]:
+def _document(clip: Clip, plan: _Plan, boxes: Sequence[SceneBox]) -> tuple[dict[str, Any], bytes]:
     """The document, but for its buffer's place, and the buffer."""
     out = _Document()
     _add_nodes(out.doc["nodes"], clip, plan)
     _add_figure(out, clip, plan)
     _add_animation(out, clip, plan)
-    out.doc["scenes"] = [{"name": clip.name, "nodes": [0, len(out.doc["nodes"]) - 1]}]
+    tops = [0, len(out.doc["nodes"]) - 1]
+    for box in boxes:
+        tops.append(len(out.doc["nodes"]))
+        _add_box(out, box, plan)
+    out.doc["scenes"] = [{"name": clip.name, "nodes": tops}]
     return out.doc, bytes(out.data)
 
 
@@ -259,6 +269,22 @@ def _add_figure(out: _Document, clip: Clip, plan: _Plan) -> None:
     out.doc["materials"] = [{"name": "Poise", "pbrMetallicRoughness": look}]
     out.doc["meshes"] = [{"name": "Figure", "primitives": [primitive]}]
     out.doc["nodes"].append({"name": "Figure", "mesh": 0, "skin": 0})
+
+
+def _add_box(out: _Document, box: SceneBox, plan: _Plan) -> None:
+    """A node with the mesh of a box; all boxes share a material."""
+    points, normals, centre = box_mesh(box, plan.axis, plan.unit_m)
+    attributes = {
+        "POSITION": out.add(points, "VEC3", target=_ARRAY, bounds=True),
+        "NORMAL": out.add(normals, "VEC3", target=_ARRAY),
+    }
+    if len(out.doc["materials"]) == 1:
+        look = {"baseColorFactor": _WOOD, "metallicFactor": 0.0, "roughnessFactor": 0.9}
+        out.doc["materials"].append({"name": "Support", "pbrMetallicRoughness": look})
+    primitive = {"attributes": attributes, "material": 1}
+    mesh = len(out.doc["meshes"])
+    out.doc["meshes"].append({"name": box.name, "primitives": [primitive]})
+    out.doc["nodes"].append({"name": box.name, "mesh": mesh, "translation": _floats(centre)})
 
 
 def _add_animation(out: _Document, clip: Clip, plan: _Plan) -> None:

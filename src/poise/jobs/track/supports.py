@@ -1,0 +1,113 @@
+"""What a motion rests on besides the floor stands in the world of the character that does it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+
+from poise.errors import PoiseError
+from poise.jobs.track.placement import Placed
+from poise.kin.supports import Support, find_supports
+from poise.motion import Clip
+from poise.motion.io.gltf.boxes import SceneBox
+from poise.motion.io.gltf.write import write_gltf
+from poise.motion.io.text import write_whole
+from poise.recipes.imitation import Imitation
+from poise.sim.props import Box
+
+#: Which supports there are, see `TrackConfig.supports`.
+Wanted = Literal["auto", "none"] | tuple[Support, ...]
+#: How deep a part may begin in a support, m.
+DEEP_M = 0.1
+
+
+def with_supports(
+    imitation: Imitation, wanted: Wanted, placed: Placed
+) -> tuple[tuple[Support, ...], Imitation]:
+    """Supports of a task's only motion, in its body's world, and the task with them.
+
+    wanted: see `TrackConfig.supports`.
+    """
+    if wanted == "none":
+        return (), imitation
+    if wanted == "auto":
+        r, table = imitation.reference, imitation.humanoid.table
+        found = find_supports(table, r.pose.pos, r.pose.quat, r.rate_hz)
+    else:
+        found = on_body(wanted, placed)
+    return found, supported(imitation, found) if found else imitation
+
+
+def supported(imitation: Imitation, supports: Sequence[Support]) -> Imitation:
+    """The task with supports in its world, as boxes that nothing moves.
+
+    Raises:
+        PoiseError: one in which the character would begin.
+    """
+    boxes = tuple(Box(f"{s.kind}{k}", s.size, s.pos, s.quat) for k, s in enumerate(supports, 1))
+    made = replace(imitation, props=boxes)
+    _check_start(made)
+    return made
+
+
+def on_body(supports: Sequence[Support], placed: Placed) -> tuple[Support, ...]:
+    """Supports that were stated beside the motion that came in, in the world of the body, which is as
+    much larger as the body, about where the motion begins."""
+    return _scaled(supports, placed, placed.moved.scale if placed.moved else 1.0)
+
+
+def at_home(supports: Sequence[Support], placed: Placed) -> tuple[Support, ...]:
+    """Supports beside the motion on the skeleton that came in."""
+    return _scaled(supports, placed, 1.0 / placed.moved.scale if placed.moved else 1.0)
+
+
+def write_supports(supports: Sequence[Support], clip: Clip, out: Path, motion: Path) -> dict[str, Path]:
+    """Writes supports as `supports.json`, which --support reads, and into a GLB with the motion: that of
+    the motion itself where it is one, else `scene.glb`."""
+    scene = motion if motion.suffix.lower() in (".glb", ".gltf") else out / "scene.glb"
+    boxes = [SceneBox(f"{s.kind}{k}", s.size, s.pos, s.yaw) for k, s in enumerate(supports, 1)]
+    write_gltf(clip, scene, boxes)
+    stated = out / "supports.json"
+    write_whole(stated, json.dumps([s.to_dict() for s in supports], indent=2) + "\n")
+    return {"supports": stated} | ({} if scene == motion else {"scene": scene})
+
+
+def _scaled(supports: Sequence[Support], placed: Placed, scale: float) -> tuple[Support, ...]:
+    if scale == 1.0:
+        return tuple(supports)
+    x, y, _ = (float(v) for v in placed.source.root_pos[0])
+    return tuple(
+        replace(
+            s,
+            size=(s.size[0] * scale, s.size[1] * scale, s.size[2] * scale),
+            pos=(x + (s.pos[0] - x) * scale, y + (s.pos[1] - y) * scale, s.pos[2] * scale),
+        )
+        for s in supports
+    )
+
+
+def _check_start(imitation: Imitation) -> None:
+    """Refuses a world in which the character begins deep inside a support."""
+    env = imitation.bare().env(1, None, False, 1, help_scale=0.0, guard=False)
+    try:
+        model, data = env.backend.get_model(0), env.backend.get_data(0)
+        first = imitation.reference.qpos[0].numpy()
+        data.qpos[: len(first)] = first
+        mujoco.mj_forward(model, data)
+        for contact in data.contact[: data.ncon]:
+            names = [model.body(int(model.geom_bodyid[g])).name for g in contact.geom]
+            box = next((n for n in names if n in {b.name for b in imitation.props}), None)
+            if box is not None and contact.dist < -DEEP_M:
+                other = names[1 - names.index(box)]
+                raise PoiseError(
+                    f"the motion begins with {other} {-contact.dist:.2f} m inside {box}",
+                    imitation.library.names[0],
+                    "Move it, or make it smaller",
+                )
+    finally:
+        env.close()
