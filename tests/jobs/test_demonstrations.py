@@ -22,6 +22,8 @@ from poise.learn import Until, load_policy
 from poise.nets import Composer
 from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.config import WIDE
+from poise.recipes.perpetual.recovery import standing
+from poise.recipes.perpetual.shapes import BodyShapes
 from toy_human import swing
 from toy_library import PLAIN, Scripted, library, lively, tiny
 
@@ -52,6 +54,21 @@ def test_ways_are_clips_of_the_stages_that_recover() -> None:
     assert drawn[own:].sum() == pytest.approx(made.config.recovering.demonstration_share)
     assert drawn[0] == pytest.approx(3 * float(drawn[1])) and not drawn[2:own].any()
     assert {r.when for r in staged(made, COMPOSER).task.rewards} == {"always"}
+
+
+def test_bodies_of_several_shapes_recover_on_the_first() -> None:
+    config = replace(tiny(recovery=True, **PLAIN), shapes=BodyShapes(count=3, per_clip=2))
+    made = build(lively(), config)
+    assert made.recovery_clips is not None and made.task.recovery is None
+    both = practised(made, COMPOSER).reference
+    own = len(made.library)
+    assert set(both.body[:own].tolist()) == {0, 1, 2} and not both.body[own:].any()
+    assert int(made.reference.body[standing(made.reference)[0]]) == 0
+    ready = staged(made, Stage("single", 2, mixed=True))
+    trainer = ready.trainer(threads=1)
+    card = try_recovery(ready, trainer.policy(), 4, threads=1)
+    trainer.env.close()
+    assert {row.trials for row in card.rows} == {4}
 
 
 def test_a_library_without_getting_up_comes_back_to_a_point() -> None:

@@ -50,12 +50,14 @@ def walking_clips(reference: Reference) -> Tensor:
 
 def standing(reference: Reference) -> tuple[int, int]:
     """(clip, frame) of the reference of trials: the last frame of the clip that ends upright most
-    quietly, on which it then goes on standing. Clips that go round and round end nowhere."""
+    quietly, on which it then goes on standing. Clips that go round and round end nowhere, and of several
+    bodies it is the first."""
     pos, vel = (getattr(reference.pose, k).cpu() for k in ("pos", "linvel"))
     last = (reference.start + reference.length - 1).cpu()
     upright = pos[last, 0, 2] / _standing(pos[:, 0, 2])
     restless = vel[last].norm(dim=-1).mean(-1)
     unfit = (upright < HEIGHT[0]) | (upright > HEIGHT[1]) | reference.cyclic.cpu()
+    unfit |= reference.body.cpu() != 0
     clip = int((restless + 1e3 * unfit).argmin())
     return clip, int(reference.length[clip]) - 1
 
@@ -66,7 +68,7 @@ def _standing(heights: Tensor) -> Tensor:
 
 
 def known_recovery_clips(config: Perpetual, reference: Reference) -> RecoveryClips | None:
-    """The recovery clips of a library; None where recovery is not learned by it."""
-    if not (config.recovery and config.recovering.demonstrations) or config.shapes.several:
+    """The recovery clips of a library on its own body; None where recovery is not learned by it."""
+    if not (config.recovery and config.recovering.demonstrations) or config.shapes.own:
         return None
     return find_recovery_clips(reference, standing(reference), walking_clips(reference))

@@ -185,9 +185,10 @@ def build(library: Clips, config: Perpetual | None = None, table: BodyTable | No
     if recovery_clips is None:
         # Without recovery clips a point goal is practised by a primitive of its own.
         config = replace(config, recovering=replace(config.recovering, primitive="own"))
-    own = task(config, humanoid, guided=recovery_clips is not None)
+    guided = recovery_clips is not None
+    own = task(config, humanoid, guided)
     built = Imitation(library, humanoid, reference, report, config, own, recovery_clips)
-    return shaped(built, config.shapes, lambda body: task(config, body))
+    return shaped(built, config.shapes, lambda body: task(config, body, guided))
 
 
 #: Expected figures: see `benchmarks/perpetual.md`.
