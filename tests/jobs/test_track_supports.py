@@ -37,6 +37,16 @@ def test_a_motion_that_sits_is_tracked_on_its_seat(tracker: Tracker, tmp_path: P
     assert abs(float(r.pos[0, 110, 0, 2] - r.ref_pos[0, 110, 0, 2])) < 0.1
     assert done.card.tracked == 1.0
     assert done.card.needs == ()
+    # What begins and ends at rest was borne by its weight on average (impulse = change of momentum).
+    touched = done.evaluation.recordings[0].contacts
+    weight = 9.81 * tracker.humanoid.mass
+    assert len(touched) == len(done.evaluation.recordings[0].qpos)
+    borne = float(np.mean([rows[:, 5].sum() for rows in touched]))
+    assert borne == pytest.approx(weight, rel=0.1)
+    # While it sits, more than a third of it stands on the seat.
+    seated = touched[100]
+    on_seat = seated[np.abs(seated[:, 2] - seat.top) < 0.05]
+    assert on_seat[:, 5].sum() > weight / 3
     paths = write(done, tmp_path).paths
     assert read_supports(paths["supports"]) == done.supports
     assert "seat1" in paths["scene"].read_bytes().decode("latin-1")
@@ -45,6 +55,7 @@ def test_a_motion_that_sits_is_tracked_on_its_seat(tracker: Tracker, tmp_path: P
     assert np.abs(again.world()[0][:, 0] - done.clip.world()[0][:, 0]).max() < 1e-4
     page = paths["report"].read_text(encoding="utf-8")
     assert '"things":[{"kind":"box"' in page.replace(" ", "").replace("\n", "")
+    assert '"pushes":{"rows":' in page.replace(" ", "")
     score = json.loads(paths["score"].read_text())
     assert score["tracked"] == 1.0
 

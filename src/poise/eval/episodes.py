@@ -76,12 +76,14 @@ def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observer
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One episode kept whole, for export: `qpos (T, 7 + n)`; `row` is its row in the rollouts."""
+    """One episode kept whole, for export: `qpos (T, 7 + n)`; `row` is its row in the rollouts;
+    `contacts` are what `ContactForces` saw in each frame, () where it did not look."""
 
     clip: int
     start: int
     qpos: np.ndarray
     row: int
+    contacts: tuple[np.ndarray, ...] = ()
 
 
 def start_frames(reference: Reference, most_frames: int = 40_000) -> tuple[Tensor, Tensor]:

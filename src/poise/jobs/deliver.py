@@ -201,6 +201,7 @@ def make_report(
             "seed": str(card.seed),
             "version": __version__,
         },
+        pushes=recording.contacts if len(recording.contacts) == frames else (),
         things=tuple(
             Shape(0, "box", (p.size[0] / 2, p.size[1] / 2, p.size[2] / 2), p.pos, p.quat)
             for p in imitation.props

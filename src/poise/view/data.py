@@ -78,6 +78,8 @@ class Report:
         notes: sentences on what was guessed, repaired or limited.
         facts: name to text.
         things: what stands in the world, such as a chair; their `body` counts for nothing.
+        pushes: of each frame `(K, 6)`, points in the world, m, and the forces that touch the character
+            there, N; () where none were recorded.
     """
 
     title: str
@@ -97,6 +99,7 @@ class Report:
     notes: tuple[str, ...]
     facts: dict[str, str]
     things: tuple[Shape, ...] = ()
+    pushes: tuple[np.ndarray, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fps) and self.fps > 0):
@@ -215,6 +218,16 @@ def encode_track(track: Track) -> dict[str, Any]:
     }
 
 
+def _pushes(frames: tuple[np.ndarray, ...]) -> dict[str, str] | None:
+    """All rows of all frames, and before which row each frame begins; None without any."""
+    rows = np.concatenate(frames) if frames else np.zeros((0, 6))
+    if not len(rows):
+        return None
+    first = np.cumsum([0, *(len(f) for f in frames)])
+    rows = np.nan_to_num(rows.astype(np.float64))
+    return {"rows": _b64(rows, "<f4"), "first": _b64(first.astype(np.float64), "<f4")}
+
+
 def payload(report: Report) -> dict[str, Any]:
     """The replay's data: shapes, both tracks and the per-frame arrays, ready for `safe_json`."""
 
@@ -235,6 +248,7 @@ def payload(report: Report) -> dict[str, Any]:
         "things": [
             {"kind": s.kind, "size": s.size, "pos": s.pos, "quat": s.quat} for s in report.things
         ],
+        "pushes": _pushes(report.pushes),
         "feet": foot_bodies(report.bodies),
         "weight": body_weight(report),
         "reference": encode_track(report.reference),

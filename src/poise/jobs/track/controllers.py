@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.env import Acts, ImitationEnv
 from poise.errors import PoiseError
 from poise.eval import run_episodes
+from poise.eval.contact_forces import ContactForces
 from poise.eval.episodes import Recording
 from poise.eval.rolloutset import Judged, RolloutSet, judge
 from poise.jobs.perpetual.evaluation import evaluate_clips
@@ -159,10 +160,15 @@ def _episode(
         acts.watch(env)
     keeper = Keeper(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
-    told = () if show is None else (Told("looking ahead", int(task.reference.length[0]) - 1, show),)
+    told = [] if show is None else [Told("looking ahead", int(task.reference.length[0]) - 1, show)]
+    # The report shows one character.
+    touched = ContactForces() if count == 1 else None
+    observers = [*told, touched] if touched else told
     rollouts, recordings = run_episodes(
-        lambda _: env, keeper or acts, every, starts, cycles=1, observers=told
+        lambda _: env, keeper or acts, every, starts, cycles=1, observers=observers
     )
+    if touched:
+        recordings[0] = replace(recordings[0], contacts=tuple(touched.frames))
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
     mended = keeper.fallen if keeper is not None else ()

@@ -35,6 +35,7 @@ const Poise = {};
       reference: decodeTrack(data.reference, data.frames, n),
       simulated: decodeTrack(data.simulated, data.frames, n),
       force: floats(data.force),
+      pushes: data.pushes ? { rows: floats(data.pushes.rows), first: floats(data.pushes.first) } : null,
       torque: floats(data.torque),
       error: floats(data.error),
       errorGlobal: floats(data.errorGlobal),

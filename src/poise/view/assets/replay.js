@@ -5,11 +5,12 @@ Poise.replay = (data) => {
   const n = data.bodies.length;
   const host = $("stage");
   const seconds = Math.max(data.frames - 1, 1) / data.fps;
-  const state = { at: 0, playing: true, speed: 1, overlay: false, follow: true, force: true, blend: 1 };
+  const state = { at: 0, playing: true, speed: 1, overlay: false, follow: true, force: true, touch: false, blend: 1 };
   const listeners = [];
   const blank = () => ({ pos: new Float32Array(n * 3), quat: new Float32Array(n * 4) });
   const poses = { reference: blank(), simulated: blank() };
   const scale = Poise.arrowScale(data.forceNorm);
+  const pushScale = Math.max(100, Math.round((data.weight || 700) / 100) * 100);
   const target = [0, 0, 0];
   let fresh = true;
 
@@ -51,9 +52,14 @@ Poise.replay = (data) => {
       arrow = [0, 1, 2].map((k) => data.force[3 * t + k] / scale);
       if (!arrow.every(Number.isFinite)) arrow = null;
     }
+    // Of each contact its point and its force, in metres of an arrow.
+    const pushes = [];
+    if (data.pushes && state.touch)
+      for (let k = data.pushes.first[t]; k < data.pushes.first[t + 1]; k++)
+        pushes.push(Array.from(data.pushes.rows.subarray(6 * k, 6 * k + 6), (v, i) => (i < 3 ? v : v / pushScale)));
     const lit = [0, 1].map((k) => Boolean(data.contacts && data.contacts[2 * t + k]));
     const shift = [[-half * sx, -half * sy], [half * sx, half * sy]];
-    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, lit };
+    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, lit };
   }
 
   function tag(id, pose, shift) {
@@ -141,6 +147,8 @@ Poise.replay = (data) => {
   $("over").addEventListener("click", () => overlay(true));
   toggle("follow", "follow", () => { fresh = true; });
   toggle("force", "force");
+  toggle("touch", "touch", () => { $("push-key").hidden = !state.touch; });
+  $("touch").hidden = !data.pushes;
   $("force").disabled = !data.force;
   $("play").addEventListener("click", () => play(!state.playing));
   $("speed").addEventListener("input", (e) => {
@@ -168,7 +176,12 @@ Poise.replay = (data) => {
   if (data.forceNorm) text("arrow-scale", `1 m = ${scale} N`);
   $("arrow-key").hidden = !data.force;
   $("foot-key").hidden = !data.contacts;
-  // `#2d` and `#overlaid` after the file's name choose how the page opens.
+  $("push-key").hidden = !state.touch;
+  text("push-scale", `${pushScale} N`);
+  // `#2d`, `#overlaid`, `#contacts` and `#at=2.5` (s) after the file's name choose how the page opens.
+  if (location.hash.includes("contacts") && data.pushes) $("touch").click();
+  const start = /at=([0-9.]+)/.exec(location.hash);
+  if (start) seek(Math.round(Number(start[1]) * data.fps), true);
   if (location.hash.includes("overlaid")) {
     overlay(true);
     state.blend = 0;
@@ -176,7 +189,7 @@ Poise.replay = (data) => {
   Poise.strip($("strip"), data, seek);
   fit();
   new ResizeObserver(fit).observe(host);
-  play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
+  play(!start && !matchMedia("(prefers-reduced-motion: reduce)").matches);
   requestAnimationFrame(tick);
   return { kind: stage.kind, seek, onFrame: (f) => listeners.push(f), fps: data.fps };
 };

@@ -154,17 +154,17 @@ Poise.stage2D = (host, data, extent) => {
     stamp(alpha, "none");
   }
 
-  function force(from, vector) {
+  function force(from, vector, color = colors.help) {
     const a = project(from);
     const b = project([from[0] + vector[0], from[1] + vector[1], from[2] + vector[2]]);
     if (!a || !b) return;
     const long = Math.hypot(b[0] - a[0], b[1] - a[1]);
     if (long < 2) return;
-    line(g, [a, b], colors.help, 4);
+    line(g, [a, b], color, 4);
     const [dx, dy] = [(b[0] - a[0]) / long, (b[1] - a[1]) / long];
     const h = Math.min(11, long * 0.6);
     line(g, [[b[0] - h * (dx - 0.6 * dy), b[1] - h * (dy + 0.6 * dx)], b,
-      [b[0] - h * (dx + 0.6 * dy), b[1] - h * (dy - 0.6 * dx)]], colors.help, 4);
+      [b[0] - h * (dx + 0.6 * dy), b[1] - h * (dy - 0.6 * dx)]], color, 4);
   }
 
   const stage = {
@@ -172,7 +172,7 @@ Poise.stage2D = (host, data, extent) => {
     canvas,
     theme() {
       const names = { bg: "--stage", ink: "--ink", ref: "--ref", refRim: "--ref-rim", sim: "--sim",
-        simRim: "--sim-rim", help: "--help", thing: "--thing", lit: "--contact" };
+        simRim: "--sim-rim", help: "--help", thing: "--thing", push: "--push", lit: "--contact" };
       for (const key in names) colors[key] = Poise.css(names[key]);
     },
     resize(w, h) {
@@ -197,6 +197,10 @@ Poise.stage2D = (host, data, extent) => {
         things(frame.shift[0]);
       character(frame.simulated, frame.shift[1], colors.sim, colors.simRim, 1, frame.lit);
       character(frame.reference, frame.shift[0], colors.ref, colors.refRim, 0.3 + 0.3 * frame.blend, [false, false]);
+      for (const p of frame.pushes) {
+        const [dx, dy] = frame.shift[1];
+        force([p[0] + dx, p[1] + dy, p[2]], p.slice(3), colors.push);
+      }
       if (frame.arrow) {
         const [p, d] = [frame.simulated.pos, frame.shift[1]];
         force([p[0] + d[0], p[1] + d[1], p[2]], frame.arrow);

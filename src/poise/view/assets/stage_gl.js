@@ -119,6 +119,15 @@ Poise.stageGL = (host, data, extent) => {
   const arrow = new T.Group().add(shaft, tip);
   shaft.renderOrder = tip.renderOrder = 5;
   scene.add(arrow);
+  const pushMaterial = new T.MeshBasicMaterial({ depthTest: false, transparent: true });
+  const pushed = Array.from({ length: 16 }, () => {
+    const one = new T.Mesh(new T.CylinderGeometry(0.01, 0.01, 1, 10).translate(0, 0.5, 0), pushMaterial);
+    const head = new T.Mesh(new T.ConeGeometry(0.03, 0.08, 14).translate(0, 0.04, 0), pushMaterial);
+    const group = new T.Group().add(one, head);
+    one.renderOrder = head.renderOrder = 5;
+    scene.add(group);
+    return { group, one, head };
+  });
   const [up, along] = [new T.Vector3(0, 1, 0), new T.Vector3()];
 
   function pose(who, state, dx, dy) {
@@ -145,6 +154,7 @@ Poise.stageGL = (host, data, extent) => {
       ghost.uniforms.tint.value.set(Poise.css("--ref"));
       ghost.uniforms.rim.value.set(Poise.css("--ref-rim"));
       arrowMaterial.color.set(Poise.css("--help"));
+      pushMaterial.color.set(Poise.css("--push"));
       wood.color.set(Poise.css("--thing"));
       colors.sim = new T.Color(Poise.css("--sim"));
       colors.lit = new T.Color(Poise.css("--contact"));
@@ -196,6 +206,17 @@ Poise.stageGL = (host, data, extent) => {
         tip.position.y = Math.max(length - 0.11 * head, 0);
         tip.scale.setScalar(head);
       }
+      pushed.forEach(({ group, one, head }, k) => {
+        const row = frame.pushes[k];
+        const length = row ? Math.hypot(row[3], row[4], row[5]) : 0;
+        group.visible = length > 0.01;
+        if (!group.visible) return;
+        along.set(row[3] / length, row[4] / length, row[5] / length);
+        group.position.set(row[0] + sx, row[1] + sy, row[2]);
+        group.quaternion.setFromUnitVectors(up, along);
+        one.scale.set(1, Math.max(length - 0.07, 1e-3), 1);
+        head.position.y = Math.max(length - 0.08, 0);
+      });
       sun.target.position.set(controls.target.x, controls.target.y, 0);
       sun.position.set(controls.target.x + 2.2, controls.target.y - 2.8, 6.5);
       grid.uniforms.center.value.copy(controls.target);
