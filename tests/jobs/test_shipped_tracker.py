@@ -85,9 +85,12 @@ def test_a_chair_that_is_not_there_is_named(tracker: Tracker) -> None:
         for side in ("Left", "Right"):
             rot[:, names.index(side + joint)] = turn("Y", torch.tensor(sign * angle)).numpy()
     path[:, 0], path[:, 2] = -0.42 * np.sin(angle), 0.9 - 0.42 * (1 - np.cos(angle))
-    tracked = track(clip.replaced(rot=rot, root_pos=path), tracker, controller="policy")
+    sitting = clip.replaced(rot=rot, root_pos=path)
+    tracked = track(sitting, tracker, controller="policy", supports="none")
     card = tracked.evaluation.card
     assert card.tracked == 0.0
     (need,) = card.needs
     assert need["what"] == "a seat" and 1.0 < need["start_s"] < 2.0 and need["stop_s"] > 3.8
     assert "It needs a seat from 1.4 to 4.0 s." in shortfalls(card)
+    there = track(sitting, tracker, controller="policy")
+    assert [s.kind for s in there.supports] == ["seat"] and there.evaluation.card.needs == ()

@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 from torch import Tensor
 
 from poise.body import BodyTable
@@ -50,6 +49,9 @@ class Asked:
         points, normals: `(K, 3)` m and unit vectors toward the body, each the axis of a cone of four
         edges with `FRICTION`, or `OF_A_WALL`.
         """
+        # It takes a while to import, and few motions need it.
+        from scipy.optimize import nnls
+
         wanted = np.concatenate((self.force[frame], self.torque[frame] / ARM_M)) / self.weight
         if not len(points):
             return float(np.linalg.norm(wanted)), np.zeros((0, 3))
