@@ -111,6 +111,8 @@ def _provide(path: Path, bones: dict[str, str]) -> None:
         toy_run(path)
     elif path.suffix == ".toml":
         path.write_text(to_toml(ResidualForce(seed=1)))
+    elif path.name == "chair.json":
+        path.write_text('{"size": [0.4, 0.4, 0.4], "pos": [0.0, 3.0, 0.2]}')
     elif path.suffix == ".trc":
         _write_trc(path, walk)
     elif path.suffix == ".c3d":
@@ -150,4 +152,4 @@ def test_commands_run(
 
 def _is_input(word: str) -> bool:
     known = (".bvh", ".glb", ".trc", ".c3d", ".toml")
-    return Path(word).suffix in known or word.rstrip("/") in ("clips", "run")
+    return Path(word).suffix in known or word.rstrip("/") in ("clips", "run", "chair.json")
