@@ -71,7 +71,7 @@ def goal_for(kind: str, task: Imitation, env_goal: ClipGoal) -> Goal:
 
 def measured(task: Imitation, kind: str, worlds: int, steps: int) -> float:
     """Seconds a control step of all worlds, the median of `steps`."""
-    backend = make_backend(task.humanoid.model, worlds, "cpu", threads=1)
+    backend = make_backend(task.model, worlds, "cpu", threads=1)
     plain = replace(task.task, auto_reset=False, help=None)
     goal = goal_for(kind, task, goal_of(task.reference, plain, backend, 0, None))
     if isinstance(goal, StreamGoal):

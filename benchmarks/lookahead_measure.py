@@ -41,7 +41,7 @@ def planners(task: Imitation, condition: Condition) -> Imitation:
     """The task as a planner believes it to be."""
     if not condition.of_planner:
         return task
-    model = copy.copy(task.humanoid.model)
+    model = copy.copy(task.model)
     model.body_mass[:] *= condition.mass
     model.body_inertia[:] *= condition.mass
     model.geom_friction[:, 0] *= condition.friction
@@ -49,7 +49,7 @@ def planners(task: Imitation, condition: Condition) -> Imitation:
     model.actuator_biasprm[:, 1] *= condition.gains
     model.dof_damping[:] *= condition.gains
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    return replace(task, humanoid=replace(task.humanoid, model=model))
+    return replace(task, physics=model)
 
 
 class Pushed(CpuBackend):
@@ -130,7 +130,7 @@ def _episode(
     backend = None
     if condition.push_n:
         torso = humanoid.rows_of("spine")[-1] + 1
-        backend = Pushed(humanoid.model, torso, condition.push_n, seed)
+        backend = Pushed(task.model, torso, condition.push_n, seed)
     env = task.env(1, None, False, 1, help_scale=0.0, guard=False, backend=backend)
     ahead = None
     if controller == "lookahead":

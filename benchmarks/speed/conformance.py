@@ -41,9 +41,9 @@ def bench_conformance(
         until: `time.monotonic()` after which no step begins.
         cone: "pyramidal" or "elliptic"; the edges of MuJoCo Warp's pyramids differ, see docs/gpu.md.
     """
-    model = copy.copy(imitation.humanoid.model)
+    model = copy.copy(imitation.model)
     model.opt.cone = int(getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}"))
-    imitation = replace(imitation, humanoid=replace(imitation.humanoid, model=model))
+    imitation = replace(imitation, physics=model)
     cpu = imitation.env(num_envs, 0, False, guard=False)
     warp = imitation.env(
         seed=0, auto_reset=False, guard=False, backend=WarpBackend(model, num_envs, device)

@@ -85,7 +85,7 @@ def bench_gpu(
     sim = imitation.config.sim
 
     def make() -> tuple[ImitationEnv, WarpBackend]:
-        backend = WarpBackend(imitation.humanoid.model, num_envs, device)
+        backend = WarpBackend(imitation.model, num_envs, device)
         return imitation.env(seed=0, guard=False, backend=backend), backend
 
     env, backend = make()

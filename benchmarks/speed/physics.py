@@ -59,7 +59,7 @@ def _servos(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]
 
 def _stable(imitation: Imitation, scale: float) -> Callable[[int], ImitationEnv]:
     def make(n: int) -> ImitationEnv:
-        backend = StablePDBackend(imitation.humanoid.model, n)
+        backend = StablePDBackend(imitation.model, n)
         return imitation.env(None, 0, False, help_scale=scale, guard=False, backend=backend)
 
     return make

@@ -13,7 +13,7 @@ import torch
 from poise.body import BodyConfig, Humanoid
 from poise.kin import Kinematics, fit_ground, fit_humanoid, lowest_height
 from poise.motion import Clip, Skeleton
-from poise.sim import SimConfig
+from poise.sim import SimConfig, alone
 from speed.stance import Stance, polygon_margin, relaxed_stance
 
 #: A fall: the centre of mass below this share of its height, or anything but the feet on the floor.
@@ -56,8 +56,7 @@ def stand(
 ) -> Standing:
     """Holds a stance by servos with its angles as targets: no feedback on the root, no other force."""
     spec = config or SimConfig()
-    model = humanoid.model
-    spec.apply(model)
+    model = alone(humanoid, spec)
     data = mujoco.MjData(model)
     data.qpos[:], data.ctrl[:] = stance.qpos, stance.qpos[7:]
     mujoco.mj_forward(model, data)

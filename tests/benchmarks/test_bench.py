@@ -97,7 +97,7 @@ def test_a_clock_leaves_no_trace():
 
 def test_stable_pd_moves_like_servos_with_damped_joints(imitation):
     fine = build(swing(), ResidualForce(sim=replace(imitation.config.sim, rate_hz=450.0)))
-    model, reference = fine.humanoid.model, fine.reference
+    model, reference = fine.model, fine.reference
     model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
     paper = StablePDBackend(model, 2, 1)
     inertia = np.zeros((model.nv, model.nv))

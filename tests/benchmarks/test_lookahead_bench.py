@@ -44,8 +44,8 @@ def imitation() -> Imitation:
 
 
 def test_a_planner_that_is_wrong_leaves_the_world_as_it_is(imitation: Imitation) -> None:
-    own = imitation.humanoid.model
-    wrong = planners(imitation, Condition(mass=1.1, friction=0.7, gains=0.9)).humanoid.model
+    own = imitation.model
+    wrong = planners(imitation, Condition(mass=1.1, friction=0.7, gains=0.9)).model
     assert wrong.body_mass.sum() == pytest.approx(1.1 * own.body_mass.sum())
     assert wrong.body_subtreemass[1] == pytest.approx(1.1 * own.body_subtreemass[1])
     assert wrong.geom_friction[0, 0] == pytest.approx(0.7 * own.geom_friction[0, 0])
@@ -57,7 +57,7 @@ def test_a_planner_that_is_wrong_leaves_the_world_as_it_is(imitation: Imitation)
 
 
 def test_pushes_come_when_they_are_said_to(imitation: Imitation) -> None:
-    worlds = Pushed(imitation.humanoid.model, 1, 150.0, 3)
+    worlds = Pushed(imitation.model, 1, 150.0, 3)
     felt = []
     for _ in range(FIRST + EVERY + 5):
         worlds.drive.clear()

@@ -150,7 +150,7 @@ def test_a_lazy_pose_makes_each_field_once_and_only_when_asked():
 def test_recorded_terms_give_what_the_plain_ones_give(make_task):
     task = make_task(*CLIPS, num_envs=20, horizon=9)
     fused, plain = (
-        ImitationEnv(task.reference, CpuBackend(task.humanoid.model, 20, 1), task.task, 2, 5, fused=on)
+        ImitationEnv(task.reference, CpuBackend(task.model, 20, 1), task.task, 2, 5, fused=on)
         for on in (True, False)
     )
     torch.testing.assert_close(fused.reset(), plain.reset())
@@ -168,7 +168,7 @@ def test_recorded_terms_give_what_the_plain_ones_give(make_task):
 def test_a_task_may_have_observations_alone(make_task):
     task = make_task()
     bare = replace(task.task, rewards=(), dones=())
-    env = ImitationEnv(task.reference, CpuBackend(task.humanoid.model, 3, 1), bare, 2)
+    env = ImitationEnv(task.reference, CpuBackend(task.model, 3, 1), bare, 2)
     env.reset()
     step = env.step(actions(env, 0))
     assert step.obs.shape == (3, env.num_obs) and not step.reward.any() and not step.terminated.any()
@@ -179,7 +179,7 @@ def test_a_task_may_have_observations_alone(make_task):
 @pytest.mark.parametrize("worlds", [3, MANY])
 def test_what_a_step_gives_may_be_learned_from_with_gradients(make_task, worlds):
     task = make_task(num_envs=worlds)
-    env = ImitationEnv(task.reference, CpuBackend(task.humanoid.model, worlds, 1), task.task, 2)
+    env = ImitationEnv(task.reference, CpuBackend(task.model, worlds, 1), task.task, 2)
     env.reset()
     for t in range(2):
         step = env.step(actions(env, t))
@@ -207,7 +207,7 @@ def test_a_term_that_looks_at_values_is_never_frozen(make_task):
 
     task = make_task()
     terms = replace(task.task, rewards=(RewardTerm("fickle", fickle, 1.0),), auto_reset=False)
-    env = ImitationEnv(task.reference, CpuBackend(task.humanoid.model, 1, 1), terms, 2)
+    env = ImitationEnv(task.reference, CpuBackend(task.model, 1, 1), terms, 2)
     start = torch.zeros(1, dtype=torch.long)
     env.reset_to(start, start)
     rewards = [float(env.step(torch.zeros(1, env.num_actions)).reward) for _ in range(25)]

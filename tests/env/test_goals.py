@@ -27,7 +27,7 @@ def task() -> Imitation:
 
 
 def env_of(task: Imitation, goal: Goal) -> ImitationEnv:
-    backend = make_backend(task.humanoid.model, goal.num_envs, "cpu", threads=1)
+    backend = make_backend(task.model, goal.num_envs, "cpu", threads=1)
     plain = replace(task.task, auto_reset=False, help=None)
     return ImitationEnv(goal, backend, plain, task.config.sim.substeps)
 

@@ -31,7 +31,7 @@ def test_the_scale_multiplies_the_limits_on_both_paths(make_env):
 def test_without_help_the_drive_is_that_of_help_scaled_to_nothing(make_env):
     """The short way taken without help moves the characters as the long one does, to the last digit."""
     short, long = make_env(2), make_env(2)
-    long._actuation.functions[False] = long._actuation.with_help
+    long.controls.actuation.functions[False] = long.controls.actuation.with_help
     for env in (short, long):
         env.help.set(0.0)
         env.reset_to(torch.zeros(2, dtype=torch.long), torch.full((2,), 3))

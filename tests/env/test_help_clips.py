@@ -141,7 +141,7 @@ def test_worlds_are_helped_by_what_their_clip_has_left(task: Imitation, fused: b
     torch.testing.assert_close(swapped[:2], full[:2] * torch.tensor([0.0, 0.5]))
     env.help.set(0.25)
     torch.testing.assert_close(pushed(env, [0, 1, 2, 1]), full / 4)
-    assert sorted(env._actuation.functions) == [True]
+    assert sorted(env.controls.actuation.functions) == [True]
     env.help.set(0.0)
     assert float(pushed(env, [0, 1, 2, 1]).max()) == 0.0
     env.close()

@@ -109,7 +109,9 @@ def test_one_world_becomes_many_and_the_others_stay() -> None:
     found = played(many, action.expand(STEPS, 6, -1))
     for a, b in zip(expected, found, strict=True):
         if len(a) == 1 and len(b) == 6:
-            assert all(torch.equal(a[0], b[i]) for i in rows.tolist())
+            # The copies are alike to the bit; one world and six are not vectorised alike everywhere.
+            assert all(torch.equal(b[1], b[i]) for i in rows.tolist())
+            torch.testing.assert_close(a[0], b[1], rtol=1e-4, atol=1e-4)
     assert obs.shape == (6, many.num_obs)
     many.restore(before, torch.tensor([0, 5]))
     again = many.snapshot(torch.tensor([0, 5]))

@@ -124,9 +124,9 @@ def test_what_cannot_be_is_refused(task, make_task):
 
 def test_recordings_and_halves_are_the_plain_terms(task):
     """Fused, cut into two halves, and one by one: the same numbers, with torques and a style."""
-    backend = make_backend(task.humanoid.model, MANY, "cpu", threads=1)
+    backend = make_backend(task.model, MANY, "cpu", threads=1)
     fused = ImitationEnv(task.reference, backend, task.task, task.config.sim.substeps, 5)
-    backend = make_backend(task.humanoid.model, MANY, "cpu", threads=1)
+    backend = make_backend(task.model, MANY, "cpu", threads=1)
     plain = ImitationEnv(task.reference, backend, task.task, task.config.sim.substeps, 5, fused=False)
     assert torch.equal(fused.reset(), plain.reset())
     for t in range(5):
@@ -141,7 +141,7 @@ def test_recordings_and_halves_are_the_plain_terms(task):
 
 
 def test_torques_are_those_of_the_servos_and_the_damping(task):
-    backend, model = make_backend(task.humanoid.model, 2, "cpu", threads=1), task.humanoid.model
+    backend, model = make_backend(task.model, 2, "cpu", threads=1), task.humanoid.model
     energy = (phc_reward.energy_term(1.0, exempt=0),)
     env = ImitationEnv(task.reference, backend, replace(task.task, rewards=energy, auto_reset=False), 1)
     env.reset_to(torch.tensor([0, 1]), torch.tensor([3, 5]))

@@ -27,7 +27,7 @@ ELSEWHERE = torch.device("meta")
 
 def on_warp(task, auto_reset: bool = True) -> ImitationEnv:
     """The same environment as `task.env`, its physics by mujoco-warp."""
-    backend = WarpBackend(task.humanoid.model, N, WARP_DEVICE)
+    backend = WarpBackend(task.model, N, WARP_DEVICE)
     settings = replace(task.task, auto_reset=auto_reset)
     return ImitationEnv(
         task.reference, backend, settings, task.config.sim.substeps, guard=NanGuard(backend)
@@ -145,7 +145,7 @@ def test_no_step_mixes_devices(make_task, settings):
     task = make_task(swing(), **settings)
     quiet = replace(task.task, auto_reset=False)
     with FakeTensorMode(allow_non_fake_inputs=True):
-        env = ImitationEnv(task.reference, FakeBackend(task.humanoid.model), quiet, 2)
+        env = ImitationEnv(task.reference, FakeBackend(task.model), quiet, 2)
         out = env.step(torch.zeros(N, env.num_actions, device=ELSEWHERE))
         for value in (out.obs, out.reward, out.terminated, out.truncated, env.pose().linvel):
             assert value.device == env.device
@@ -160,7 +160,7 @@ def test_phcs_terms_mix_no_devices_either(make_phc):
     task = make_phc(swing())
     quiet = replace(task.task, auto_reset=False)
     with FakeTensorMode(allow_non_fake_inputs=True):
-        env = ImitationEnv(task.reference, FakeBackend(task.humanoid.model), quiet, 2)
+        env = ImitationEnv(task.reference, FakeBackend(task.model), quiet, 2)
         out = env.step(torch.zeros(N, env.num_actions, device=ELSEWHERE))
         rows = torch.arange(5, device=ELSEWHERE)
         seen = env._clip_features._of(rows)

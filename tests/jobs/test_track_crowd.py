@@ -16,7 +16,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
 from poise.plan import LookaheadConfig
-from poise.sim import CpuBackend
+from poise.sim import CpuBackend, alone
 from toy_human import swing
 from toy_policy import toy_run, walk
 
@@ -35,7 +35,8 @@ def test_places() -> None:
 
 
 def test_a_model_of_copies(tracker: Tracker) -> None:
-    single, sim = tracker.humanoid.model, tracker.config.sim
+    sim = tracker.config.sim
+    single = alone(tracker.humanoid, sim)
     rows = crowd(tracker.humanoid, sim, 3)
     model = rows.get_model(0)
     assert model.nq == 3 * single.nq and model.nexclude == 3 * single.nexclude
@@ -54,18 +55,18 @@ def test_its_state_looks_like_that_of_worlds(tracker: Tracker) -> None:
     n = torch.arange(3)
     qpos, qvel = imitation.reference.coordinates(n, 4 * n)
     rows = crowd(tracker.humanoid, tracker.config.sim, 3)
-    alone = CpuBackend(tracker.humanoid.model, 3, threads=1)
+    apart = CpuBackend(alone(tracker.humanoid), 3, threads=1)
     try:
-        for backend in (rows, alone):
+        for backend in (rows, apart):
             backend.state.bind(("qfrc_damper",))
             backend.write(None, qpos, qvel)
             backend.drive.clear()
             backend.drive.ctrl.add_(qpos[:, 7:] + 0.1)
             backend.step(4)
         for name in ("qpos", "qvel", "qfrc_damper"):
-            assert torch.allclose(rows.state[name], alone.state[name], atol=1e-7), name
+            assert torch.allclose(rows.state[name], apart.state[name], atol=1e-7), name
         for name in ("xpos", "xquat", "xipos", "subtree_com", "cvel"):
-            a, b = rows.state[name][:, 1:], alone.state[name][:, 1:]
+            a, b = rows.state[name][:, 1:], apart.state[name][:, 1:]
             assert torch.allclose(a, b, atol=1e-7), name
         before = rows.snapshot()
         rows.write(torch.tensor([1]), qpos[1:2], qvel[1:2])
@@ -77,7 +78,7 @@ def test_its_state_looks_like_that_of_worlds(tracker: Tracker) -> None:
             rows.state.bind(("geom_xpos",))
     finally:
         rows.close()
-        alone.close()
+        apart.close()
 
 
 def test_each_tracks_as_if_alone(tracker: Tracker) -> None:

@@ -9,7 +9,7 @@ import torch
 
 from poise.body import generate_table, make_humanoid
 from poise.plan.lqr import driven, linearise
-from poise.sim import CpuBackend, SimConfig, difference, displaced
+from poise.sim import CpuBackend, alone, difference, displaced
 from toy_human import human
 
 UNIT = torch.tensor([100.0] * 3 + [30.0] * 3, dtype=torch.float64)
@@ -17,9 +17,7 @@ UNIT = torch.tensor([100.0] * 3 + [30.0] * 3, dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    model = make_humanoid(human(), generate_table(human())).model
-    SimConfig().apply(model)
-    return model
+    return alone(make_humanoid(human(), generate_table(human())))
 
 
 def states(model: mujoco.MjModel, count: int, height: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -188,7 +188,7 @@ def test_a_stream_repeats_its_last_frame() -> None:
     task = built(window=(2, 4))
     frames, stream = task.reference.qpos[:6], StreamGoal(task.humanoid, task.config.sim.control_hz)
     stream.push(frames[0])
-    backend = make_backend(task.humanoid.model, 1)
+    backend = make_backend(task.model, 1)
     own = replace(task.task, auto_reset=False, help_by="all")
     env = ImitationEnv(stream, backend, own, task.config.sim.substeps)
     env.reset()

@@ -79,7 +79,7 @@ def test_methods_and_the_papers_own_setting():
     faithful = build(swing(), config)
     assert names(faithful.task.dones) == ["root_too_low"] and faithful.task.pd.mode == "absolute"
     assert "target_bodies" not in names(faithful.task.obs)
-    assert faithful.humanoid.model.opt.timestep == pytest.approx(1 / 450)
+    assert faithful.model.opt.timestep == pytest.approx(1 / 450)
     env = faithful.env(2)
     assert torch.isfinite(env.step(torch.zeros(2, env.num_actions)).obs).all()
     env.close()

@@ -24,6 +24,7 @@ from poise.sim import (
     SimConfig,
     Steps,
     Touch,
+    alone,
 )
 from poise.sim.props import Ball, Box, Carrier, Door, Lift, Mesh
 
@@ -56,13 +57,17 @@ def run(sim: SceneSim, seconds: float) -> None:
     sim.step(round(seconds * sim.scene.scene.sim.rate_hz))
 
 
-def test_a_scene_of_one_character_is_its_model(humanoid: Humanoid) -> None:
-    made = Scene((Character(humanoid),)).compile().model
-    plain = humanoid.model
-    for name in dir(plain):
-        value = getattr(plain, name)
-        if isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(value, getattr(made, name), err_msg=name)
+def test_a_scene_of_one_character_is_its_body_on_a_floor(humanoid: Humanoid) -> None:
+    """Compiling it leaves the body as it is, and what a second body is simulated with is its own."""
+    before = humanoid.model.opt.timestep
+    made, fine = alone(humanoid), alone(humanoid, SimConfig(rate_hz=450.0, integrator="euler"))
+    assert humanoid.model.opt.timestep == before and "floor" not in {
+        humanoid.model.geom(i).name for i in range(humanoid.model.ngeom)
+    }
+    assert (made.opt.timestep, fine.opt.timestep) == (1 / 60, 1 / 450)
+    assert made.ngeom == humanoid.model.ngeom + 1 and made.geom(0).name == "floor"
+    for name in ("body_mass", "body_pos", "jnt_range", "dof_damping", "actuator_gainprm"):
+        np.testing.assert_array_equal(getattr(humanoid.model, name), getattr(made, name), err_msg=name)
 
 
 @pytest.mark.parametrize("worlds", [1, 4])
@@ -76,10 +81,10 @@ def test_other_things_before_a_character_change_nothing(humanoid: Humanoid, worl
         Character(humanoid, "y"),
     )
     scene = SceneSim(Scene(things, sim=sim), worlds, threads=1)
-    alone = CpuBackend(Scene((Character(humanoid),), sim=sim).compile().model, worlds, 1)
+    single = CpuBackend(alone(humanoid, sim), worlds, 1)
     rows, other = scene.characters("y"), scene.characters("x")
     other.write(None, *standing(humanoid, worlds, -3.0))
-    for backend in (rows, alone):
+    for backend in (rows, single):
         backend.state.bind(("qfrc_actuator", "qacc"))
         backend.write(None, *standing(humanoid, worlds))
         backend.drive.clear()
@@ -90,11 +95,11 @@ def test_other_things_before_a_character_change_nothing(humanoid: Humanoid, worl
             backend.step(2)
     for name in rows.state.names:
         if name not in ("qacc_warmstart", "time"):
-            got, want = rows.state[name], alone.state[name]
+            got, want = rows.state[name], single.state[name]
             if got.dim() == 3:
                 got, want = got[:, 1:], want[:, 1:]
             torch.testing.assert_close(got, want, rtol=0, atol=1e-10, msg=name)
-    torch.testing.assert_close(rows.state.qpos, alone.state.qpos, rtol=0, atol=1e-12)
+    torch.testing.assert_close(rows.state.qpos, single.state.qpos, rtol=0, atol=1e-12)
 
 
 def test_two_characters_in_each_of_many_worlds(humanoid: Humanoid) -> None:
@@ -104,14 +109,14 @@ def test_two_characters_in_each_of_many_worlds(humanoid: Humanoid) -> None:
     assert isinstance(rows, CharacterRows) and rows.num_envs == 128
     qpos, qvel = standing(humanoid, 128)
     qpos[1::2, 0] = 3.0
-    alone = CpuBackend(Scene((Character(humanoid),)).compile().model, 128, 1)
-    for backend in (rows, alone):
+    single = CpuBackend(alone(humanoid), 128, 1)
+    for backend in (rows, single):
         backend.write(None, qpos, qvel)
         backend.drive.clear()
         backend.drive.ctrl.add_(qpos[:, 7:] + 0.1)
         backend.step(6)
-    torch.testing.assert_close(rows.state.qpos, alone.state.qpos, rtol=0, atol=1e-9)
-    torch.testing.assert_close(rows.state.xpos[:, 1:], alone.state.xpos[:, 1:], rtol=0, atol=1e-9)
+    torch.testing.assert_close(rows.state.qpos, single.state.qpos, rtol=0, atol=1e-9)
+    torch.testing.assert_close(rows.state.xpos[:, 1:], single.state.xpos[:, 1:], rtol=0, atol=1e-9)
     # A partial reset leaves the others, and what drives them, where they are.
     before, target = rows.snapshot(), rows.drive.ctrl.clone()
     some = torch.tensor([5, 8])
@@ -121,8 +126,8 @@ def test_two_characters_in_each_of_many_worlds(humanoid: Humanoid) -> None:
     assert torch.equal(rows.snapshot(False)[rest], before[rest, : rows.snapshot(False).shape[1]])
     assert torch.equal(rows.drive.ctrl[rest], target[rest])
     rows.restore(before)
-    rows.step(4), alone.step(4)
-    torch.testing.assert_close(rows.state.qpos, alone.state.qpos, rtol=0, atol=1e-9)
+    rows.step(4), single.step(4)
+    torch.testing.assert_close(rows.state.qpos, single.state.qpos, rtol=0, atol=1e-9)
 
 
 def test_characters_that_meet_push_each_other_alike(humanoid: Humanoid) -> None:

@@ -25,8 +25,9 @@ class Humanoid:
 
     Attributes:
         table: the parameters; row i is MuJoCo body `i + 1`.
-        model: compiled, with a floor at z = 0, a free root and one position actuator per hinge (`ctrl`
-            is its target angle in rad).
+        model: compiled alone, with a free root and one position actuator per hinge (`ctrl` is its target
+            angle in rad). It has no floor and MuJoCo's own physics settings: what is simulated is a
+            `sim.Scene`, or `sim.alone(humanoid)`. Nothing changes it.
     """
 
     skeleton: Skeleton
@@ -96,15 +97,11 @@ class Humanoid:
 
 
 def make_spec(table: BodyTable) -> mujoco.MjSpec:
-    """The `MjSpec` of a humanoid on a floor; see `add_humanoid`."""
+    """The `MjSpec` of a humanoid with nothing around it; see `add_humanoid`."""
     spec = mujoco.MjSpec()
     spec.modelname = "poise"
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    floor = spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], condim=3
-    )
-    floor.friction = [table.friction, 0.1, 0.1]
     add_humanoid(spec, table)
     return spec
 

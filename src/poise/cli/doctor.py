@@ -168,10 +168,10 @@ def speed() -> Check:
         import torch
 
         from poise.jobs.open import open_run
-        from poise.sim import CpuBackend, SimConfig
+        from poise.sim import CpuBackend, SimConfig, alone
 
         humanoid = open_run().tracker.humanoid
-        backend = CpuBackend(humanoid.model, _SPEED_ENVS)
+        backend = CpuBackend(alone(humanoid), _SPEED_ENVS)
     except Exception as problem:
         said = f"{type(problem).__name__}: {problem}"
         return Check("physics", "missing", " ".join(said.split())[:120], "install Poise again")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.control import PDTargets, Residual, Wrench
 from poise.env.plugins import Plugin
-from poise.sim import Backend, Drive, NanGuard
+from poise.sim import Backend, Drive
 
 TensorFunction = Callable[..., tuple[Tensor, ...]]
 
@@ -120,23 +120,26 @@ class Actuation:
         force, torque, point = self.functions[helped](*given)
         return None if residual is None else Wrench(force, torque, point, self.bodies)
 
-    def step(self, worlds: Backend | NanGuard, substeps: int) -> None:
-        """One control step of `worlds` with what drives them and the forces of the plug-ins."""
-        drive = self.backend.drive
+    def push(self) -> None:
+        """Adds the forces of plug-ins that hold for the control step."""
         for plugin in self.pushing:
-            plugin.push(drive)
-        if not self.pushing_substeps:
-            worlds.step(substeps)
-            return
-        parts = drive.ctrl, drive.qfrc_applied, drive.xfrc_applied
-        held = [x.clone() for x in parts]
-        for k in range(substeps):
-            if k:
-                for part, value in zip(parts, held, strict=True):
-                    part.copy_(value)
-            for plugin in self.pushing_substeps:
-                plugin.push_substep(drive)
-            worlds.step(1)
+            plugin.push(self.backend.drive)
+
+    def held(self) -> tuple[Tensor, ...]:
+        """What is in the drive, to begin each physics step with."""
+        drive = self.backend.drive
+        return drive.ctrl.clone(), drive.qfrc_applied.clone(), drive.xfrc_applied.clone()
+
+    def push_substep(self, held: tuple[Tensor, ...] | None) -> None:
+        """Adds the forces of plug-ins that are told anew before each physics step to what was `held`;
+        None where that is in the drive already."""
+        drive = self.backend.drive
+        if held is not None:
+            parts = drive.ctrl, drive.qfrc_applied, drive.xfrc_applied
+            for part, value in zip(parts, held, strict=True):
+                part.copy_(value)
+        for plugin in self.pushing_substeps:
+            plugin.push_substep(drive)
 
     def with_help(
         self, action: Tensor, targets: Tensor, rows: Tensor, *state: Tensor

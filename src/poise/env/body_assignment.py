@@ -20,7 +20,7 @@ from poise.env.frame import Observable
 from poise.env.plugins import Plugin
 from poise.env.terms.phc_obs import shape_of
 from poise.errors import PoiseError
-from poise.sim import Backend
+from poise.sim import Backend, alone
 
 
 def differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
@@ -59,7 +59,7 @@ class BodyAssignment(Plugin):
     """
 
     def __init__(self, backend: Backend, humanoids: Sequence[Humanoid]):
-        fields = differing([backend.model, *(h.model for h in humanoids[1:])])
+        fields = differing([backend.model, *(alone(h) for h in humanoids[1:])])
         self._live = {name: backend.expand(name) for name in fields}
         self._values = {
             name: torch.from_numpy(fields[name]).to(live).view(len(humanoids), *live.shape[1:])

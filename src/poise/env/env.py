@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.control import Wrench
 from poise.env import observables
-from poise.env.actuation import Actuation, keep_actions, unkept_actions
+from poise.env.controls import Controls
 from poise.env.frame import FIELDS, Frame, Pose, placed
 from poise.env.goals.goal import Goal
 from poise.env.make import goal_of, plugins_of
@@ -46,7 +46,7 @@ class ImitationEnv:
         age: `(N,)` control steps since the episode began.
         action: `(N, A)` the last one, as it acted.
         given: `(N, A)` the last one, as it was given; the same without `TaskConfig.filter`.
-        wrench: what the residual force was.
+        controls: turn actions into what drives the characters.
         terms, imitation: values of the last step's rewards by name, and the imitation reward `(N,)`.
     """
 
@@ -66,31 +66,22 @@ class ImitationEnv:
         self.goal = goal if isinstance(goal, Goal) else goal_of(goal, task, backend, seed, weights)
         humanoid = self.goal.humanoid
         self.hinges = len(humanoid.hinges)
-        if backend.model.nu != self.hinges:
-            raise PoiseError(
-                f"the model has {backend.model.nu} actuators, the body {self.hinges} hinges"
-            )
         self._limit_n = task.residual.limit_n if task.residual and task.residual.capped else None
-        self.num_actions = self.hinges + (task.residual.dims if task.residual else 0)
         n, here = self.num_envs, self.device
         self.age = torch.zeros(n, dtype=torch.long, device=here)
-        self.action = torch.zeros(n, self.num_actions, device=here)
-        self.given = torch.zeros_like(self.action)
-        # What acted in the step before, and the hinges' torques at the begin of the last one.
-        self._action_before = torch.zeros_like(self.action)
-        self._torque_before = torch.zeros(n, self.hinges, device=here)
-        self.wrench: Wrench | None = None
         self.terms: dict[str, Tensor] = {}
         self.imitation = torch.zeros(n, device=here)
         self.help, self.plugins = plugins_of(task, self.goal, backend, seed)
         # Only plug-ins that change a hook are asked by it.
-        self._holding, self._ticking, self._targeting, self._judging, self._logging, *pushing = (
+        self._holding, self._ticking, self._judging, self._logging = (
             tuple(p for p in self.plugins if getattr(type(p), hook) is not getattr(Plugin, hook))
-            for hook in ("held", "tick", "targets", "judged", "log", "push", "push_substep")
+            for hook in ("held", "tick", "judged", "log")
         )
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        self._actuation = Actuation(backend, task.pd, task.residual, fused, *pushing)
+        self.controls = Controls(task, backend, self.hinges, self.plugins, fused)
+        self.num_actions = self.controls.num_actions
+        self.action, self.given = self.controls.action, self.controls.given
         self._every = torch.arange(n, device=here)
         self._terms = self._make_terms(fused)
         self.goal.aim(None, None)
@@ -107,7 +98,8 @@ class ImitationEnv:
         task, model, here = self.task, self.backend.model, self.device
         named = {**observables.STANDARD, **task.observables}
         held: dict[str, Tensor] = {"action": self.action, "age": self.age}
-        held |= {"action_before": self._action_before, "torque_before": self._torque_before}
+        controls = self.controls
+        held |= {"action_before": controls.before, "torque_before": controls.torque_before}
         for plugin in self.plugins:
             named |= plugin.observables
             held |= plugin.sources()
@@ -220,29 +212,20 @@ class ImitationEnv:
 
     def step(self, actions: Tensor) -> EnvStep:
         """One control step for all worlds; `actions (N, A)`."""
-        if actions.shape != (self.num_envs, self.num_actions):
-            raise PoiseError(
-                f"actions must be ({self.num_envs}, {self.num_actions}), got {tuple(actions.shape)}"
-            )
+        self.drive(actions)
+        self.controls.step(self._guard or self.backend, self.substeps)
+        return self.renew(self.judge())
+
+    def drive(self, actions: Tensor) -> None:
+        """The first part of a step: fills the drive; the physics is then the caller's to step."""
+        goal, by = self.goal, self.task.help_by
+        self._row, self._group = goal.row(), goal.group(by)
+        torques = self._sources.reads("torque_before")
+        self.controls.apply(actions, self.age, goal, self.help, torques)
+
+    def judge(self) -> EnvStep:
+        """The second part of a step: rewards and ends, before any episode begins anew."""
         goal, task = self.goal, self.task
-        self._action_before.copy_(self.action)
-        if self._sources.reads("torque_before"):
-            forces = (self.backend.state[k] for k in ("qfrc_actuator", "qfrc_damper"))
-            self._torque_before.copy_(observables.hinge_torques(*forces))
-        # A copy, since a restart clears its rows and the caller's actions are the caller's.
-        self.given.copy_(actions)
-        self.action.copy_(actions)
-        if task.filter:
-            keep_actions(self.action, self._action_before, self._kept(), self.hinges)
-        row, group = goal.row(), goal.group(task.help_by)
-        targets, rows = goal.targets()
-        if self._targeting and task.pd.mode == "additive":
-            targets, rows = targets[rows], self._every
-            for plugin in self._targeting:
-                targets = plugin.targets(targets)
-        help_left = self.help.at(group)
-        self.wrench = self._actuation.apply(self.action, targets, rows, help_left, self.help.now > 0)
-        self._actuation.step(self._guard or self.backend, self.substeps)
         self.age += 1
         waited = self._held()
         for plugin in self._ticking:
@@ -259,13 +242,18 @@ class ImitationEnv:
         if task.completion_bonus:
             done = terminated & ~failed
             reward = torch.where(done, reward * (1.0 + task.completion_bonus), reward)
-        obs, more = final, {k: v for p in self._logging for k, v in p.log().items()}
-        limit = None if self._limit_n is None else self.help.limit(self._limit_n, group)
+        more = {k: v for p in self._logging for k, v in p.log().items()}
+        limit = None if self._limit_n is None else self.help.limit(self._limit_n, self._group)
         log = StepLog(self.terms, self.imitation, self.wrench, limit, more)
-        if task.auto_reset:
-            ids = (terminated | truncated).nonzero().squeeze(-1)
+        return EnvStep(final, reward, terminated, truncated, final, log, failed)
+
+    def renew(self, step: EnvStep) -> EnvStep:
+        """The last part of a step: new episodes where one ended, and what is seen then."""
+        goal, final, obs = self.goal, step.final_obs, step.obs
+        if self.task.auto_reset:
+            ids = (step.terminated | step.truncated).nonzero().squeeze(-1)
             counted = combined((p.counted() for p in self.plugins), torch.logical_and)
-            ended = Ended(ids, failed, terminated, self.age, goal, row, counted)
+            ended = Ended(ids, step.failed, step.terminated, self.age, goal, self._row, counted)
             for plugin in self.plugins:
                 plugin.count(ended)
             if len(ids):
@@ -275,17 +263,17 @@ class ImitationEnv:
                 obs[ids] = self._terms.observe(fresh)
         if self._watched():
             obs = self._observe()
-            final = final if task.auto_reset else obs
-        return EnvStep(obs, reward, terminated, truncated, final, log, failed)
+            final = final if self.task.auto_reset else obs
+        return step._replace(obs=obs, final_obs=final)
 
     def unfiltered(self, actions: Tensor) -> Tensor:
         """What to give to the next `step` so that `actions (N, A)` act in spite of the task's filter."""
-        kept = self._kept()
-        return unkept_actions(actions, self.action, kept, self.hinges) if self.task.filter else actions
+        return self.controls.unfiltered(actions, self.age)
 
-    def _kept(self) -> Tensor:
-        """`(N, 1)`, the share of the last action that the next one keeps."""
-        return self.task.filter * (self.age > 0).to(self.action).unsqueeze(1)
+    @property
+    def wrench(self) -> Wrench | None:
+        """What the residual force was; None without one."""
+        return self.controls.wrench
 
     def _watched(self) -> bool:
         """Whether the goal has changed by what it sees of the characters."""

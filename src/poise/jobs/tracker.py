@@ -71,7 +71,7 @@ class Tracker:
 
     Attributes:
         policy: acts deterministically on raw observations.
-        humanoid: the body, its model with the physics settings.
+        humanoid: the body.
         example: a clip on the body's skeleton, which tells how it stands.
         config: the settings by which it was trained.
         about: "clips" (names), "stage", "samples", "seconds", "help_n" (what help the training still
@@ -105,7 +105,6 @@ class Tracker:
         """
         table, example = own_body(clip, self.humanoid.table, self.example, self.config.body)
         humanoid = make_humanoid(example.skeleton, table)
-        self.config.sim.apply(humanoid.model)
         return replace(self, humanoid=humanoid, example=example, onto=onto_own(humanoid.table))
 
 
@@ -131,7 +130,6 @@ def policy_of_run(file: RunFile) -> Tracker:
         humanoid, example, names = made.humanoid, made.library.clips[0], made.library.names
         config, known = made.config, made.recovery_clips
     else:
-        config.sim.apply(humanoid.model)
         told, names = under(perpetual_run.WAYS, file.tensors), file.meta["body"]["names"]
         known = RecoveryClips.of(told) if told else None
         if known is None:
@@ -220,7 +218,6 @@ def load_tracker(path: Path) -> Tracker:
             path,
             "Export it anew from its run",
         )
-    config.sim.apply(humanoid.model)
     bundle.meta = {"samples": about.get("samples", 0), "seconds": about.get("seconds", 0.0)}
     return Tracker(bundle, humanoid, example, config, about, recovery_clips, value)
 

@@ -25,7 +25,7 @@ from poise.plan.expert import make_plan
 from poise.plan.lqr import Regulator, linearise, regulate
 from poise.plan.shooting import Segments, best_steps, segments
 from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
-from poise.sim import CpuBackend, SimConfig, difference
+from poise.sim import CpuBackend, SimConfig, alone, difference
 
 #: Worlds that compute differences, and rows of which a linear model is kept at once (35 kB each).
 WORLDS, ROWS = 4096, 4000
@@ -46,7 +46,7 @@ class TrajectoryOptimizer:
         if len(reference.bodies) > 1:
             raise PoiseError("trajectories are optimised for one body", hint="Train without body shapes")
         self.reference, self.config, self.sim = reference, config or TrajOptConfig(), sim
-        self.threads, model = threads, reference.humanoid.model
+        self.threads, model = threads, alone(reference.humanoid, sim)
         self.model, self.joints = model, model.nu
         self.iteration, self.seconds = 0, 0.0
         c, nv = self.config, model.nv

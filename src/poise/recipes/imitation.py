@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
+import mujoco
 from torch import Tensor
 
 from poise.body import Humanoid
@@ -19,7 +21,7 @@ from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.plan import LookaheadTeacher, TeacherConfig
-from poise.sim import Backend, Character, NanGuard, Scene, SceneSim, make_backend
+from poise.sim import Backend, Character, NanGuard, Scene, SceneSim, alone, make_backend
 from poise.sim.props import Prop
 
 #: What a recipe is built of: a clip, the file of one, or a library.
@@ -49,6 +51,7 @@ class Imitation:
         config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
         recovery_clips: those of the library, where recovery is learned by them.
         props: what else stands in every world, such as a chair; fixed to it, or driven by nothing.
+        physics: a model in place of the body's own on a floor, such as a heavier one; without props.
     """
 
     library: ClipLibrary
@@ -59,6 +62,7 @@ class Imitation:
     task: TaskConfig
     recovery_clips: RecoveryClips | None = None
     props: tuple[Prop, ...] = ()
+    physics: mujoco.MjModel | None = None
 
     def __repr__(self) -> str:
         clips, seconds = len(self.library), self.library.seconds
@@ -101,10 +105,15 @@ class Imitation:
         env.help.set(help_scale)
         return env
 
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """What is simulated of the body: alone on a floor, with the settings' physics."""
+        return self.physics or alone(self.humanoid, self.config.sim)
+
     def _worlds(self, count: int, device: str, threads: int) -> Backend:
         """Fresh worlds with a character and the props."""
         if not self.props:
-            return make_backend(self.humanoid.model, count, device, threads=threads)
+            return make_backend(self.model, count, device, threads=threads)
         scene = Scene((Character(self.humanoid), *self.props), sim=self.config.sim)
         return SceneSim(scene, count, device, threads).characters()
 

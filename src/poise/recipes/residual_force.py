@@ -265,7 +265,6 @@ def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
     config = config or ResidualForce()
     library, own = on_own_body(as_library(clips), config.body)
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, own)
-    config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
 

@@ -19,7 +19,7 @@ from poise.sim.links import Link
 from poise.sim.make import check_device, make_backend
 from poise.sim.mechanics import Mechanics
 from poise.sim.rows import CharacterRows
-from poise.sim.scene import Character, Scene, SceneModel, Touch
+from poise.sim.scene import Character, Scene, SceneModel, Touch, alone
 from poise.sim.scene_sim import Contact, SceneSim
 from poise.sim.tangent import difference, displaced
 from poise.sim.warp import WarpBackend
@@ -56,6 +56,7 @@ __all__ = [
     "UnstableError",
     "WarpBackend",
     "add_contact_sensors",
+    "alone",
     "body_angular_velocity_w",
     "body_com_velocity_w",
     "body_linear_velocity_w",

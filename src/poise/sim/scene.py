@@ -167,6 +167,11 @@ class Scene:
             sensor.reftype, sensor.refname = ends[1]
 
 
+def alone(humanoid: Humanoid, sim: SimConfig | None = None) -> mujoco.MjModel:
+    """The model of a world with a body and a plane floor, and nothing else."""
+    return Scene((Character(humanoid),), sim=sim or SimConfig()).compile().model
+
+
 def _check(name: str, known: list[str], where: str) -> None:
     if name not in known:
         raise PoiseError(f"there is no body '{name}' in the scene", where, did_you_mean(name, known))

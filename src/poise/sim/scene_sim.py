@@ -14,7 +14,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.sim.links import FAR_M
 from poise.sim.make import make_backend
 from poise.sim.rows import CharacterRows
-from poise.sim.scene import Character, Scene
+from poise.sim.scene import Scene, alone
 from poise.spatial import quat_conj, quat_mul, quat_rotate
 
 #: m; things that begin deeper in one another are a mistake.
@@ -80,9 +80,9 @@ class SceneSim:
             raise PoiseError(
                 f"{what} cannot share rows", "Scene", "Ask for each body's characters by name"
             )
-        alone = Scene((Character(known[chosen[0]]),), sim=self.scene.scene.sim)
+        own = alone(known[chosen[0]], self.scene.scene.sim)
         places = [self.scene.place(n) for n in chosen]
-        return CharacterRows(self.backend, places, alone.compile().model)
+        return CharacterRows(self.backend, places, own)
 
     def place(self, name: str, qpos: Tensor, qvel: Tensor, rows: Tensor | None = None) -> None:
         """Sets a thing down in worlds `rows (n,)`, all for None; everything else stays as it is.

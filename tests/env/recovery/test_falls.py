@@ -18,7 +18,7 @@ from toy_human import swing
 def test_the_fallen_lie_on_the_floor(make_phc, drop):
     built = make_phc(swing())
     humanoid, pd = built.humanoid, built.task.pd
-    backend = CpuBackend(humanoid.model, 3, 1)
+    backend = CpuBackend(built.model, 3, 1)
     before = backend.snapshot()
     states = fall_states(backend, humanoid, pd, drop, seed=1)
     assert states.shape == (7, humanoid.model.nq) and states.isfinite().all()
@@ -26,21 +26,22 @@ def test_the_fallen_lie_on_the_floor(make_phc, drop):
     assert bool(lies(humanoid, states).all()) and not states[:, :2].any()
     assert float(states[:, 2].max()) < 0.6 * standing_height(humanoid)
     # MuJoCo itself finds every body touching the floor and none deep in anything.
-    data = mujoco.MjData(humanoid.model)
+    model = built.model
+    data = mujoco.MjData(model)
     for q in states:
         data.qpos[:] = q.numpy()
-        mujoco.mj_forward(humanoid.model, data)
+        mujoco.mj_forward(model, data)
         floor = (data.contact.geom == 0).any(1)
         assert floor.any() and data.contact.dist[floor].min() > -0.031
     # As many worlds as one likes give the same states; another seed gives others.
-    other = CpuBackend(humanoid.model, 5, 1)
+    other = CpuBackend(built.model, 5, 1)
     assert torch.equal(states, fall_states(other, humanoid, pd, drop, seed=1))
     assert not torch.equal(states, fall_states(other, humanoid, pd, drop, seed=2))
 
 
 def test_who_does_not_come_to_lie_is_told(make_phc):
     built = make_phc(swing())
-    backend = CpuBackend(built.humanoid.model, 4, 1)
+    backend = CpuBackend(built.model, 4, 1)
     with pytest.raises(PoiseError, match="did not come to lie"):
         fall_states(backend, built.humanoid, built.task.pd, Drop(steps=2, count=4))
     upright = torch.zeros(2, built.humanoid.model.nq, dtype=torch.float64)

@@ -42,7 +42,7 @@ def demonstrations(imitation: Imitation) -> Reference:
     )
     assert recovery_clips is not None
     drop, seed = Recovery.phc(config.faithful, "primitive").drop, int(config.seed)
-    backend = make_backend(humanoid.model, min(WORLDS, count), "cpu", threads=1)
+    backend = make_backend(imitation.model, min(WORLDS, count), "cpu", threads=1)
     try:
         drop = replace(drop, count=-(-count // 2))
         falls = fall_states(backend, humanoid, imitation.task.pd, drop, seed)

@@ -162,7 +162,7 @@ def check_falls(imitation: Imitation, count: int = 32) -> None:
     recovery = imitation.task.recovery
     if recovery is None:
         return
-    backend = make_backend(imitation.humanoid.model, count, "cpu", threads=1)
+    backend = make_backend(imitation.model, count, "cpu", threads=1)
     try:
         drop = replace(recovery.drop, count=min(count, recovery.drop.count))
         fall_states(backend, imitation.humanoid, imitation.task.pd, drop, int(imitation.config.seed))

@@ -157,7 +157,6 @@ def imitation_of(tracker: Tracker, placed: Sequence[Placed]) -> Imitation:
     if config.widens and widen(humanoid.table, motions, 0.0)[1]:
         table, _ = widen(humanoid.table, motions, config.body.margin)
         humanoid = make_humanoid(humanoid.skeleton, table)
-        config.sim.apply(humanoid.model)
     library = ClipLibrary(tuple(p.clip for p in placed), (1.0,) * len(placed))
     names = [p.clip.name for p in placed]
     reference = Reference(humanoid, [p.qpos for p in placed], config.sim.control_hz, names)

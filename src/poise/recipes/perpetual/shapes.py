@@ -191,8 +191,6 @@ def _finished(
     rate = imitation.reference.rate_hz
     tables = _widened(tables, motions, imitation.config.body.margin)
     bodies = [make_humanoid(s, t) for s, t in zip(skeletons, tables, strict=True)]
-    for humanoid in bodies:
-        imitation.config.sim.apply(humanoid.model)
     reference = Reference(bodies[0], motions, rate, library.names, cyclic, bodies, body)
     task = make_task(bodies[0])
     if not any(term.fn is phc_obs.shape for term in task.obs):

@@ -179,7 +179,6 @@ def build(library: Clips, config: Perpetual | None = None, table: BodyTable | No
     widens = table is None or config.widens
     table = table or own
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
-    config.sim.apply(humanoid.model)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
     recovery_clips = known_recovery_clips(config, reference)
     if recovery_clips is None:
