@@ -205,6 +205,53 @@ def test_a_weld_is_switched_and_carries_the_weight() -> None:
     assert bool((sim.backend.state.xpos[:, at.body, 2] < 0.11).all())
 
 
+@pytest.mark.parametrize("kind", ["weld", "ball"])
+def test_the_force_of_a_link(kind: str) -> None:
+    """A box that hangs is pulled up by m g; hung out of its middle by a weld, with m g times the arm."""
+    arm = (0.1, 0.0, 0.0) if kind == "weld" else (0.0, 0.0, 0.1)
+    things = (
+        Box("top", (0.2, 0.2, 0.2), (0, 0, 2.0)),
+        Box("box", (0.2, 0.2, 0.2), (0, 0, 1.79), mass=4.0),
+    )
+    links = (
+        Link("up", "top", "box", kind, at=arm, measured=True),
+        Link("down", "box", "top", kind, at=tuple(-x for x in arm), measured=True),
+    )
+    sim = SceneSim(Scene(things, links), 3, threads=1)
+    sim.switch("up", True, torch.tensor([0]))
+    sim.switch("down", True, torch.tensor([1]))
+    run(sim, 2.0)
+    up, down = sim.link("up"), sim.link("down")
+    torch.testing.assert_close(up.force[0], torch.tensor([0, 0, 4.0 * G]).double(), rtol=1e-3, atol=0.05)
+    torch.testing.assert_close(
+        down.force[1], torch.tensor([0, 0, -4.0 * G]).double(), rtol=1e-3, atol=0.05
+    )
+    assert not up.force[1:].any() and not down.force[2].any()
+    if kind == "weld":
+        # About its point, which is 0.1 m ahead of the centre of mass.
+        assert up.torque[0].tolist() == pytest.approx([0.0, 0.1 * 4.0 * G, 0.0], abs=0.1)
+    box = sim.backend.state.xpos[0, sim.scene.place("box").body]
+    assert float((up.point[0] - box - torch.tensor(arm)).norm()) < 0.02
+
+
+def test_which_forces_of_links_are_measured(humanoid: Humanoid) -> None:
+    """A character keeps its own bodies: what measures is on the prop."""
+    hand = next(n for n in humanoid.bodies if "wrist" in n)
+    things = (
+        Box("bar", (0.05, 1.0, 0.05), (0, 0, 2.6)),
+        Character(humanoid, "h"),
+        Character(humanoid, "g"),
+    )
+    link = Link("grip", f"h/{hand}", "bar", "ball", measured=True)
+    sim = SceneSim(Scene(things, (link,)), 1, threads=1)
+    assert len(sim.characters("h").state.xpos[0]) == len(humanoid.bodies) + 1
+    both = Link("hands", f"h/{hand}", f"g/{hand}", "ball", measured=True)
+    with pytest.raises(PoiseError, match="between two characters' bodies is not measured"):
+        SceneSim(Scene(things, (both,)), 1, threads=1)
+    with pytest.raises(PoiseError, match="no link 'gri'"):
+        sim.link("gri")
+
+
 def test_a_ball_joint_holds_a_point(humanoid: Humanoid) -> None:
     """A body that hangs by its hand, let go of in the other world."""
     hand = next(n for n in humanoid.bodies if "wrist" in n)

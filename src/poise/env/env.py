@@ -73,9 +73,9 @@ class ImitationEnv:
         self.imitation = torch.zeros(n, device=here)
         self.help, self.plugins = plugins_of(task, self.goal, backend, seed)
         # Only plug-ins that change a hook are asked by it.
-        self._holding, self._ticking, self._judging, self._logging = (
+        self._holding, self._ticking, self._judging, self._logging, self._placing = (
             tuple(p for p in self.plugins if getattr(type(p), hook) is not getattr(Plugin, hook))
-            for hook in ("held", "tick", "judged", "log")
+            for hook in ("held", "tick", "judged", "log", "placed")
         )
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
@@ -202,6 +202,8 @@ class ImitationEnv:
         for plugin in self.plugins:
             start = plugin.start(ids, kind, start, self.goal.rng)
         self.backend.write(ids, *start)
+        for plugin in self._placing:
+            plugin.placed(ids)
         self.goal.aim(ids, self._held())
 
     def _held(self) -> Tensor | None:
@@ -258,6 +260,8 @@ class ImitationEnv:
                 plugin.count(ended)
             if len(ids):
                 self._restart(ids)
+                for plugin in self.plugins:
+                    ids = plugin.seeing(ids)
                 obs = self._obs.copy_(final)
                 fresh = self._sources.of(self._told(ids), ids)
                 obs[ids] = self._terms.observe(fresh)
@@ -370,6 +374,8 @@ class ImitationEnv:
             PoiseError: another number of worlds, or the snapshot of another kind of environment.
         """
         put(self, snapshot, rows)
+        for plugin in self._placing:
+            plugin.placed(rows)
         self.goal.aim(None, self._held())
         return self._observe()
 
@@ -381,6 +387,8 @@ class ImitationEnv:
         """Continues from `state()`: exactly, or from the same positions and velocities where the state
         is that of another kind of backend (another number format), such as the GPU's."""
         put_state(self, state)
+        for plugin in self._placing:
+            plugin.placed(None)
         self.goal.aim(None, self._held())
 
     def close(self) -> None:

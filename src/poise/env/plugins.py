@@ -75,6 +75,13 @@ class Plugin:
         """
         return start
 
+    def placed(self, ids: Tensor | None) -> None:
+        """Worlds `ids (n,)`, all for None, have been set down, or are what a snapshot holds."""
+
+    def seeing(self, ids: Tensor) -> Tensor:
+        """Worlds that see something else now that `ids (n,)` have been set down, these among them."""
+        return ids
+
     def kinds(self, count: int, rng: torch.Generator) -> Tensor | None:
         """`(count,)` kinds of new episodes, or None where there are no kinds."""
         return None

@@ -20,7 +20,7 @@ from poise.sim.make import check_device, make_backend
 from poise.sim.mechanics import Mechanics
 from poise.sim.rows import CharacterRows
 from poise.sim.scene import Character, Scene, SceneModel, Touch, alone
-from poise.sim.scene_sim import Contact, SceneSim
+from poise.sim.scene_sim import Contact, Pull, SceneSim
 from poise.sim.tangent import difference, displaced
 from poise.sim.warp import WarpBackend
 from poise.sim.worlds import add_contact_sensors, contact_columns
@@ -45,6 +45,7 @@ __all__ = [
     "NanGuard",
     "Place",
     "Plane",
+    "Pull",
     "Replay",
     "Scene",
     "SceneModel",

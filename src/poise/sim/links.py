@@ -28,6 +28,7 @@ class Link:
         to: m, the point of `a` in its own frame that holds it; None for where `at` is when the link is
             switched on. For a weld always None.
         on: whether it holds from the beginning.
+        measured: whether its force is, see `SceneSim.link`; one of the two must not be a character's.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Link:
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     to: tuple[float, float, float] | None = None
     on: bool = False
+    measured: bool = False
 
     def __post_init__(self) -> None:
         if self.a == self.b:
@@ -46,12 +48,32 @@ class Link:
         if self.kind == "weld" and self.to is not None:
             raise PoiseError("a weld keeps bodies as they are, it has no `to`", f"Link '{self.name}'")
 
-    def add(self, spec: mujoco.MjSpec) -> None:
-        """Adds the constraint to a description."""
+    @property
+    def hook(self) -> str:
+        """The body without a joint that holds in place of `a` or `b` where the force is measured."""
+        return f"link {self.name}"
+
+    def add(self, spec: mujoco.MjSpec, hooked: str | None = None) -> None:
+        """Adds the constraint to a description.
+
+        hooked: the one of `a` and `b` in place of which a body without a joint holds, whose sensors
+            measure what it passes on; None measures nothing.
+        """
+        ends = [self.a, self.b]
+        if hooked is not None:
+            body = spec.body(hooked).add_body(name=self.hook)
+            body.add_site(name=self.hook, pos=list(self.at if hooked == self.b else (0.0, 0.0, 0.0)))
+            for kind in ("force", "torque"):
+                sensor = getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")
+                spec.add_sensor(
+                    name=f"{self.hook} {kind}", type=sensor,
+                    objtype=mujoco.mjtObj.mjOBJ_SITE, objname=self.hook,
+                )  # fmt: skip
+            ends[ends.index(hooked)] = self.hook
         kinds = {"weld": mujoco.mjtEq.mjEQ_WELD, "ball": mujoco.mjtEq.mjEQ_CONNECT}
         constraint = spec.add_equality(
             name=self.name, type=kinds[self.kind], objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=self.a, name2=self.b, active=self.on,
+            name1=ends[0], name2=ends[1], active=self.on,
         )  # fmt: skip
         # As stiff as the physics rate permits: at 60 Hz a body that hangs by it sinks 1 cm.
         constraint.solimp[:2] = list(STIFF)

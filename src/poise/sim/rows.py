@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import mujoco
 import torch
@@ -14,6 +15,9 @@ from poise.sim.backend import Backend, SimState
 from poise.sim.drive import Drive
 from poise.sim.index import Place
 from poise.sim.worlds import check_state, row_index
+
+if TYPE_CHECKING:
+    from poise.sim.scene_sim import SceneSim
 
 #: State fields with a row per body; those of degrees of freedom are told by how they begin.
 _BODIES = ("xpos", "xquat", "xmat", "xipos", "ximat", "subtree_com", "cvel", "cfrc_ext", "xfrc_applied")
@@ -77,10 +81,24 @@ class CharacterRows:
         world: the worlds with everything in them.
         places: of the K characters.
         model: of one of them alone.
+        sim: the scene that they are of, if it is known.
+        sole: whether there is no other character in the worlds, so that each row has a world of its own:
+            its snapshots then hold the whole world, with its props and links.
+
+    Attributes:
+        world, places, model, sim: as given.
     """
 
-    def __init__(self, world: Backend, places: Sequence[Place], model: mujoco.MjModel):
-        self.world, self.places, self.model = world, tuple(places), model
+    def __init__(
+        self,
+        world: Backend,
+        places: Sequence[Place],
+        model: mujoco.MjModel,
+        sim: SceneSim | None = None,
+        sole: bool = False,
+    ):
+        self.world, self.places, self.model, self.sim = world, tuple(places), model, sim
+        self._sole = sole
         self.num_envs, self.device = world.num_envs * len(places), world.device
         self._fields: dict[str, _Field] = {}
         self._make(_OWN)
@@ -123,12 +141,19 @@ class CharacterRows:
 
     def snapshot(self, derived: bool = True, out: Tensor | None = None) -> Tensor:
         """`(N K, width)` of the characters alone: their states, what drives them, and with `derived` the
-        other bound fields. Props, links and characters of other rows are not part of it."""
+        other bound fields. Props, links and characters of other rows are not part of it, but of the
+        snapshots of a `sole` character."""
+        if self._sole:
+            return self.world.snapshot(derived, out)
         names = self._names(derived)
         return torch.cat([self._fields[n].own.reshape(self.num_envs, -1) for n in names], 1, out=out)
 
     def restore(self, snapshot: Tensor, rows: Tensor | None = None) -> None:
         """Sets characters down as a snapshot has them."""
+        if self._sole:
+            self.world.restore(snapshot, rows)
+            self.pull()
+            return
         ids = None if rows is None else row_index(rows, self.num_envs)
         n = self.num_envs if ids is None else len(ids)
         sizes = {name: self._fields[name].own[0].numel() for name in self._names(True)}

@@ -116,7 +116,7 @@ class Scene:
         for link in self.links:
             for body in (link.a, link.b):
                 _check(body, known, f"Link '{link.name}'")
-            link.add(spec)
+            link.add(spec, self._hooked(link))
         for touch in self.touches:
             self._sense(spec, touch, known)
         self.sim.apply(spec)
@@ -137,6 +137,20 @@ class Scene:
         return SceneModel(
             self, model, {n: place_of(model, n, model.body(body).id) for n, body in first.items()}
         )
+
+    def _hooked(self, link: Link) -> str | None:
+        """The body of a measured link that is no character's, since a character keeps its own bodies."""
+        if not link.measured:
+            return None
+        taken = {c.prefix + name for c in self.characters for name in c.humanoid.bodies}
+        free = [body for body in (link.b, link.a) if body not in taken]
+        if not free:
+            raise PoiseError(
+                "the force between two characters' bodies is not measured",
+                f"Link '{link.name}'",
+                "Put a prop between them, linked to both",
+            )
+        return free[0]
 
     @staticmethod
     def _first_body(thing: Character | Prop) -> str:

@@ -37,12 +37,27 @@ class Contact(NamedTuple):
     point: Tensor
 
 
+class Pull(NamedTuple):
+    """What a measured `Link` exerted on its body `b`, in the last physics step; 0 while it is off.
+
+    Attributes:
+        force: `(N, 3)` N, world axes.
+        torque: `(N, 3)` N m about `point`, world axes.
+        point: `(N, 3)` m.
+    """
+
+    force: Tensor
+    torque: Tensor
+    point: Tensor
+
+
 class SceneSim:
     """`num_envs` worlds of one scene.
 
     Attributes:
         scene: compiled, with the places of its things.
         backend: all worlds with everything in them.
+        link_data: `(N, L, 11)` of the links, how they hold; None without any.
     """
 
     def __init__(
@@ -51,11 +66,14 @@ class SceneSim:
         self.scene = scene.compile()
         self.backend = make_backend(self.scene.model, num_envs, device, threads=threads)
         self.backend.state.bind(["qacc_warmstart"])
+        self.link_data: Tensor | None = None
         if scene.links:
             self.backend.state.bind(["eq_active"])
-            self._eq_data = self.backend.expand("eq_data")
-        if scene.touches:
+            self.link_data = self.backend.expand("eq_data")
+        if scene.touches or any(link.measured for link in scene.links):
             self.backend.state.bind(["sensordata"])
+        if any(link.measured for link in scene.links):
+            self.backend.state.bind(["site_xpos"])
 
     @property
     def num_envs(self) -> int:
@@ -82,7 +100,7 @@ class SceneSim:
             )
         own = alone(known[chosen[0]], self.scene.scene.sim)
         places = [self.scene.place(n) for n in chosen]
-        return CharacterRows(self.backend, places, own)
+        return CharacterRows(self.backend, places, own, self, len(known) == 1)
 
     def place(self, name: str, qpos: Tensor, qvel: Tensor, rows: Tensor | None = None) -> None:
         """Sets a thing down in worlds `rows (n,)`, all for None; everything else stays as it is.
@@ -135,7 +153,8 @@ class SceneSim:
                 self._too_far(link.name, float(far.max()))
             if link.to is None:
                 self._near(link.name, a, b, to)
-            data = self._eq_data[to, i].double()
+            assert self.link_data is not None
+            data = self.link_data[to, i].double()
             if link.kind == "weld":
                 # Anchor on b; then b's place and turn as seen from a.
                 data[:, :3] = at
@@ -143,8 +162,26 @@ class SceneSim:
                 data[:, 6:10] = quat_mul(back, quat_b)
             else:
                 data[:, :3], data[:, 3:6] = wanted, at
-            self._eq_data[to, i] = data.to(self._eq_data)
+            self.link_data[to, i] = data.to(self.link_data)
         state["eq_active"][to, i] = on
+
+    def link(self, name: str) -> Pull:
+        """What a measured link exerts."""
+        links = {link.name: link for link in self.scene.scene.links}
+        if name not in links:
+            raise PoiseError(f"there is no link '{name}'", "Scene", did_you_mean(name, list(links)))
+        link, model, state = links[name], self.scene.model, self.backend.state
+        if not link.measured:
+            raise PoiseError(f"the force of link '{name}' is not measured", hint="Link(measured=True)")
+        body, site = model.body(link.hook).id, model.site(link.hook).id
+        ends = [model.eq_obj1id, model.eq_obj2id]
+        # The sensor has what the body exerts on the hook, so minus what the link does; and where the
+        # hook is on `a`, `b` feels the opposite.
+        sign = -1.0 if int(ends[1][list(links).index(name)]) == body else 1.0
+        seen = [int(model.sensor(f"{link.hook} {kind}").adr[0]) for kind in ("force", "torque")]
+        turn, data = state.xquat[:, body], state["sensordata"]
+        force, torque = (sign * quat_rotate(turn, data[:, at : at + 3].to(turn)) for at in seen)
+        return Pull(force, torque, state["site_xpos"][:, site])
 
     def touch(self, name: str) -> Contact:
         """What is measured of a touch."""
@@ -183,6 +220,12 @@ class SceneSim:
         mujoco.mj_forward(self.scene.model, data)
         return data
 
+    def _solid(self, body: int) -> int:
+        """The body that a link's hook is on, or the body itself."""
+        hooks = {link.hook for link in self.scene.scene.links if link.measured}
+        model = self.scene.model
+        return int(model.body_parentid[body]) if model.body(body).name in hooks else body
+
     def _thing(self, root: int) -> str:
         for name, place in self.scene.places.items():
             if place.body == root:
@@ -193,7 +236,11 @@ class SceneSim:
         """Raises where two bodies' surfaces are farther apart than `FAR_M`."""
         model = self.scene.model
         geoms = [
-            [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_contype[g]]
+            [
+                g
+                for g in range(model.ngeom)
+                if model.geom_bodyid[g] == self._solid(body) and model.geom_contype[g]
+            ]
             for body in (a, b)
         ]
         for env in rows.tolist():

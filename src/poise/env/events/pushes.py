@@ -1,4 +1,4 @@
-"""Events: what happens to worlds at intervals."""
+"""Pushes at random times."""
 
 from __future__ import annotations
 

@@ -1,0 +1,22 @@
+"""Events: what happens to worlds when episodes begin, at intervals and on conditions."""
+
+from poise.env.events.event import Condition, Event, Happening
+from poise.env.events.in_scene import InScene, MeteredPart, ScenePart
+from poise.env.events.pushes import Pushes, Pushing
+from poise.env.events.things import Move, SetDown, Switch, Throw, near
+
+__all__ = [
+    "Condition",
+    "Event",
+    "Happening",
+    "InScene",
+    "MeteredPart",
+    "Move",
+    "Pushes",
+    "Pushing",
+    "ScenePart",
+    "SetDown",
+    "Switch",
+    "Throw",
+    "near",
+]

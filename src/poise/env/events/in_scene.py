@@ -1,0 +1,213 @@
+"""A task's part in a scene: what its terms see of it, what happens in it, when episodes end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from poise.env.events.event import Event
+from poise.env.goals.goal import Goal
+from poise.env.plugins import Plugin, Start
+from poise.errors import PoiseError
+from poise.sim import Backend, CharacterRows, Drive, SceneSim
+
+#: The name by which a character sees the others that share its rows.
+OTHERS = "others"
+_OF_OTHERS = ("qpos", "qvel", "xpos", "xquat")
+
+
+@dataclass(frozen=True)
+class InScene:
+    """Given to `TaskConfig.plugins` of an environment on characters of a `SceneSim`.
+
+    Attributes:
+        sees: things that terms read by `frame.source`: "door/qpos" `(N, q)`, "door/qvel" `(N, v)`, and
+            of its first body "door/pos" `(N, 3)` m and "door/quat" `(N, 4)`; "others" for the other
+            characters of the same rows, "others/qpos" `(N, K - 1, q)`, likewise "qvel", "xpos", "xquat",
+            the next one first.
+        touches: contacts that terms read: "touch/hit" `(N, 10)`, the numbers of a `sim.Contact`.
+        metered: touches of which the impulse "impulse/hit" `(N, 3)` N s and the greatest force
+            "peak/hit" `(N,)` N over the last control step are measured; its physics steps are then made
+            one by one.
+        events: what happens.
+        ends: whether episodes end per "character", or for all characters of a "world" at once: where
+            one ends, those of the others are cut off like by a time-out.
+    """
+
+    sees: tuple[str, ...] = ()
+    touches: tuple[str, ...] = ()
+    metered: tuple[str, ...] = ()
+    events: tuple[Event, ...] = ()
+    ends: Literal["character", "world"] = "character"
+
+    def __call__(self, goal: Goal, backend: Backend) -> ScenePart:
+        """The plug-in of an environment."""
+        if not isinstance(backend, CharacterRows) or backend.sim is None:
+            hint = "Give the environment SceneSim(...).characters() as backend"
+            raise PoiseError("a task in a scene needs the characters of a scene", "InScene", hint)
+        kind = MeteredPart if self.metered else ScenePart
+        return kind(self, backend, backend.sim, goal.rate_hz)
+
+
+class ScenePart(Plugin):
+    """A task's part in the N worlds of a scene, for its K characters in each.
+
+    Attributes:
+        happenings: its events, in order.
+    """
+
+    def __init__(self, given: InScene, rows: CharacterRows, sim: SceneSim, control_hz: float):
+        self.given, self._rows, self._sim = given, rows, sim
+        self._many = len(rows.places)
+        if OTHERS in given.sees and self._many < 2:
+            raise PoiseError("there are no others among these rows", "InScene")
+        self.happenings = [make(sim, control_hz) for make in given.events]
+        self._sources: dict[str, Tensor] = {}
+        for name in (*given.touches, *given.metered):
+            sim.touch(name)
+        self._look()
+
+    def sources(self) -> Mapping[str, Tensor]:
+        return self._sources
+
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        """Events begin anew in worlds all of which's characters do."""
+        if self.happenings:
+            n, k = self._sim.num_envs, self._many
+            every = torch.arange(n, device=self._sim.backend.device)
+            worlds = every if ids is None else every[torch.bincount(ids // k, minlength=n) == k]
+            for happening in self.happenings if len(worlds) else ():
+                happening.begin(worlds)
+        return start
+
+    def placed(self, ids: Tensor | None) -> None:
+        self._look()
+
+    def seeing(self, ids: Tensor) -> Tensor:
+        """Characters see the others of their worlds."""
+        if OTHERS not in self.given.sees:
+            return ids
+        k, others = self._many, torch.arange(self._many, device=ids.device)
+        return (torch.unique(ids // k).unsqueeze(1) * k + others).flatten()
+
+    def push(self, drive: Drive) -> None:
+        """What happens before the control step."""
+        for happening in self.happenings:
+            happening.before()
+
+    def tick(self) -> None:
+        for happening in self.happenings:
+            happening.after()
+        self._look()
+
+    def judged(self, ends: Tensor, ref: Tensor, late: Tensor, rng: torch.Generator | None) -> None:
+        """Cuts off the episodes of the others."""
+        if self.given.ends == "world" and self._many > 1:
+            cut_off(ends[1], ends[2], self._many)
+
+    def rows(self) -> dict[str, Tensor]:
+        """Worlds of several characters are not copied as wholes, and neither is what happens in them."""
+        if self._many > 1:
+            return {}
+        named = enumerate(self.happenings)
+        out = {f"event/{i}/{k}": v for i, h in named for k, v in h.rows().items()}
+        return out if self._sim.link_data is None else {**out, "links": self._sim.link_data}
+
+    def state(self) -> dict[str, Tensor]:
+        named = enumerate(self.happenings)
+        own = {f"event/{i}/{k}": v for i, h in named for k, v in h.state().items()}
+        return {**own, **{k: v.clone() for k, v in self.rows().items()}}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on with the same events; from a task without them with those it has."""
+        for name, value in self.rows().items():
+            if name in state:
+                value.copy_(state[name])
+        for i, happening in enumerate(self.happenings):
+            prefix = f"event/{i}/"
+            own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            if own.keys() >= happening.state().keys():
+                happening.load_state(own)
+        self._look()
+
+    def _look(self) -> None:
+        """Brings the sources up to date."""
+        for name in self.given.sees:
+            if name == OTHERS:
+                for field in _OF_OTHERS:
+                    whole = self._rows.state[field].unflatten(0, (self._sim.num_envs, self._many))
+                    turned = [whole.roll(-k, 1) for k in range(1, self._many)]
+                    self._keep(f"{name}/{field}", torch.stack(turned, 2).flatten(0, 1))
+                continue
+            place, state = self._sim.scene.place(name), self._sim.backend.state
+            self._share(f"{name}/qpos", state.qpos[:, place.qpos])
+            self._share(f"{name}/qvel", state.qvel[:, place.dofs])
+            self._share(f"{name}/pos", state.xpos[:, place.body])
+            self._share(f"{name}/quat", state.xquat[:, place.body])
+        for name in self.given.touches:
+            contact = self._sim.touch(name)
+            numbers = contact.contacts.unsqueeze(1), contact.force, contact.torque, contact.point
+            self._share(f"touch/{name}", torch.cat(numbers, 1))
+
+    def _share(self, name: str, value: Tensor) -> None:
+        """What all characters of a world see, `(N, ...)`."""
+        self._keep(name, value.repeat_interleave(self._many, 0) if self._many > 1 else value)
+
+    def _keep(self, name: str, value: Tensor) -> None:
+        if name in self._sources:
+            self._sources[name].copy_(value)
+        else:
+            self._sources[name] = value.float().clone()
+
+
+class MeteredPart(ScenePart):
+    """The same, with impulses and greatest forces of touches over each control step."""
+
+    def __init__(self, given: InScene, rows: CharacterRows, sim: SceneSim, control_hz: float):
+        self._fresh, self._step_s = True, float(sim.scene.model.opt.timestep)
+        super().__init__(given, rows, sim, control_hz)
+        for name in given.metered:
+            force = sim.touch(name).force
+            self._share(f"impulse/{name}", torch.zeros_like(force))
+            self._share(f"peak/{name}", torch.zeros_like(force[:, 0]))
+
+    def push(self, drive: Drive) -> None:
+        super().push(drive)
+        self._fresh = True
+        for name in self.given.metered:
+            self._sources[f"impulse/{name}"].zero_()
+            self._sources[f"peak/{name}"].zero_()
+
+    def push_substep(self, drive: Drive) -> None:
+        """Notes what the physics step before it measured."""
+        if not self._fresh:
+            self._note()
+        self._fresh = False
+
+    def tick(self) -> None:
+        self._note()
+        super().tick()
+
+    def _note(self) -> None:
+        for name in self.given.metered:
+            force = self._sim.touch(name).force
+            if self._many > 1:
+                force = force.repeat_interleave(self._many, 0)
+            self._sources[f"impulse/{name}"].add_(self._step_s * force)
+            peak = self._sources[f"peak/{name}"]
+            torch.maximum(peak, force.norm(dim=-1).to(peak), out=peak)
+
+
+def cut_off(terminated: Tensor, truncated: Tensor, many: int) -> None:
+    """Cuts off, in place, the episodes of all `many` characters of a world where one ended.
+
+    terminated, truncated: `(N K,)` bool.
+    """
+    over = (terminated | truncated).view(-1, many).any(1).repeat_interleave(many)
+    truncated |= over & ~terminated
