@@ -27,7 +27,7 @@ from poise.recipes.perpetual.shapes import (
     scaled_table,
     shaped,
 )
-from poise.sim import CpuBackend
+from poise.sim import CpuBackend, alone
 from toy_library import library, tiny
 
 SHAPES = BodyShapes(count=3, seed=2)
@@ -93,19 +93,19 @@ def test_each_world_is_the_body_of_its_clip(imitation: Imitation) -> None:
         env.step(action)
         kept.append((env.backend.state.qpos.clone(), env.backend.drive.ctrl.clone()))
     for i in range(6):
-        alone = CpuBackend(imitation.reference.bodies[int(body[i])].model, 1, 1)
-        alone.write(
+        single = CpuBackend(alone(imitation.reference.bodies[int(body[i])]), 1, 1)
+        single.write(
             None, *imitation.reference.coordinates(clip[i : i + 1], torch.zeros(1, dtype=torch.long))
         )
         for qpos, ctrl in kept:
-            alone.drive.clear()
-            alone.drive.ctrl.copy_(ctrl[i : i + 1])
-            alone.step(env.substeps)
+            single.drive.clear()
+            single.drive.ctrl.copy_(ctrl[i : i + 1])
+            single.step(env.substeps)
             # The solver's stopping rule knows the first body's mean inertia alone.
-            torch.testing.assert_close(alone.state.qpos[0], qpos[i], rtol=1e-6, atol=1e-6)
+            torch.testing.assert_close(single.state.qpos[0], qpos[i], rtol=1e-6, atol=1e-6)
         total = env.backend.get_model(i).body_mass.sum()
         assert total == pytest.approx(imitation.reference.bodies[int(body[i])].mass)
-        alone.close()
+        single.close()
     env.close()
 
 
@@ -206,9 +206,9 @@ def test_the_expert_knows_the_body(imitation: Imitation) -> None:
     r, c = imitation.reference, 4
     plan, body = make_plan(r), r.bodies[int(r.body[c])]
     own = r.qpos[int(r.start[c]) : int(r.start[c] + r.length[c])].numpy()
-    alone = make_plan(Reference(body, [own], r.rate_hz, ["own"]))
+    own_plan = make_plan(Reference(body, [own], r.rate_hz, ["own"]))
     rows = slice(int(r.start[c]), int(r.start[c] + r.length[c]))
-    torch.testing.assert_close(plan.torque[rows], alone.torque)
+    torch.testing.assert_close(plan.torque[rows], own_plan.torque)
 
 
 def test_each_clip_on_some_bodies_only() -> None:

@@ -52,6 +52,26 @@ def test_page_has_every_section_and_figure():
     assert "{{" not in re.sub(r"<script>.*?</script>", "", page, flags=re.S)
 
 
+def test_forces_at_their_points_and_others_in_the_world():
+    plain = make_report(FRAMES)
+    rows = tuple(np.arange(6.0 * k).reshape(k, 6) for k in (0, 2, 1))
+    helps = rows + (np.zeros((0, 6)),) * (FRAMES - 3)
+    data = _motion(
+        render(dataclasses.replace(plain, helps=helps, others=(plain.reference, plain.simulated)))
+    )
+    got = np.frombuffer(base64.b64decode(data["helps"]["rows"]), "<f4").reshape(-1, 6)
+    np.testing.assert_array_equal(got, np.concatenate(rows))
+    first = np.frombuffer(base64.b64decode(data["helps"]["first"]), "<f4")
+    assert first[:4].tolist() == [0, 0, 2, 3] and len(first) == FRAMES + 1
+    assert len(data["others"]) == 2
+    other = _decoded(data["others"][1], len(plain.bodies))
+    np.testing.assert_allclose(other.pos, plain.simulated.pos, atol=1e-3)
+    assert _motion(render(plain))["helps"] is None
+    short = dataclasses.replace(plain.reference, pos=plain.reference.pos[:5])
+    with pytest.raises(PoiseError, match="must have shape"):
+        dataclasses.replace(plain, others=(short,))
+
+
 def test_page_loads_nothing_from_outside():
     page = render(make_report(FRAMES))
     assert set(re.findall(r"https?://[^\s\"'`)]+", page)) <= {

@@ -238,7 +238,7 @@ class Recorder:
         sizes = {
             **{k: (bodies, 3) for k in ("pos", "ref_pos")},
             **{k: (bodies, 4) for k in ("quat", "ref_quat")},
-            **{k: (len(helped), 3) for k in ("force", "torque", "point_vel", "ang_vel")},
+            **{k: (len(helped), 3) for k in ("force", "torque", "point", "point_vel", "ang_vel")},
         }
         many = len(clip), self.total
         self.tensors = {k: torch.zeros(*many, *size) for k, size in sizes.items()}
@@ -268,6 +268,7 @@ class Recorder:
         if wrench is not None:
             bodies = list(wrench.body)
             out["force"][:, t], out["torque"][:, t] = wrench.force, wrench.torque
+            out["point"][:, t] = wrench.point
             # The wrench was applied at the poses before this step: its arm is zero for a root wrench.
             arm = wrench.point.cpu() - out["pos"][:, t - 1, bodies]
             ang, vel = sim.angvel[:, bodies].cpu(), sim.linvel[:, bodies].cpu()

@@ -35,6 +35,7 @@ class RolloutSet:
     rule_bodies: bodies the success rule looks at; None for all.
     trial: `(E,)` int, which of several perturbed starts each episode is, see `episodes.perturb`; None
         where starts are exact.
+    point: `(E, T, M, 3)` m, where the residual forces acted; None where it was not recorded.
     """
 
     pos: Tensor
@@ -63,6 +64,7 @@ class RolloutSet:
     ref_min_height: Tensor | None = None
     rule_bodies: tuple[int, ...] | None = None
     trial: Tensor | None = None
+    point: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.pos.ndim != 4 or self.pos.shape[-1] != 3 or 0 in self.pos.shape:

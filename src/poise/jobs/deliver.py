@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from poise.eval import ScoreCard, clip_figures, write_score
+from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
 from poise.kin import hold_feet, lowest_height, qpos_to_clip
 from poise.motion import Clip, resample
@@ -201,6 +202,11 @@ def make_report(
             "seed": str(card.seed),
             "version": __version__,
         },
+        helps=_helps(r, row, frames) if helped else (),
+        others=tuple(
+            _lasting(r, other, imitation.library.names[other.clip], frames)
+            for other in (evaluation.recordings[1:] if evaluation.together else ())
+        ),
         pushes=recording.contacts if len(recording.contacts) == frames else (),
         things=tuple(
             Shape(0, "box", (p.size[0] / 2, p.size[1] / 2, p.size[2] / 2), p.pos, p.quat)
@@ -208,3 +214,19 @@ def make_report(
             if isinstance(p, Box)
         ),
     )
+
+
+def _helps(rollouts: RolloutSet, row: int, frames: int) -> tuple[np.ndarray, ...]:
+    """The residual forces of several bodies as a report has them; () for one on the root."""
+    if rollouts.point is None or rollouts.force.shape[2] == 1:
+        return ()
+    both = torch.cat((rollouts.point[row, :frames], rollouts.force[row, :frames]), -1).numpy()
+    return tuple(frame[np.abs(frame[:, 3:]).max(1) > 0.0] for frame in both)
+
+
+def _lasting(rollouts: RolloutSet, recording: Recording, name: str, frames: int) -> Track:
+    """A character's motion as long as another's; where it ends before, it stays as it was."""
+    last = min(len(recording.qpos), frames) - 1
+    at = torch.arange(frames).clamp_max(last)
+    row = recording.row
+    return Track(name, rollouts.pos[row, at].numpy(), rollouts.quat[row, at].numpy())

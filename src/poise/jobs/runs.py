@@ -54,11 +54,15 @@ from poise.settings import to_data
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What a policy did: the score card, the padded rollouts, one whole episode per clip."""
+    """What a policy did: the score card, the padded rollouts, one whole episode per clip.
+
+    together: whether these are characters of one world.
+    """
 
     card: ScoreCard
     rollouts: RolloutSet
     recordings: list[Recording]
+    together: bool = False
 
 
 def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str = "cpu") -> Imitation:

@@ -80,6 +80,9 @@ class Report:
         things: what stands in the world, such as a chair; their `body` counts for nothing.
         pushes: of each frame `(K, 6)`, points in the world, m, and the forces that touch the character
             there, N; () where none were recorded.
+        helps: of each frame `(K, 6)`, points and residual forces of several bodies in the same way; they
+            are drawn in place of `force`, which is their sum. () where the root alone is helped.
+        others: other characters of the same body in the simulation's world.
     """
 
     title: str
@@ -100,6 +103,8 @@ class Report:
     facts: dict[str, str]
     things: tuple[Shape, ...] = ()
     pushes: tuple[np.ndarray, ...] = ()
+    helps: tuple[np.ndarray, ...] = ()
+    others: tuple[Track, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fps) and self.fps > 0):
@@ -114,7 +119,7 @@ class Report:
             ("error_global_mm", self.error_global_mm, (frames,)),
             ("contacts", self.contacts, (frames, 2)),
         ]
-        for track in (self.reference, self.simulated):
+        for track in (self.reference, self.simulated, *self.others):
             wanted.append((f"track '{track.name}' pos", track.pos, (frames, bodies, 3)))
             wanted.append((f"track '{track.name}' quat", track.quat, (frames, bodies, 4)))
         for name, array, shape in wanted:
@@ -249,6 +254,8 @@ def payload(report: Report) -> dict[str, Any]:
             {"kind": s.kind, "size": s.size, "pos": s.pos, "quat": s.quat} for s in report.things
         ],
         "pushes": _pushes(report.pushes),
+        "helps": _pushes(report.helps),
+        "others": [encode_track(track) for track in report.others],
         "feet": foot_bodies(report.bodies),
         "weight": body_weight(report),
         "reference": encode_track(report.reference),

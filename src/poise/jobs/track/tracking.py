@@ -134,7 +134,7 @@ def track(
             f"The policy is that of an unfinished training that still helped by up to "
             f"{float(about['help_n']):.0f} N; here nothing helps."
         )
-    evaluation = Evaluation(card, rollouts, done.recordings)
+    evaluation = Evaluation(card, rollouts, done.recordings, config.count > 1)
     times = tuple((character, frame / rate) for character, frame in frames)
     if losses is not None:
         times = tuple((0, t) for t in losses.lost)

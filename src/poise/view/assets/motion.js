@@ -9,6 +9,8 @@ const Poise = {};
   }
   const floats = (text) => (text ? new Float32Array(bytes(text)) : null);
 
+  const arrows = (data) => (data ? { rows: floats(data.rows), first: floats(data.first) } : null);
+
   function decodeTrack(data, frames, bodies) {
     const root = new Float32Array(bytes(data.root));
     const offset = new Int16Array(bytes(data.offset));
@@ -35,7 +37,9 @@ const Poise = {};
       reference: decodeTrack(data.reference, data.frames, n),
       simulated: decodeTrack(data.simulated, data.frames, n),
       force: floats(data.force),
-      pushes: data.pushes ? { rows: floats(data.pushes.rows), first: floats(data.pushes.first) } : null,
+      others: (data.others || []).map((track) => decodeTrack(track, data.frames, n)),
+      pushes: arrows(data.pushes),
+      helps: arrows(data.helps),
       torque: floats(data.torque),
       error: floats(data.error),
       errorGlobal: floats(data.errorGlobal),

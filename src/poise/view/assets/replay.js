@@ -8,7 +8,7 @@ Poise.replay = (data) => {
   const state = { at: 0, playing: true, speed: 1, overlay: false, follow: true, force: true, touch: false, blend: 1 };
   const listeners = [];
   const blank = () => ({ pos: new Float32Array(n * 3), quat: new Float32Array(n * 4) });
-  const poses = { reference: blank(), simulated: blank() };
+  const poses = { reference: blank(), simulated: blank(), others: data.others.map(blank) };
   const scale = Poise.arrowScale(data.forceNorm);
   const pushScale = Math.max(100, Math.round((data.weight || 700) / 100) * 100);
   const target = [0, 0, 0];
@@ -37,6 +37,7 @@ Poise.replay = (data) => {
   function frameAt(dt) {
     Poise.sample(data.reference, n, data.frames, state.at, poses.reference);
     Poise.sample(data.simulated, n, data.frames, state.at, poses.simulated);
+    data.others.forEach((track, k) => Poise.sample(track, n, data.frames, state.at, poses.others[k]));
     const aim = state.overlay ? 0 : 1;
     state.blend += (aim - state.blend) * (1 - Math.exp(-dt * 9));
     const half = (extent.gap / 2) * state.blend;
@@ -48,18 +49,19 @@ Poise.replay = (data) => {
     fresh = false;
     const t = Math.round(state.at);
     let arrow = null;
-    if (data.force && state.force) {
+    if (data.force && state.force && !data.helps) {
       arrow = [0, 1, 2].map((k) => data.force[3 * t + k] / scale);
       if (!arrow.every(Number.isFinite)) arrow = null;
     }
-    // Of each contact its point and its force, in metres of an arrow.
-    const pushes = [];
-    if (data.pushes && state.touch)
-      for (let k = data.pushes.first[t]; k < data.pushes.first[t + 1]; k++)
-        pushes.push(Array.from(data.pushes.rows.subarray(6 * k, 6 * k + 6), (v, i) => (i < 3 ? v : v / pushScale)));
+    // Of each contact or residual force its point and its force, in metres of an arrow.
+    const rows = ({ rows, first }, scale) =>
+      Array.from({ length: first[t + 1] - first[t] }, (_, j) => 6 * (first[t] + j)).map((k) =>
+        Array.from(rows.subarray(k, k + 6), (v, i) => (i < 3 ? v : v / scale)));
+    const pushes = data.pushes && state.touch ? rows(data.pushes, pushScale) : [];
+    const helps = data.helps && state.force ? rows(data.helps, scale) : [];
     const lit = [0, 1].map((k) => Boolean(data.contacts && data.contacts[2 * t + k]));
     const shift = [[-half * sx, -half * sy], [half * sx, half * sy]];
-    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, lit };
+    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, helps, lit };
   }
 
   function tag(id, pose, shift) {
@@ -182,7 +184,8 @@ Poise.replay = (data) => {
   if (location.hash.includes("contacts") && data.pushes) $("touch").click();
   const start = /at=([0-9.]+)/.exec(location.hash);
   if (start) seek(Math.round(Number(start[1]) * data.fps), true);
-  if (location.hash.includes("overlaid")) {
+  // Others stand beside the simulation, where its ghost would stand apart.
+  if (location.hash.includes("overlaid") || data.others.length) {
     overlay(true);
     state.blend = 0;
   }

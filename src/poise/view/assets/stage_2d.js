@@ -172,7 +172,7 @@ Poise.stage2D = (host, data, extent) => {
     canvas,
     theme() {
       const names = { bg: "--stage", ink: "--ink", ref: "--ref", refRim: "--ref-rim", sim: "--sim",
-        simRim: "--sim-rim", help: "--help", thing: "--thing", push: "--push", lit: "--contact" };
+        simRim: "--sim-rim", help: "--help", thing: "--thing", other: "--other", push: "--push", lit: "--contact" };
       for (const key in names) colors[key] = Poise.css(names[key]);
     },
     resize(w, h) {
@@ -195,12 +195,14 @@ Poise.stage2D = (host, data, extent) => {
       things(frame.shift[1]);
       if (Math.hypot(frame.shift[0][0] - frame.shift[1][0], frame.shift[0][1] - frame.shift[1][1]) > 1e-3)
         things(frame.shift[0]);
+      for (const pose of frame.others) character(pose, frame.shift[1], colors.other, colors.simRim, 1, [false, false]);
       character(frame.simulated, frame.shift[1], colors.sim, colors.simRim, 1, frame.lit);
       character(frame.reference, frame.shift[0], colors.ref, colors.refRim, 0.3 + 0.3 * frame.blend, [false, false]);
-      for (const p of frame.pushes) {
-        const [dx, dy] = frame.shift[1];
-        force([p[0] + dx, p[1] + dy, p[2]], p.slice(3), colors.push);
-      }
+      for (const [rows, color] of [[frame.pushes, colors.push], [frame.helps, colors.help]])
+        for (const p of rows) {
+          const [dx, dy] = frame.shift[1];
+          force([p[0] + dx, p[1] + dy, p[2]], p.slice(3), color);
+        }
       if (frame.arrow) {
         const [p, d] = [frame.simulated.pos, frame.shift[1]];
         force([p[0] + d[0], p[1] + d[1], p[2]], frame.arrow);

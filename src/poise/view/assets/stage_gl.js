@@ -112,6 +112,7 @@ Poise.stageGL = (host, data, extent) => {
   });
   const reference = character(true);
   const simulated = character(false);
+  const others = data.others.map(() => character(false));
 
   const arrowMaterial = new T.MeshBasicMaterial({ depthTest: false, transparent: true });
   const shaft = new T.Mesh(new T.CylinderGeometry(0.016, 0.016, 1, 16).translate(0, 0.5, 0), arrowMaterial);
@@ -120,14 +121,16 @@ Poise.stageGL = (host, data, extent) => {
   shaft.renderOrder = tip.renderOrder = 5;
   scene.add(arrow);
   const pushMaterial = new T.MeshBasicMaterial({ depthTest: false, transparent: true });
-  const pushed = Array.from({ length: 16 }, () => {
-    const one = new T.Mesh(new T.CylinderGeometry(0.01, 0.01, 1, 10).translate(0, 0.5, 0), pushMaterial);
-    const head = new T.Mesh(new T.ConeGeometry(0.03, 0.08, 14).translate(0, 0.04, 0), pushMaterial);
+  const pool = (length, material) => Array.from({ length }, () => {
+    const one = new T.Mesh(new T.CylinderGeometry(0.01, 0.01, 1, 10).translate(0, 0.5, 0), material);
+    const head = new T.Mesh(new T.ConeGeometry(0.03, 0.08, 14).translate(0, 0.04, 0), material);
     const group = new T.Group().add(one, head);
     one.renderOrder = head.renderOrder = 5;
     scene.add(group);
     return { group, one, head };
   });
+  const pushed = pool(16, pushMaterial);
+  const helped = pool(data.helps ? data.bodies.length : 0, arrowMaterial);
   const [up, along] = [new T.Vector3(0, 1, 0), new T.Vector3()];
 
   function pose(who, state, dx, dy) {
@@ -157,6 +160,7 @@ Poise.stageGL = (host, data, extent) => {
       pushMaterial.color.set(Poise.css("--push"));
       wood.color.set(Poise.css("--thing"));
       colors.sim = new T.Color(Poise.css("--sim"));
+      colors.other = new T.Color(Poise.css("--other"));
       colors.lit = new T.Color(Poise.css("--contact"));
     },
     resize(width, height) {
@@ -189,6 +193,10 @@ Poise.stageGL = (host, data, extent) => {
       const [sx, sy] = frame.shift[1];
       pose(reference, frame.reference, rx, ry);
       pose(simulated, frame.simulated, sx, sy);
+      others.forEach((who, k) => {
+        pose(who, frame.others[k], sx, sy);
+        for (const mat of who.mats) mat.color.copy(colors.other);
+      });
       ghost.visible = true;
       things.forEach((group, k) => group.position.set(frame.shift[k][0], frame.shift[k][1], 0));
       things[0].visible = Math.hypot(rx - sx, ry - sy) > 1e-3;
@@ -206,8 +214,8 @@ Poise.stageGL = (host, data, extent) => {
         tip.position.y = Math.max(length - 0.11 * head, 0);
         tip.scale.setScalar(head);
       }
-      pushed.forEach(({ group, one, head }, k) => {
-        const row = frame.pushes[k];
+      const point = (rows) => ({ group, one, head }, k) => {
+        const row = rows[k];
         const length = row ? Math.hypot(row[3], row[4], row[5]) : 0;
         group.visible = length > 0.01;
         if (!group.visible) return;
@@ -216,7 +224,9 @@ Poise.stageGL = (host, data, extent) => {
         group.quaternion.setFromUnitVectors(up, along);
         one.scale.set(1, Math.max(length - 0.07, 1e-3), 1);
         head.position.y = Math.max(length - 0.08, 0);
-      });
+      };
+      pushed.forEach(point(frame.pushes));
+      helped.forEach(point(frame.helps));
       sun.target.position.set(controls.target.x, controls.target.y, 0);
       sun.position.set(controls.target.x + 2.2, controls.target.y - 2.8, 6.5);
       grid.uniforms.center.value.copy(controls.target);
