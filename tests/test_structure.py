@@ -29,7 +29,6 @@ EXPLAINED = {
         "metrics/tracking.py:mpjpe_pa",
     ),
     "figures of the benchmarks": (
-        
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
     ),
     "analytic inverse kinematics, which keyframes will need": (
@@ -44,6 +43,7 @@ EXPLAINED = {
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
         "sim/props/carrier.py:Carrier", "sim/props/door.py:Door", "sim/props/lift.py:Lift",
         "sim/props/sphere.py:Ball", "sim/mechanics.py:Mechanics", "sim/mechanics.py:Mechanics.step_map",
+        "env/teams.py:Teams",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

@@ -56,8 +56,8 @@ class Link:
     def add(self, spec: mujoco.MjSpec, hooked: str | None = None) -> None:
         """Adds the constraint to a description.
 
-        hooked: the one of `a` and `b` in place of which a body without a joint holds, whose sensors
-            measure what it passes on; None measures nothing.
+        hooked: the one of `a` and `b` in place of which a body without a joint holds; its sensors
+            measure what it passes on. None measures nothing.
         """
         ends = [self.a, self.b]
         if hooked is not None:

@@ -77,7 +77,7 @@ class ScenePart(Plugin):
     def start(
         self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
     ) -> Start:
-        """Events begin anew in worlds all of which's characters do."""
+        """Events begin anew in worlds where all characters do."""
         if self.happenings:
             n, k = self._sim.num_envs, self._many
             every = torch.arange(n, device=self._sim.backend.device)
