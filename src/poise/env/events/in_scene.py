@@ -1,5 +1,7 @@
 """A task's part in a scene: what its terms see of it, what happens in it, when episodes end."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 from collections.abc import Mapping

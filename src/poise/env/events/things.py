@@ -1,5 +1,7 @@
 """Events of props and links: things set down, thrown, moved, and links that are switched."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 from collections.abc import Callable
