@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -21,8 +21,9 @@ from poise.nets.transition import Known
 from poise.spatial import slerp
 from poise.synth.footlock import lock_feet
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
+from poise.synth.limits import ALOFT_M, Calmed, Motion, calmed, excess, fastest, flown, off_floor
 from poise.synth.other_rig import OtherRig
-from poise.synth.seams import meet, sampled
+from poise.synth.seams import meet, sampled, spread
 
 #: Test-time adaptation of one gap, so that its feet slide less: of 10, 20 and 40 iterations at 3e-5 and
 #: 1e-4 the one with the least slide, against the recorded, in its worst of four CMU clips (03_01, 03_03,
@@ -95,7 +96,10 @@ def fill_keyframes(
         rig = OtherRig.between(interpolated(own, root, rot, gaps), _example(other, clip, model))
         feet = foot_joints(own.skeleton)
         warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
-    filler = _Filler(own, model, filling, keys, rig, feet)
+    kept = [k for k in range(clip.frames) if k in keys or not keys[0] < k < keys[-1]]
+    heights = off_floor(own.skeleton, (root[kept], rot[kept]))
+    aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
+    filler = _Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft)
     clips: list[Clip] = []
     made = 0
     for sample in range(filling.samples):
@@ -110,7 +114,31 @@ def fill_keyframes(
                 on_gap(made, len(gaps) * filling.samples)
         name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
         clips.append(_as_clip(clip, *path, name))
-    return Filled(tuple(clips), tuple(warnings))
+    return Filled(tuple(clips), (*warnings, *_calmings(filler.calmed)))
+
+
+def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
+    """Which gaps hold less than the whole of what the network made, or are too fast all the same."""
+
+    def listed(gaps: list[str]) -> str:
+        return ", ".join(gaps[:6]) + (f" and {len(gaps) - 6} more" if len(gaps) > 6 else "")
+
+    less = [f"{a} to {b} ({100 * c.share:.0f} %)" for (a, b), c in calmed.items() if c.share < 1.0]
+    free = [f"{a} to {b}" for (a, b), c in calmed.items() if not c.held]
+    fast = [f"{a} to {b} ({c.over:.1f} x)" for (a, b), c in calmed.items() if c.over > 1.0]
+    out: list[str] = []
+    if less:
+        out.append(
+            "the network moves joints faster than people do; so much of its motion is kept, the rest "
+            f"interpolated: frames {listed(less)}"
+        )
+    if free and len(free) < len(calmed):
+        out.append(f"feet are not held where they could not get there in time: frames {listed(free)}")
+    if fast:
+        out.append(
+            f"the keyframes ask for more than people reach, give them more time: frames {listed(fast)}"
+        )
+    return tuple(out)
 
 
 def unlike(clip: Clip, model: InbetweenModel) -> str | None:
@@ -156,7 +184,14 @@ def _between(root: Tensor, rot: Tensor, gap: Gap) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class _Filler:
-    """Fills the gaps of one clip `own`; feet: its joints that may stand."""
+    """Fills the gaps of one clip `own`.
+
+    Attributes:
+        feet: its joints that may stand.
+        limits: `(J,)` m/s that its joints reach at most.
+        aloft: m that each keyframe is off the floor, 0 for those that stand.
+        calmed: what each gap was made of to keep to what people reach, by its ends.
+    """
 
     own: Clip
     model: InbetweenModel
@@ -164,16 +199,42 @@ class _Filler:
     keys: tuple[int, ...]
     rig: OtherRig | None
     feet: Sequence[int]
+    limits: Tensor
+    aloft: dict[int, float]
+    calmed: dict[Gap, Calmed] = field(default_factory=dict[Gap, Calmed])
 
     @torch.no_grad()
     def fill(self, root: Tensor, rot: Tensor, gap: Gap, noise: torch.Generator | None) -> None:
         """Fills a gap in place."""
         a, b = gap
-        root[a + 1 : b], rot[a + 1 : b], contact = self._transition(root, rot, gap, noise)
+        *made, contact = self._transition(root, rot, gap, noise)
+        plain = _between(root, rot, gap)
+        ends = (root[[a, b]], rot[[a, b]])
+        made = spread(ends, (made[0], made[1]))
+        before, after = (self.aloft.get(k, 0.0) for k in gap)
+        if max(before, after) > 0.0:
+            made[0][:, 2] = plain[0][:, 2] = flown(plain[0][:, 2], before, after, self.own.fps)
+
+        def finish(motion: Motion, hold: bool) -> Motion:
+            root[a + 1 : b], rot[a + 1 : b] = motion
+            self._finish(root, rot, gap, contact if hold else contact[:, :0])
+            return root[a + 1 : b].clone(), rot[a + 1 : b].clone()
+
+        def over(motion: Motion) -> float:
+            whole = tuple(torch.cat((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
+            return excess(self.own.skeleton, self.limits, (whole[0], whole[1]), self.own.fps)[0]
+
+        done = calmed(made, plain, finish, over, self.filling.foot_lock)
+        root[a + 1 : b], rot[a + 1 : b] = done.motion
+        self.calmed[gap] = done
+
+    def _finish(self, root: Tensor, rot: Tensor, gap: Gap, contact: Tensor) -> None:
+        """Holds the feet of a gap and lets its ends meet, in place."""
+        a, b = gap
         # Two frames before, and after the gap where they are kept, say how fast it must be met.
         low = max(0, a - 1)
         high = min(len(root), b + 2) if b >= self.keys[-1] else b + 1
-        if self.filling.foot_lock and len(self.feet) == contact.shape[1]:
+        if len(self.feet) and len(self.feet) == contact.shape[1]:
             free = torch.zeros(high - low, dtype=torch.bool)
             free[a + 1 - low : b - low] = True
             stands = torch.zeros(high - low, contact.shape[1], dtype=torch.bool)

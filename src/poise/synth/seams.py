@@ -43,6 +43,33 @@ def fade(count: int, frames: int) -> Tensor:
     return 0.5 * (1 + torch.cos(torch.pi * t))
 
 
+def spread(ends: tuple[Tensor, Tensor], made: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Generated frames that lead from one kept frame to another, with what they miss of either spread
+    over all of them.
+
+        y(i) += (1 - s(i)) (x(0) - (2 y(1) - y(2))) + s(i) (x(n+1) - (2 y(n) - y(n-1))),
+
+    with s from 0 to 1 along a smooth step, and for rotations the same in turns: an end that the motion
+    misses by far is not made up for in a jerk.
+
+    Args:
+        ends: root `(2, 3)` and rotations `(2, J, 4)` of the kept frames.
+        made: root `(n, 3)` and rotations `(n, J, 4)` between them.
+    """
+    (ends_root, ends_rot), (root, rot) = ends, made
+    n = len(root)
+    if n < 2:
+        return root.clone(), rot.clone()
+    t = torch.arange(1, n + 1, dtype=root.dtype) / (n + 1)
+    ease = t * t * (3 - 2 * t)
+    shift, turn = torch.zeros_like(root), torch.zeros(n, rot.shape[1], 3, dtype=rot.dtype)
+    for k, (a, b), weight in ((0, (1, 0), 1 - ease), (1, (n - 2, n - 1), ease)):
+        place, pose = _ahead(root, rot, a, b)
+        shift += weight[:, None] * (ends_root[k] - place)
+        turn += weight[:, None, None] * quat_to_rotvec(quat_mul(ends_rot[k], quat_conj(pose)))
+    return root + shift, normalize(quat_mul(rotvec_to_quat(turn), rot))
+
+
 def meet(root: Tensor, rot: Tensor, before: int, after: int, blend: int) -> tuple[Tensor, Tensor]:
     """A path; its generated middle leaves and reaches the kept frames at their speed.
 
