@@ -87,7 +87,7 @@ def test_python_snippets_run(
     code = _blocks(page, "python")[index]
     for long, short in _SHORTER:
         code = code.replace(long, short)
-    for name in re.findall(r"(?:read_clip|imitate|track|inbetween|read)\(\"([\w.]+)\"", code):
+    for name in re.findall(r"(?:read_clip|imitate|track|inbetween|complete|read)\(\"([\w.]+)\"", code):
         shutil.copy(_example_clip(request), tmp_path / name)
     if "policy.safetensors" in code:
         shutil.copytree(request.getfixturevalue("policy"), tmp_path, dirs_exist_ok=True)

@@ -5,6 +5,7 @@
     made = poise.imitate("walk.bvh", minutes=3)     # a policy is trained on the clip
     tracked = poise.track("kick.bvh")               # by the policy that comes with Poise
     filled = poise.inbetween("dance.bvh", (0, 30, 60))
+    done = poise.complete("dance.bvh", (0, 30, 60))  # the same with a body
     made.card, made.clip, made.notes, made.save("out")
     poise.open_run("out").evaluate(help_limit=0.0)
 
@@ -20,6 +21,7 @@ from poise.errors import PoiseError
 from poise.version import __version__
 
 if TYPE_CHECKING:
+    from poise.jobs.complete import Completed, complete
     from poise.jobs.imitate import Imitated, imitate
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
     from poise.jobs.inbetween.training import Inbetween
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "Clip": "poise.motion",
     "ClipLibrary": "poise.motion",
+    "Completed": "poise.jobs.complete",
     "Imitated": "poise.jobs.imitate",
     "Inbetween": "poise.jobs.inbetween.training",
     "Inbetweened": "poise.jobs.inbetween.fill",
@@ -43,6 +46,7 @@ _PLACES = {
     "Run": "poise.jobs.open",
     "TrackConfig": "poise.jobs.track",
     "Tracked": "poise.jobs.track",
+    "complete": "poise.jobs.complete",
     "imitate": "poise.jobs.imitate",
     "inbetween": "poise.jobs.inbetween.fill",
     "open_run": "poise.jobs.open",
@@ -54,6 +58,7 @@ _PLACES = {
 __all__ = [
     "Clip",
     "ClipLibrary",
+    "Completed",
     "Imitated",
     "Inbetween",
     "Inbetweened",
@@ -64,6 +69,7 @@ __all__ = [
     "TrackConfig",
     "Tracked",
     "__version__",
+    "complete",
     "imitate",
     "inbetween",
     "open_run",

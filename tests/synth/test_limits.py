@@ -45,21 +45,29 @@ def test_what_is_missed_is_spread_over_the_whole_gap() -> None:
 def test_a_keyframe_in_the_air_is_reached_by_gravity() -> None:
     n, h = 29, 0.3
     line = 0.9 + h * torch.arange(1, n + 1, dtype=torch.float64) / (n + 1)
-    up = flown(line, 0.0, h, FPS)
+    up, in_air, along = flown(line, 0.0, h, FPS)
     t = torch.arange(n, 0, -1, dtype=torch.float64) / FPS
     flight = math.sqrt(2 * h / 9.81)
-    in_air = t < flight
+    assert torch.equal(in_air, t < flight)
     torch.testing.assert_close(up[in_air], 0.9 + h - 0.5 * 9.81 * t[in_air] ** 2, atol=1e-3, rtol=0)
-    torch.testing.assert_close(up[~in_air], torch.full_like(up[~in_air], 0.9))
+    # Before it, a crouch from which it is pushed off with the speed of the flight; it begins at rest.
+    assert float(up[~in_air].min()) == pytest.approx(0.9 - 0.7 * h, abs=0.02)
+    assert float((up[:5] - 0.9).abs().max()) < 1e-6
+    speed = up.diff() * FPS
+    assert float(speed.diff().abs().max()) * FPS < 20.0
+    # It goes ahead while it pushes off and flies, evenly in the air.
+    assert float(along[:10].max()) == 0.0 and float(along[-1]) == pytest.approx(1.0, abs=0.15)
+    even = along[in_air].diff()
+    torch.testing.assert_close(even, even[:1].expand_as(even), atol=1e-6, rtol=0)
     # Down again is the same backwards, and two keyframes of one flight lie on one parabola.
-    torch.testing.assert_close(flown(line.flip(0), h, 0.0, FPS), up.flip(0))
+    torch.testing.assert_close(flown(line.flip(0), h, 0.0, FPS).height, up.flip(0))
     few = torch.full((5,), 1.2, dtype=torch.float64)
-    fell = flown(few, h, h, FPS).diff(n=2) * FPS**2
+    fell = flown(few, h, h, FPS).height.diff(n=2) * FPS**2
     torch.testing.assert_close(fell, torch.full_like(fell, -9.81), atol=1e-3, rtol=0)
     # Too short a gap to come from the floor: no step at its other end.
-    short = flown(0.9 + h * torch.arange(1, 4, dtype=torch.float64) / 4, 0.0, h, FPS)
+    short = flown(0.9 + h * torch.arange(1, 4, dtype=torch.float64) / 4, 0.0, h, FPS).height
     assert float(short.diff().abs().max()) < 0.12
-    assert torch.equal(flown(line, 0.0, 0.0, FPS), line)
+    assert torch.equal(flown(line, 0.0, 0.0, FPS).height, line)
 
 
 def test_the_network_is_followed_as_far_as_people_reach() -> None:

@@ -28,6 +28,7 @@ VERBS = {
     "imitate": "give one clip a body: train, simulate, score, report",
     "train": "train a recipe on one clip or a library, and no more",
     "inbetween": "fill the frames between keyframes of a clip with a trained network",
+    "complete": "from keyframes to a body: fill the frames, and let a character do them",
     "track": "let a trained policy do any motion, without training",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",

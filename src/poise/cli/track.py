@@ -77,6 +77,12 @@ class Options:
     """Where a single motion sits, leans or steps on something, put a box there; a sentence says what."""
     support: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Boxes beside the motion that stand there instead (.json), such as a result's supports.json."""
+    weight: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PART=FACTOR[:A-B]")] = ()
+    """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
+    pin: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:A-B")] = ()
+    """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
+    touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
+    """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -149,6 +155,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         raise PoiseError("several characters make several files", motion, "Give a folder as -o")
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, write
+    from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
@@ -160,6 +167,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
         smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
         search=search, threads=o.threads, body=o.body, supports=stands,
+        direction=direction_of(o.weight, o.pin, o.touch),
     )  # fmt: skip
     config.check(len(o.clips))
     given = [read(clip, o.reading) for clip in o.clips]

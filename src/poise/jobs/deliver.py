@@ -90,6 +90,7 @@ def deliver(
     hold: bool = True,
     source: Clip | None = None,
     said: tuple[str, ...] = (),
+    keys: tuple[int, ...] = (),
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`.
 
@@ -104,6 +105,7 @@ def deliver(
             what holding did stands in them as well.
         source: see `make_report`.
         said: sentences that the report begins with.
+        keys: frames of the source that stay visible in the report.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
@@ -115,7 +117,9 @@ def deliver(
     paths["score"] = write_score(done.card, out / "score.json")
     paths["report"] = out / "report.html"
     report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
-    write_report(replace(report, notes=(*said, *report.notes, *done.notes)), paths["report"])
+    frames = tuple(round(k / (source or imitation.library.clips[0]).fps * report.fps) for k in keys)
+    report = replace(report, notes=(*said, *report.notes, *done.notes), keys=frames)
+    write_report(report, paths["report"])
     return replace(done, paths=paths)
 
 

@@ -44,6 +44,7 @@ class Tried(NamedTuple):
         ended: `(G,)` bool, whether a world's goal ended before the horizon.
         rough: how rough the copies were.
         source: how rough their goals were, `(G, ...)`.
+        off: `(N, T, B)` m, how far each body was from its goal, from the first step on.
     """
 
     cost: Tensor
@@ -51,6 +52,7 @@ class Tried(NamedTuple):
     ended: Tensor
     rough: Roughness
     source: Roughness
+    off: Tensor
 
 
 class Candidates:
@@ -120,4 +122,7 @@ class Candidates:
             )
             for p, q, was in ((pos, quat, past), (ref_pos, ref_quat, past[:1, :0]))
         )
-        return Tried(cost, lost, ended, rough, source)
+        each = n // groups
+        aims = torch.stack(ref_pos[1:] or ref_pos, 1).repeat_interleave(each, 0)
+        off = (torch.stack(pos[1:] or pos, 1) - aims).norm(dim=-1)
+        return Tried(cost, lost, ended, rough, source, off)

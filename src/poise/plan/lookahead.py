@@ -160,6 +160,8 @@ class Lookahead:
         policy: acts on observations of both environments.
         value: the return `(N,)` that the policy is still to earn, of observations `(N, O)`.
         config: see `LookaheadConfig`.
+        prices: `(F, B)`, what a metre costs by which each body is off its goal, beside the reward, in
+            each of the reference's frames; None for nothing.
 
     Attributes:
         seconds: of each decision.
@@ -171,7 +173,9 @@ class Lookahead:
         policy: Acts,
         value: Callable[[Tensor], Tensor],
         config: LookaheadConfig | None = None,
+        prices: Tensor | None = None,
     ):
+        self.prices = prices
         self.copies, self.policy = copies, policy
         self.config = c = config or LookaheadConfig(candidates=copies.num_envs)
         if copies.num_envs != c.candidates:
@@ -248,7 +252,13 @@ class Lookahead:
         bodies = torch.stack(world.past) if world.past else self._env.pose().pos[:0]
         changes = Changes(drawn, self._keep, self._much)
         snapshot = self._env.snapshot(torch.tensor([i]))
-        cost, _, _, rough, source = self._candidates.tried(snapshot, changes, bodies.unsqueeze(0))
+        cost, _, _, rough, source, apart = self._candidates.tried(snapshot, changes, bodies.unsqueeze(0))
+        if self.prices is not None:
+            reference, clip = self._env.reference, int(self._env.clip[i])
+            first = int(reference.start[clip])
+            frame = torch.arange(1, apart.shape[1] + 1) + int(self._env.frame[i])
+            frame = first + frame.clamp_max(int(reference.length[clip]) - 1)
+            cost = cost + (self.prices[frame] * apart).sum((1, 2))
         price = rough.price(source, c.jerk_price, c.slide_price)
         off = self._env.pose().pos[i] - self._env.goal_pose().pos[i]
         left = 1.0 - float(off.norm(dim=-1).mean()) / c.strict_m

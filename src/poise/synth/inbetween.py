@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from poise.synth.footlock import lock_feet
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
 from poise.synth.limits import ALOFT_M, Calmed, Motion, calmed, excess, fastest, flown, off_floor
 from poise.synth.other_rig import OtherRig
+from poise.synth.planted import planted
 from poise.synth.seams import meet, sampled, spread
 
 #: Test-time adaptation of one gap, so that its feet slide less: of 10, 20 and 40 iterations at 3e-5 and
@@ -52,10 +54,15 @@ class Filling:
 
 @dataclass(frozen=True, eq=False)
 class Filled:
-    """The clips, and what the user should know."""
+    """The clips, and what the user should know.
+
+    over: by which factor the fastest joint goes beyond what people reach in each gap between keyframes
+    of the last clip, 1 at most where none does.
+    """
 
     clips: tuple[Clip, ...]
     warnings: tuple[str, ...]
+    over: tuple[float, ...] = ()
 
 
 def fill_keyframes(
@@ -114,7 +121,11 @@ def fill_keyframes(
                 on_gap(made, len(gaps) * filling.samples)
         name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
         clips.append(_as_clip(clip, *path, name))
-    return Filled(tuple(clips), (*warnings, *_calmings(filler.calmed)))
+    gaps_over = tuple(
+        max((c.over for (x, y), c in filler.calmed.items() if a <= x and y <= b), default=0.0)
+        for a, b in pairwise(keys)
+    )
+    return Filled(tuple(clips), (*warnings, *_calmings(filler.calmed)), gaps_over)
 
 
 def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
@@ -212,12 +223,21 @@ class _Filler:
         ends = (root[[a, b]], rot[[a, b]])
         made = spread(ends, (made[0], made[1]))
         before, after = (self.aloft.get(k, 0.0) for k in gap)
-        if max(before, after) > 0.0:
-            made[0][:, 2] = plain[0][:, 2] = flown(plain[0][:, 2], before, after, self.own.fps)
+        in_air = torch.zeros(b - a + 1, dtype=torch.bool)
+        if jumps := max(before, after) > 0.0:
+            flight = flown(plain[0][:, 2], before, after, self.own.fps)
+            here, there = ends[0][:, None, :2].to(made[0]).unbind(0)
+            level = torch.lerp(here, there, flight.along[:, None])
+            path = torch.cat((level, flight.height[:, None]), 1)
+            made, plain = (path, made[1]), (path.clone(), plain[1])
+            in_air[0], in_air[1:-1], in_air[-1] = before > 0.0, flight.in_air, after > 0.0
 
         def finish(motion: Motion, hold: bool) -> Motion:
             root[a + 1 : b], rot[a + 1 : b] = motion
-            self._finish(root, rot, gap, contact if hold else contact[:, :0])
+            self._finish(root, rot, gap, contact[:, :0] if jumps or not hold else contact)
+            if jumps and hold:
+                here = slice(a, b + 1)
+                rot[here] = planted(self.own.skeleton, root[here], rot[here], in_air, self.own.fps)
             return root[a + 1 : b].clone(), rot[a + 1 : b].clone()
 
         def over(motion: Motion) -> float:

@@ -24,6 +24,10 @@ SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: m above its height on the floor from which on a body is in the air.
 ALOFT_M = 0.06
 
+#: Depth of the crouch before and after a jump, as a share of its height, and between which it lies, m; s
+#: that it takes to go down.
+CROUCH, CROUCHES_M, CROUCH_S = 0.7, (0.08, 0.3), 0.35
+
 #: Root `(T, 3)` m and rotations `(T, J, 4)`.
 Motion = tuple[Tensor, Tensor]
 
@@ -98,12 +102,28 @@ def calmed(
     return best
 
 
-def flown(height: Tensor, before: float, after: float, fps: float) -> Tensor:
+class Flown(NamedTuple):
+    """A gap with an end in the air.
+
+    Attributes:
+        height: `(n,)` m, of the root.
+        in_air: `(n,)` bool.
+        along: `(n,)`, the share of the level way between the keyframes that is done.
+    """
+
+    height: Tensor
+    in_air: Tensor
+    along: Tensor
+
+
+def flown(height: Tensor, before: float, after: float, fps: float) -> Flown:
     """Heights `(n)` m of a root in a gap with an end in the air: there it rises or falls by gravity.
 
     A keyframe in the air is taken as the top of its flight, so that the root leaves the floor
-    t = sqrt(2 h / g) before it and comes back as long after it: z(t) = z_key - g t^2 / 2. Two keyframes
-    too near to one another for that are of one flight, a parabola through both.
+    t = sqrt(2 h / g) before it and comes back as long after it: z(t) = z_key - g t^2 / 2. It takes off
+    with v = g t from a crouch of depth d, evenly accelerated over 2 d / v, and lands in one alike; it
+    goes ahead over its feet in that time alone, and evenly in the air. Two keyframes too near to one
+    another for that are of one flight, a parabola through both.
 
     Args:
         height: the root on the straight line between the keyframes, without these.
@@ -114,17 +134,45 @@ def flown(height: Tensor, before: float, after: float, fps: float) -> Tensor:
     whole = (n + 1) / fps
     falls = (2.0 * before / GRAVITY) ** 0.5, (2.0 * after / GRAVITY) ** 0.5
     if whole < sum(falls) and before > 0.0 and after > 0.0:
-        return height + 0.5 * GRAVITY * t * (whole - t)
-    out = height.clone()
-    for off, since in ((before, t), (after, whole - t)):
+        rise = 0.5 * GRAVITY * t * (whole - t)
+        return Flown(height + rise, torch.ones(n, dtype=torch.bool), t / whole)
+    out, in_air = height.clone(), torch.zeros(n, dtype=torch.bool)
+    ways: list[Tensor] = []
+    for off, fall, since, away in ((before, falls[0], t, True), (after, falls[1], whole - t, False)):
         if off <= 0.0:
             continue
         # The line's own rise goes, and what is left where the gap ends before the flight does.
         flight = (off - 0.5 * GRAVITY * since**2).clamp_min(0.0)
         rest = max(0.0, off - 0.5 * GRAVITY * whole**2)
-        up = flight - (rest * since + off * (whole - since)) / whole
-        out = out + up
-    return out
+        out = out + flight - (rest * since + off * (whole - since)) / whole
+        depth = min(max(CROUCH * off, CROUCHES_M[0]), CROUCHES_M[1])
+        push = 2.0 * depth / (GRAVITY * fall)
+        out = out - _crouch(since - fall, depth, push, whole - fall)
+        in_air |= since < fall
+        left = _left(since, fall, min(push, max(whole - fall, 1e-6)))
+        ways.append(left if away else 1.0 - left)
+    return Flown(out, in_air, torch.stack(ways).mean(0) if ways else t / whole)
+
+
+def _left(since: Tensor, fall: float, push: float) -> Tensor:
+    """The share of the way to a keyframe in the air that is left `since` seconds before it."""
+    whole = fall + 0.5 * push
+    pushing = 1.0 - (fall + push - since).clamp_min(0.0) ** 2 / (2.0 * push * whole)
+    return torch.where(since <= fall, since / whole, pushing).clamp(0.0, 1.0)
+
+
+def _crouch(since: Tensor, depth: float, push: float, room_s: float) -> Tensor:
+    """How deep (m) a body crouches, `since` seconds before it takes off or after it landed.
+
+    depth: at most, m. push: s from there to the take-off. room_s: what there is of the gap.
+    """
+    speed = 2.0 * depth / push
+    if room_s < push + CROUCH_S:
+        return torch.zeros_like(since)
+    pushing = depth - 0.5 * speed / push * (push - since) ** 2
+    sinking = 0.5 * depth * (1.0 + torch.cos(torch.pi * (since - push) / CROUCH_S))
+    down = torch.where(since <= push, pushing, sinking)
+    return torch.where((since > 0.0) & (since < push + CROUCH_S), down, 0.0)
 
 
 def off_floor(skeleton: Skeleton, motion: Motion) -> Tensor:

@@ -83,6 +83,7 @@ class Report:
         helps: of each frame `(K, 6)`, points and residual forces of several bodies in the same way; they
             are drawn in place of `force`, which is their sum. () where the root alone is helped.
         others: other characters of the same body in the simulation's world.
+        keys: frames of the reference that stay visible, such as keyframes.
     """
 
     title: str
@@ -105,6 +106,7 @@ class Report:
     pushes: tuple[np.ndarray, ...] = ()
     helps: tuple[np.ndarray, ...] = ()
     others: tuple[Track, ...] = ()
+    keys: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fps) and self.fps > 0):
@@ -255,6 +257,7 @@ def payload(report: Report) -> dict[str, Any]:
         ],
         "pushes": _pushes(report.pushes),
         "helps": _pushes(report.helps),
+        "keys": [k for k in report.keys if 0 <= k < len(report.reference.pos)],
         "others": [encode_track(track) for track in report.others],
         "feet": foot_bodies(report.bodies),
         "weight": body_weight(report),

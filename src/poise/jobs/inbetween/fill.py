@@ -25,13 +25,14 @@ class Inbetweened(Result):
     """What came of filling keyframes; nothing is simulated, so there is no score.
 
     clips: the first is the best guess, the others are variants. source: what came in. keyframes: its
-    frames that stayed. warnings: what is doubtful.
+    frames that stayed. warnings: what is doubtful. over: see `synth.inbetween.Filled`.
     """
 
     clips: tuple[Clip, ...]
     source: Clip
     keyframes: tuple[int, ...]
     warnings: tuple[str, ...]
+    over: tuple[float, ...] = ()
     card: None = None
 
     @property
@@ -87,7 +88,7 @@ def inbetween(
     adaptation = replace(EACH_GAP, iterations=adapt) if adapt else None
     filling = Filling(samples, foot_lock, adaptation=adaptation, seed=seed)
     filled = fill_keyframes(source, keys, net, filling, on_gap)
-    return Inbetweened(filled.clips, source, tuple(keys), filled.warnings)
+    return Inbetweened(filled.clips, source, tuple(keys), filled.warnings, filled.over)
 
 
 def shipped_model(path: str | Path | None = None) -> Path:

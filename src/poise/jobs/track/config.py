@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from poise.errors import PoiseError
+from poise.jobs.track.direction import Direction
 from poise.kin.supports import Support
 from poise.motion.noise import Noise
 from poise.plan import LookaheadConfig, SamplingConfig
@@ -38,6 +39,7 @@ class TrackConfig:
             the same bodies and hinges with the lengths and masses of the skeleton that came in.
         supports: "auto" puts boxes where a single motion sits, leans or steps on something
             (`kin.supports`), "none" leaves the floor alone; or supports beside the motion that comes in.
+        direction: what counts more, stays put or is touched; for a single clip.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -52,6 +54,7 @@ class TrackConfig:
     threads: int = 0
     body: Literal["policy", "own"] = "policy"
     supports: Literal["auto", "none"] | tuple[Support, ...] = "auto"
+    direction: Direction = field(default_factory=Direction)
 
     def __post_init__(self) -> None:
         validate(self)
@@ -67,6 +70,9 @@ class TrackConfig:
         if isinstance(self.supports, tuple) and (self.recover or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes back by itself"
             raise PoiseError(f"supports are for a single character, not {what}")
+        if self.direction and (self.recover or self.count > 1):
+            what = "several characters" if self.count > 1 else "one that comes back by itself"
+            raise PoiseError(f"weights, pins and touches are for a single character, not {what}")
         if self.body == "own" and self.recover:
             raise PoiseError("recovery clips are those of the policy's body, so body='own' has none")
 
@@ -80,6 +86,7 @@ class TrackConfig:
             "several characters are": self.count > 1, "noise is": bool(self.noise),
             "putting a character back is": self.reset_on_fail,
             "a search is": self.controller == "search", "a body of its own is": self.body == "own",
+            "weights, pins and touches are": bool(self.direction),
             "a support is": isinstance(self.supports, tuple),
         }  # fmt: skip
         if not clips:

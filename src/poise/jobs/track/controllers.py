@@ -60,10 +60,12 @@ def done_by(
     config: TrackConfig,
     replayed: Replay | None = None,
     show: Show | None = None,
+    prices: Tensor | None = None,
 ) -> tuple[Done, Sequence[str]]:
     """Does a task's motion with the controller that is wanted, or whatever it takes.
 
     Args:
+        prices: what counts more, see `Lookahead`.
         replayed: actions that were made already; nothing else is tried then.
 
     Returns:
@@ -75,7 +77,7 @@ def done_by(
     if config.looks_ahead and tracker.value is None:
         notes.append(NO_CRITIC)
     if config.looks_ahead and tracker.value is not None:
-        ahead = look_ahead(tracker, imitation, config.lookahead, config.threads, config.seed)
+        ahead = look_ahead(tracker, imitation, config.lookahead, config.threads, config.seed, prices)
         try:
             done = _episode(imitation, config, ahead, "lookahead", show)
         finally:
@@ -121,13 +123,15 @@ def led_by(
 
 
 def look_ahead(
-    tracker: Tracker, imitation: Imitation, config: LookaheadConfig, threads: int = 0, seed: int = 0
-) -> Lookahead:
+    tracker: Tracker, imitation: Imitation, config: LookaheadConfig, threads: int = 0, seed: int = 0,
+    prices: Tensor | None = None,
+) -> Lookahead:  # fmt: skip
     """The tracker's policy with lookahead in copies of a character of a task, without help.
 
     Args:
         threads: of the physics of the copies; 0 is all cores.
         seed: takes the place of the settings' own.
+        prices: see `Lookahead`.
 
     Raises:
         PoiseError: the policy has no critic.
@@ -138,7 +142,7 @@ def look_ahead(
     copies = imitation.bare(rewards=True).env(
         config.candidates, auto_reset=False, threads=threads, help_scale=0.0, guard=False
     )
-    return Lookahead(copies, tracker.policy, tracker.value, replace(config, seed=seed))
+    return Lookahead(copies, tracker.policy, tracker.value, replace(config, seed=seed), prices)
 
 
 def loses(tracker: Tracker, imitation: Imitation) -> bool:

@@ -20,6 +20,7 @@ from poise.jobs.track.recovering import Losses
 from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
 from poise.kin import hold_feet
+from poise.kin.directed import Pin, pinned
 from poise.kin.supports import Support
 from poise.motion import Clip
 from poise.motion.io import home_suffix, write_clip
@@ -59,7 +60,7 @@ class Tracked(Result):
     was lost and found again; None where it was not. found: what a search came to; None where
     nothing was searched. controller: which did the motion: "policy", "lookahead" or "search". parts:
     what became of each of several clips; none where it was one. supports: what stands in the world for
-    the motion to rest on, in the world of the body.
+    the motion to rest on, in the world of the body. pins: limbs that stay put.
     """
 
     tracker: Tracker
@@ -74,6 +75,7 @@ class Tracked(Result):
     controller: str = "policy"
     parts: tuple[Part, ...] = ()
     supports: tuple[Support, ...] = ()
+    pins: tuple[Pin, ...] = ()
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -95,9 +97,9 @@ class Tracked(Result):
         made = self.motion(character)
         if hold:
             made = hold_feet(made, self.imitation.humanoid.table)[0]
-        if self.placed.moved is None:
-            return made
-        return home(made, self.placed, self.tracker).replaced(name=made.name)
+        if self.placed.moved is not None:
+            made = home(made, self.placed, self.tracker).replaced(name=made.name)
+        return pinned(made, self.pins) if hold and self.pins else made
 
     def _shown(self) -> Shown:
         return Shown(self.clip, self.placed.source, self.card, self.notes)
@@ -116,6 +118,8 @@ def write(
     motion: Path | None = None,
     hold: bool = True,
     curve: dict[str, np.ndarray] | None = None,
+    keys: tuple[int, ...] = (),
+    said: tuple[str, ...] = (),
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`, see `deliver`.
 
@@ -125,19 +129,20 @@ def write(
     Args:
         motion: the file of the motion, in place of one in `out`. hold: see `deliver`.
         curve: of a training, which the report draws.
+        keys: frames of the clip that stay visible in the report. said: sentences that it begins with.
     """
     t, placed, count = tracked, tracked.placed, len(tracked.evaluation.recordings)
     if count > 1 and motion is not None:
         raise PoiseError(f"{count} characters make {count} files", motion, "Give a folder as -o")
     other = placed.moved is not None
     inner = out / "body.bvh" if other and count == 1 else motion
-    said = tuple(
+    failures = tuple(
         f"The character failed at {seconds:.1f} s" + (f" (character {k + 1})." if count > 1 else ".")
         for k, seconds in t.failures
     )
-    said = tuple(p.sentence() for p in t.parts) or said
+    said += tuple(p.sentence() for p in t.parts) or failures
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
-    done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said)
+    done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys)
     if not other:
         return _with_supports(t, done, out, hold)
     paths: dict[str, Path] = {}

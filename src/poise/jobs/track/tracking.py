@@ -83,6 +83,7 @@ def track(
     motions = [read_motion(m) for m in motions]
     motion = motions[0]
     given, points = _input(motion, config)
+    given, directions = config.direction.applied(given)
     several = len(motions) > 1
     if config.recover or several:
         all_placed = place_all([given, *(_input(m, config)[0] for m in motions[1:])], tracker)
@@ -92,6 +93,7 @@ def track(
     placed = all_placed[0]
     imitation = imitation_of(tracker, all_placed)
     notes = [f"{p.clip.name}: {n}" if several else n for p in all_placed for n in p.notes]
+    notes += directions
     if points is not None and not several:
         reference, said = follow(tracker, placed, points, imitation.reference, config.smooth_hz)
         imitation, notes = replace(imitation, reference=reference), [*notes, *said]
@@ -107,7 +109,9 @@ def track(
         led, said = led_by(tracker, all_placed, imitation, config, progress)
         placed, imitation, replayed, losses, spans = led
         notes += said
-    done, said = done_by(tracker, imitation, config, replayed, progress)
+    ref = imitation.reference
+    prices = config.direction.prices(given, imitation.humanoid.table, ref.frames, ref.rate_hz)
+    done, said = done_by(tracker, imitation, config, replayed, progress, prices)
     notes += said
     if not several:
         notes += rate_notes(
@@ -142,7 +146,7 @@ def track(
         times = tuple((0, p.lost) for p in parts if p.lost is not None)
     return Tracked(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
-        done.controller, parts, supports,
+        done.controller, parts, supports, config.direction.pins,
     )  # fmt: skip
 
 

@@ -195,6 +195,11 @@ Poise.stage2D = (host, data, extent) => {
       things(frame.shift[1]);
       if (Math.hypot(frame.shift[0][0] - frame.shift[1][0], frame.shift[0][1] - frame.shift[1][1]) > 1e-3)
         things(frame.shift[0]);
+      for (const key of data.keys || []) {
+        const at = { pos: new Float32Array(3 * data.bodies.length), quat: new Float32Array(4 * data.bodies.length) };
+        Poise.sample(data.reference, data.bodies.length, data.frames, key, at);
+        character(at, frame.shift[1], colors.ref, colors.refRim, 0.25, [false, false]);
+      }
       for (const pose of frame.others) character(pose, frame.shift[1], colors.other, colors.simRim, 1, [false, false]);
       character(frame.simulated, frame.shift[1], colors.sim, colors.simRim, 1, frame.lit);
       character(frame.reference, frame.shift[0], colors.ref, colors.refRim, 0.3 + 0.3 * frame.blend, [false, false]);

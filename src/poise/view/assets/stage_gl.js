@@ -113,6 +113,10 @@ Poise.stageGL = (host, data, extent) => {
   const reference = character(true);
   const simulated = character(false);
   const others = data.others.map(() => character(false));
+  const keys = (data.keys || []).map((frame) => {
+    const at = { pos: new Float32Array(3 * data.bodies.length), quat: new Float32Array(4 * data.bodies.length) };
+    return { who: character(true), at: Poise.sample(data.reference, data.bodies.length, data.frames, frame, at) };
+  });
 
   const arrowMaterial = new T.MeshBasicMaterial({ depthTest: false, transparent: true });
   const shaft = new T.Mesh(new T.CylinderGeometry(0.016, 0.016, 1, 16).translate(0, 0.5, 0), arrowMaterial);
@@ -193,6 +197,7 @@ Poise.stageGL = (host, data, extent) => {
       const [sx, sy] = frame.shift[1];
       pose(reference, frame.reference, rx, ry);
       pose(simulated, frame.simulated, sx, sy);
+      keys.forEach(({ who, at }) => pose(who, at, sx, sy));
       others.forEach((who, k) => {
         pose(who, frame.others[k], sx, sy);
         for (const mat of who.mats) mat.color.copy(colors.other);

@@ -1,0 +1,185 @@
+"""`poise complete`: keyframes in, the motion of a simulated body out."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+
+from poise.cli.answer import LOST, Answer
+from poise.cli.console import print_card, say, table, tell
+from poise.cli.inbetween import frames_of
+from poise.cli.options import Flag, Reading, check_range
+from poise.cli.output import claimed, may_deliver, may_write, places
+from poise.cli.progress import left, showing, working
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.jobs.complete import Completed
+
+
+@dataclass(frozen=True)
+class Options:
+    """From keyframes to a body: make the motion between keyframes of a clip, let a simulated character
+    do it without help, and write it on the skeleton that came in, with score.json and report.html."""
+
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
+    """The motion file that holds the keyframes."""
+    keyframes: Annotated[str, arg(metavar="0,30,60")]
+    """Frames that stay, counted from 0, in rising order; frames outside of them stay too."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
+    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
+    into a folder of its name."""
+    kinematic: Flag = False
+    """Only fill the frames, without a body: keyframes are met exactly. See poise inbetween."""
+    retime: Flag = False
+    """Give gaps that no body does in their time more of it; the new times are said."""
+    policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
+    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
+    Poise."""
+    model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """A trained in-betweening network; by default the one that comes with Poise."""
+    controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
+    """See poise track."""
+    budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
+    """Simulated control steps of lookahead for each that is made; by default 768."""
+    weight: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PART=FACTOR[:A-B]")] = ()
+    """Parts that lookahead minds more than the rest, such as hands=3, or head=2:10-40 in frames."""
+    pin: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:A-B")] = ()
+    """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
+    touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
+    """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
+    adapt: Annotated[int, arg(metavar="N")] = 20
+    """Iterations of test-time adaptation for each gap; 0 does without."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of all draws."""
+    threads: Annotated[int, arg(metavar="N")] = 0
+    """Cores for lookahead and search; 0 is all."""
+    hold_feet: Flag = True
+    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+def run(options: Options, argv: Sequence[str]) -> Answer:
+    """Reads, fills, simulates, writes."""
+    o = options
+    keys = frames_of(o.keyframes)
+    check_range("adapt", o.adapt, 0, 1000)
+    check_range("seed", o.seed, 0)
+    check_range("threads", o.threads, 0)
+    check_range("budget", o.budget, 1, 1_000_000)
+    if o.kinematic:
+        return _kinematic(o, keys)
+    out, motion = places(o.out)
+    may_deliver(out, motion, o.force, o.clip)
+    from poise.jobs.complete import complete
+    from poise.jobs.open import open_run
+    from poise.jobs.track import TrackConfig
+    from poise.jobs.track.direction import direction_of
+    from poise.plan import LookaheadConfig
+    from poise.synth.gaps import check_keyframes
+
+    ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
+    config = TrackConfig(
+        seed=o.seed, controller=o.controller, lookahead=ahead, threads=o.threads,
+        direction=direction_of(o.weight, o.pin, o.touch),
+    )  # fmt: skip
+    clip = o.reading.read(o.clip)
+    check_keyframes(keys, clip.frames, str(o.clip))
+    with working("opening the policy"):
+        tracker = open_run(o.policy).tracker
+    with claimed(out):
+        with contextlib.ExitStack() as shown:
+            done = complete(
+                clip, keys, tracker, config, model=o.model, adapt=o.adapt, retime=o.retime,
+                progress=_bar(shown),
+            )  # fmt: skip
+        with working("writing"):
+            delivered = done.write(out, motion, o.hold_feet)
+    _say(done)
+    print_card(delivered.card)
+    say(done.sentence)
+    lost = bool(done.tracked.failures)
+    result = {
+        "outcome": "lost" if lost else "completed",
+        "controller": done.tracked.controller,
+        "sentence": done.sentence,
+        "keyframes": list(done.keyframes),
+        "at": list(done.at),
+        "met_mm": [round(x, 1) for x in done.met_mm],
+        "stages": [s.to_dict() for s in done.stages],
+        "score": delivered.card.to_dict(),
+    }
+    word = "lost" if lost else "completed"
+    told = (*done.notes, *delivered.notes)
+    return Answer(result, delivered.paths, told, LOST if lost else 0, word, delivered.card.mpjpe_mm)
+
+
+def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
+    """The filled frames alone."""
+    if o.weight or o.pin or o.touch or o.retime:
+        raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
+    from poise.jobs.inbetween.fill import inbetween
+    from poise.motion.io import check_writable, write_clip
+
+    path = o.out if o.out.suffix else o.out / f"filled{o.clip.suffix}"
+    check_writable(path)
+    may_write(path, o.force, o.clip)
+    clip = o.reading.read(o.clip)
+    with contextlib.ExitStack() as shown:
+        bar = _bar(shown)
+        filled = inbetween(
+            clip, keys, o.model, adapt=o.adapt, seed=o.seed, on_gap=lambda n, of: bar("filling", n, of)
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_clip(filled.clip, path)
+    say(
+        f"{path.name}: {filled.clip.frames} frames at {filled.clip.fps:.5g} fps, keyframes {o.keyframes}"
+    )
+    result = {"outcome": "filled", "keyframes": list(keys), "warnings": list(filled.warnings)}
+    return Answer(result, {"motion": path}, filled.notes, outcome="filled")
+
+
+def _bar(shown: contextlib.ExitStack) -> Callable[[str, int, int], None]:
+    """Shows what is done, with the time left."""
+    began, now = time.monotonic(), ""
+    bar: Callable[[float, str], None] | None = None
+
+    def show(what: str, done: int, of: int) -> None:
+        nonlocal began, now, bar
+        if bar is None or what != now:
+            shown.close()
+            began, now = time.monotonic(), what
+            bar = shown.enter_context(showing(what))
+        share = done / max(of, 1)
+        bar(share, f"{what}, {100 * share:.0f} % done, {left(time.monotonic() - began, share)}")
+
+    return show
+
+
+def _say(done: Completed) -> None:
+    """The stages as a table."""
+
+    def figure(value: float | None, digits: int = 0) -> str:
+        return "" if value is None else f"{value:.{digits}f}"
+
+    rows = [
+        (
+            s.name, figure(s.key_mm), figure(s.foot_slide_mm_per_s), figure(s.penetration_mm, 1),
+            figure(s.jerk_m_per_s3), figure(s.fastest_m_per_s, 1),
+        )
+        for s in done.stages
+    ]  # fmt: skip
+    names = ("stage", "keyframes mm", "foot slide mm/s", "sinks mm", "jerk m/s^3", "fastest m/s")
+    table("stage by stage", names, rows, left=1)
+    for note in done.filled.warnings:
+        tell(f"warning: {note}.", "yellow")

@@ -1,0 +1,214 @@
+"""From keyframes to a body: what `poise complete` does.
+
+done = complete("dance.bvh", (0, 30, 60, 90))
+done.clip, done.card, done.stages, done.save("out")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.eval import ScoreCard
+from poise.jobs.deliver import Delivery
+from poise.jobs.inbetween.fill import Inbetweened, inbetween
+from poise.jobs.result import Result, Shown, clip_of
+from poise.jobs.stages import Stage, stage_of
+from poise.jobs.track import TrackConfig, Tracked, track, write
+from poise.jobs.track.direction import Weight
+from poise.jobs.tracker import Tracker
+from poise.learn.model import InbetweenModel
+from poise.motion import Clip
+from poise.motion.io import home_suffix, write_clip
+from poise.plan import LookaheadConfig
+from poise.settings import changed
+from poise.synth.gaps import check_keyframes
+from poise.synth.retime import Retiming, retimed
+
+#: How much more a keyframe counts than the frames between.
+KEY_WEIGHT = 20.0
+#: Simulated control steps for each that is made, where lookahead is not set otherwise, and its slack:
+#: keyframes are to be met, so little is given up for a smoother motion.
+BUDGET, SLACK = 768.0, 0.3
+#: Rounds of retiming; a gap is made longer by so much in each in which it is not done; m by which a
+#: keyframe may be missed, on average over the joints, and still be met.
+ROUNDS, LONGER, MET_M = 4, 1.3, 0.1
+
+#: Is told what is done, and how much of how much.
+Show = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Completed(Result):
+    """What came of keyframes.
+
+    Attributes:
+        source: what came in.
+        keyframes: its frames that are kept.
+        filled: the kinematic stage, on the times of the result.
+        tracked: the physical stage.
+        at: frames of the result at which each keyframe is; `keyframes` unless times were changed.
+        met_mm: how far the body's joints are from each keyframe, mean, in the world.
+        stages: figures of each stage.
+        retiming: what was done to the times; None where nothing was.
+    """
+
+    source: Clip
+    keyframes: tuple[int, ...]
+    filled: Inbetweened
+    tracked: Tracked
+    at: tuple[int, ...]
+    met_mm: tuple[float, ...]
+    stages: tuple[Stage, ...]
+    retiming: Retiming | None
+
+    @property
+    def card(self) -> ScoreCard:
+        """The score of the simulation against the filled motion, help 0."""
+        return self.tracked.card
+
+    @property
+    def clip(self) -> Clip:
+        """The body's motion on the skeleton that came in."""
+        return self.tracked.clip
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is doubtful, and what was done, in sentences."""
+        said = () if self.retiming is None else (self.retiming.sentence(),)
+        return (*self.filled.notes, *said, *self.tracked.notes)
+
+    @property
+    def sentence(self) -> str:
+        """How the keyframes were met."""
+        worst = int(np.argmax(self.met_mm))
+        done = self.tracked.failed_s
+        if done:
+            return f"Lost: the character fell away from the motion at {done[0]:.1f} s."
+        return (
+            f"Without help; keyframes met to {np.mean(self.met_mm):.0f} mm on average, frame "
+            f"{self.keyframes[worst]} worst with {self.met_mm[worst]:.0f} mm."
+        )
+
+    def _shown(self) -> Shown:
+        return Shown(self.clip, self.filled.clip, self.card, self.notes, self.at)
+
+    def _save_all(self, folder: Path) -> dict[str, Path]:
+        return self.write(folder).paths
+
+    def write(self, out: Path, motion: Path | None = None, hold: bool = True) -> Delivery:
+        """Writes what `track` writes, with the keyframes in the report, and the filled motion beside it
+        as `filled.bvh`, or in the format of the source."""
+        said = (self.sentence, *(s.sentence() for s in self.stages))
+        done = write(self.tracked, out, motion, hold, keys=self.at, said=said)
+        filled = out / f"filled{home_suffix(self.filled.clip)}"
+        write_clip(self.filled.clip, filled)
+        return replace(done, paths={**done.paths, "filled": filled})
+
+
+def complete(
+    clip: Clip | str | Path,
+    keyframes: Sequence[int],
+    policy: Tracker | str | Path | None = None,
+    config: TrackConfig | None = None,
+    *,
+    model: InbetweenModel | str | Path | None = None,
+    adapt: int | None = None,
+    retime: bool = False,
+    progress: Show | None = None,
+    **settings: Any,
+) -> Completed:
+    """Makes a motion of keyframes, and gives it a body: in-betweening, then a simulated character.
+
+    The motion between the keyframes is made by a network (`inbetween`); the policy with lookahead does
+    it, without help, minding the keyframes more than what is between; and it comes back on the
+    skeleton that came in. Frames outside of the keyframes are part of the motion as they are.
+
+    Args:
+        keyframes: frames that stay, counted from 0, in rising order.
+        policy, config, settings: see `track`.
+        model, adapt: see `inbetween`.
+        retime: gaps that no body does in their time get more of it, see `Retiming`.
+        progress: is told what is done.
+
+    Raises:
+        PoiseError: keyframes that make no sense, or a skeleton that is no human's.
+    """
+    config = changed(config or TrackConfig(), settings)
+    if config.count > 1 or config.recover or config.noise:
+        raise PoiseError("keyframes are completed for a single character, without noise or recovery")
+    if config.lookahead == LookaheadConfig():
+        config = replace(config, lookahead=replace(LookaheadConfig().with_budget(BUDGET), slack=SLACK))
+    source = clip_of(clip)
+    keys = tuple(check_keyframes(keyframes, source.frames, source.name))
+    more: dict[str, Any] = {} if adapt is None else {"adapt": adapt}
+    factors = np.ones(len(keys) - 1)
+    best: tuple[float, Completed] | None = None
+    for round_ in range(ROUNDS if retime else 1):
+        stretched, at = retimed(source, keys, factors)
+        told = None if progress is None else _telling(progress, "filling")
+        filled = inbetween(stretched, at, model, on_gap=told, **more)
+        weights = tuple(Weight("all", KEY_WEIGHT, k, k) for k in at)
+        direction = replace(config.direction, weights=(*config.direction.weights, *weights))
+        # A retimed motion is searched at last, when its times are settled.
+        how = config if round_ + 1 == ROUNDS or not retime else replace(config, controller="lookahead")
+        tracked = track(filled.clip, policy, replace(how, direction=direction), progress=progress)
+        done = _completed(source, keys, filled, tracked, at, factors)
+        score = float(np.mean(done.met_mm)) + 1e6 * bool(tracked.failures)
+        if best is None or score < best[0]:
+            best = score, done
+        slow = _too_fast(done)
+        if not retime or not slow.any():
+            break
+        factors = np.where(slow, LONGER * factors, factors)
+    assert best is not None
+    return best[1]
+
+
+def _completed(
+    source: Clip,
+    keys: tuple[int, ...],
+    filled: Inbetweened,
+    tracked: Tracked,
+    at: tuple[int, ...],
+    factors: np.ndarray,
+) -> Completed:
+    made = tracked.delivered(hold=False)
+    wanted, have = source.positions(), made.positions()
+    # What was simulated ends where the character was lost.
+    off = [
+        float(np.linalg.norm(have[min(k, len(have) - 1)] - wanted[s], axis=-1).mean()) * 1000
+        for k, s in zip(at, keys, strict=True)
+    ]
+    stages = tuple(
+        stage_of(name, motion, source, keys, at)
+        for name, motion in (
+            ("filled", filled.clip), ("simulated", made), ("delivered", tracked.delivered()),
+        )
+    )  # fmt: skip
+    retiming = (
+        None if (factors == 1.0).all() else Retiming(keys, at, source.fps, tuple(factors.tolist()))
+    )
+    return Completed(source, keys, filled, tracked, at, tuple(off), stages, retiming)
+
+
+def _too_fast(done: Completed) -> np.ndarray:
+    """`(gaps,)` bool, those that the body did not do in their time."""
+    over = np.array(done.filled.over) > 1.0
+    missed = np.array(done.met_mm) > 1000 * MET_M
+    late = missed[1:] | (missed[:-1] & (np.arange(len(missed) - 1) > 0))
+    out = over | late
+    for _, seconds in done.tracked.failures:
+        frame = seconds * done.source.fps
+        gap = int(np.clip(np.searchsorted(done.at, frame) - 1, 0, len(out) - 1))
+        out[gap] = True
+    return out
+
+
+def _telling(show: Show, what: str) -> Callable[[int, int], None]:
+    return lambda made, of: show(what, made, of)

@@ -1,0 +1,179 @@
+"""A director's controls of tracking: what counts more, what stays put, what is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from poise.body import BodyTable
+from poise.errors import PoiseError, did_you_mean
+from poise.kin.directed import LIMBS, Pin, TouchPoint, directed, ease
+from poise.motion import Clip
+
+#: Cost per metre of distance in a control step of a part that counts twice, and of limbs that are
+#: pinned or touch.
+PRICE, HELD_PRICE = 10.0, 40.0
+#: Parts by the names of weights: kinds of the body table.
+PARTS = {
+    "hands": ("hand",), "feet": ("foot",), "arms": ("upper_arm", "forearm", "hand"),
+    "legs": ("thigh", "shin", "foot"), "head": ("neck", "head"), "trunk": ("pelvis", "spine"),
+    "root": ("pelvis",), "all": (),
+}  # fmt: skip
+SIDED = ("hand", "foot", "arm", "leg")
+#: Highest weight.
+MOST = 100.0
+
+
+@dataclass(frozen=True)
+class Weight:
+    """Parts that count more, or less, than the rest.
+
+    Attributes:
+        part: one of `PARTS`, with a side for hands, feet, arms and legs: "left_hand"; or a body.
+        factor: how much more, 1 as ever.
+        first, last: frames of the clip; None is its begin and its end.
+    """
+
+    part: str
+    factor: float
+    first: int | None = None
+    last: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.factor <= MOST:
+            raise PoiseError(f"a weight must lie in 0 to {MOST:g}, got {self.factor:g}", self.part)
+
+
+@dataclass(frozen=True)
+class Direction:
+    """What a director wants of a motion.
+
+    Attributes:
+        weights: what counts more than the rest; lookahead alone looks at it.
+        pins: hands and feet that stay where they are.
+        touches: points that hands and feet reach.
+    """
+
+    weights: tuple[Weight, ...] = ()
+    pins: tuple[Pin, ...] = ()
+    touches: tuple[TouchPoint, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.weights or self.pins or self.touches)
+
+    def applied(self, clip: Clip) -> tuple[Clip, tuple[str, ...]]:
+        """The clip with its pins and touches, and sentences on them."""
+        return directed(clip, self.pins, self.touches)
+
+    def prices(self, clip: Clip, table: BodyTable, frames: int, rate_hz: float) -> Tensor | None:
+        """`(frames, B)`, what a metre of distance costs in each control step beside the reward; None
+        where nothing counts more.
+
+        Raises:
+            PoiseError: a part that the body does not have.
+        """
+        if not self:
+            return None
+        out = torch.zeros(frames, len(table.rows))
+        at = torch.arange(frames) / rate_hz * clip.fps
+        for weight in self.weights:
+            first = 0 if weight.first is None else weight.first
+            last = clip.frames - 1 if weight.last is None else weight.last
+            # A single frame counts in the control step nearest to it.
+            half = 0.5 * max(1.0, clip.fps / rate_hz)
+            inside = (at >= first - half) & (at <= last + half)
+            rows = rows_of(table, weight.part)
+            price = PRICE * (weight.factor - 1.0) / len(rows)
+            out[inside[:, None] & torch.tensor([i in rows for i in range(len(table.rows))])] += price
+        for held in (*self.pins, *self.touches):
+            span = (held.first, held.last) if isinstance(held, Pin) else (held.frame, held.frame)
+            share = ease(clip.frames, *span, clip.fps)[at.round().long().clamp_max(clip.frames - 1)]
+            for row in rows_of(table, held.limb):
+                out[:, row] += HELD_PRICE * share.float() ** 4
+        return out
+
+
+def rows_of(table: BodyTable, part: str) -> tuple[int, ...]:
+    """Rows of a body table that a part's name means.
+
+    Raises:
+        PoiseError: no such part.
+    """
+    side, _, name = part.rpartition("_")
+    plural = {"hand": "hands", "foot": "feet", "arm": "arms", "leg": "legs"}
+    if side in ("left", "right") and name in plural:
+        kinds = PARTS[plural[name]]
+        return tuple(i for i, r in enumerate(table.rows) if r.kind in kinds and r.side == side)
+    if part == "all":
+        return tuple(range(len(table.rows)))
+    if part in PARTS:
+        return tuple(i for i, r in enumerate(table.rows) if r.kind in PARTS[part])
+    found = tuple(i for i, r in enumerate(table.rows) if r.name == part)
+    if not found:
+        known = [*PARTS, *LIMBS, *(f"{s}_{n}" for s in ("left", "right") for n in ("arm", "leg"))]
+        raise PoiseError(
+            f"there is no part '{part}'",
+            hint=did_you_mean(part, [*known, *(r.name for r in table.rows)]),
+        )
+    return found
+
+
+def direction_of(
+    weights: Sequence[str] = (), pins: Sequence[str] = (), touches: Sequence[str] = ()
+) -> Direction:
+    """What words ask for: "hands=3", "head=2:10-40"; "left_foot:12-40"; "right_hand:50:0.3,0.2,1.1".
+
+    Raises:
+        PoiseError: words that make no sense.
+    """
+    return Direction(
+        tuple(_weight(w) for w in weights),
+        tuple(_pin(w) for w in pins),
+        tuple(_touch(w) for w in touches),
+    )
+
+
+def _weight(word: str) -> Weight:
+    try:
+        part, _, rest = word.partition("=")
+        factor, _, span = rest.partition(":")
+        first, last = _span(span) if span else (None, None)
+        return Weight(part, float(factor), first, last)
+    except ValueError:
+        raise PoiseError(
+            f"--weight '{word}' makes no sense", hint="Write hands=3 or head=2:10-40"
+        ) from None
+
+
+def _pin(word: str) -> Pin:
+    try:
+        limb, span = word.split(":")
+        return Pin(_limb(limb), *_span(span))
+    except ValueError:
+        raise PoiseError(f"--pin '{word}' makes no sense", hint="Write left_foot:12-40") from None
+
+
+def _touch(word: str) -> TouchPoint:
+    try:
+        limb, frame, place = word.split(":")
+        x, y, z = (float(v) for v in place.split(","))
+        return TouchPoint(_limb(limb), int(frame), (x, y, z))
+    except ValueError:
+        hint = "Write right_hand:50:0.3,0.2,1.1, a limb, a frame and a place in m"
+        raise PoiseError(f"--touch '{word}' makes no sense", hint=hint) from None
+
+
+def _limb(name: str) -> str:
+    if name not in LIMBS:
+        raise PoiseError(f"there is no limb '{name}'", hint=did_you_mean(name, list(LIMBS)))
+    return name
+
+
+def _span(text: str) -> tuple[int, int]:
+    first, last = (int(v) for v in text.split("-"))
+    if not 0 <= first <= last:
+        raise PoiseError(f"frames must rise from 0, got {text}")
+    return first, last

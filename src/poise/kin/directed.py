@@ -1,0 +1,157 @@
+"""A director's hand on a motion: hands and feet that stay where they are, or reach a point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.body import find_anatomy
+from poise.errors import PoiseError, did_you_mean
+from poise.kin.limbs import match_positions
+from poise.motion import Clip, Skeleton
+from poise.spatial import forward_kinematics
+
+#: Ends of limbs that can be pinned and can touch.
+LIMBS = ("left_foot", "right_foot", "left_hand", "right_hand")
+#: s over which a limb comes to a pin or a touch, and leaves it.
+EASE_S = 0.35
+#: m off the floor from which on a pinned foot hangs in the air; m out of reach that is worth a sentence.
+HANGS_M, SHORT_M = 0.15, 0.01
+#: See `limbs.soft_reach`: what is asked for is asked for, so legs may be nearly straight.
+SOFT = 0.003
+
+
+@dataclass(frozen=True)
+class Pin:
+    """A hand or foot that stays where it is.
+
+    Attributes:
+        limb: one of `LIMBS`.
+        first, last: frames of the clip, both pinned; its place is that of the first.
+    """
+
+    limb: str
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class TouchPoint:
+    """A point that a hand or foot reaches.
+
+    Attributes:
+        limb: one of `LIMBS`.
+        frame: of the clip.
+        point: m, in the clip's world.
+    """
+
+    limb: str
+    frame: int
+    point: tuple[float, float, float]
+
+
+def end_of(skeleton: Skeleton, limb: str) -> int:
+    """The joint of a limb's end: ankle or wrist.
+
+    Raises:
+        PoiseError: no such limb, or the skeleton has none.
+    """
+    if limb not in LIMBS:
+        raise PoiseError(f"there is no limb '{limb}'", hint=did_you_mean(limb, list(LIMBS)))
+    side, kind = limb.split("_")
+    joints = find_anatomy(skeleton).of(kind, side)
+    if not joints:
+        raise PoiseError(f"the skeleton has no {side} {kind}", hint="Name another limb")
+    return joints[0]
+
+
+def ease(frames: int, first: int, last: int, fps: float) -> Tensor:
+    """`(T,)` 1 from frame `first` to `last`, rising and falling in `EASE_S` along a smooth step."""
+    t = torch.arange(frames, dtype=torch.float64)
+    away = torch.maximum(first - t, t - last).clamp_min(0.0) / (EASE_S * fps)
+    left = (1.0 - away).clamp(0.0, 1.0)
+    return left * left * (3.0 - 2.0 * left)
+
+
+def directed(
+    clip: Clip, pins: Sequence[Pin] = (), touches: Sequence[TouchPoint] = ()
+) -> tuple[Clip, tuple[str, ...]]:
+    """The motion with limbs on their pins and touch points, and what of that is doubtful.
+
+    A limb is led there by its own joints alone, and comes and goes in `EASE_S`; hands and feet keep
+    their turn in the world. What is out of reach is approached as far as the limb goes.
+
+    Raises:
+        PoiseError: frames that the clip does not have, or limbs that the skeleton does not have.
+    """
+    if not pins and not touches:
+        return clip, ()
+    notes: list[str] = []
+    root, rot = clip.tensors()
+    for what in (*pins, *touches):
+        span = (what.first, what.last) if isinstance(what, Pin) else (what.frame, what.frame)
+        if not 0 <= span[0] <= span[1] < clip.frames:
+            raise PoiseError(
+                f"{what.limb} is wanted in frames {span[0]} to {span[1]}, and the clip has 0 to "
+                f"{clip.frames - 1}",
+                clip.name,
+            )
+        joint = end_of(clip.skeleton, what.limb)
+        pos = _ends(clip.skeleton, root, rot, joint)
+        place = pos[span[0]] if isinstance(what, Pin) else torch.tensor(what.point).to(pos)
+        share = ease(clip.frames, *span, clip.fps).to(pos)[:, None]
+        turned = rot.clone()
+        goal = torch.lerp(pos, place.expand_as(pos), share)
+        rot = match_positions(clip.skeleton, rot, root, {joint: goal}, soft=SOFT)
+        untouched = (share[:, 0] == 0.0)[:, None, None]
+        rot = torch.where(untouched, turned, rot)
+        notes += _doubts(clip, what, pos, _ends(clip.skeleton, root, rot, joint), place)
+    return clip.replaced(rot=rot.numpy()), tuple(notes)
+
+
+def pinned(clip: Clip, pins: Sequence[Pin]) -> Clip:
+    """The motion with its pinned limbs at rest, each at its middle place while it is pinned.
+
+    For a simulated motion, where friction holds a foot to within millimetres.
+    """
+    root, rot = clip.tensors()
+    for pin in pins:
+        joint = end_of(clip.skeleton, pin.limb)
+        pos = _ends(clip.skeleton, root, rot, joint)
+        last = min(pin.last, clip.frames - 1)
+        place = pos[pin.first : last + 1].median(0).values
+        share = ease(clip.frames, pin.first, last, clip.fps).to(pos)[:, None]
+        goal = torch.lerp(pos, place.expand_as(pos), share)
+        rot = match_positions(clip.skeleton, rot, root, {joint: goal}, soft=SOFT)
+    return clip.replaced(rot=rot.numpy())
+
+
+def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:
+    offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
+    return forward_kinematics(skeleton.parents, offsets, root, rot)[0][:, joint]
+
+
+def _doubts(
+    clip: Clip, what: Pin | TouchPoint, before: Tensor, after: Tensor, place: Tensor
+) -> list[str]:
+    """What a director should know of a pin or a touch."""
+    span = (what.first, what.last) if isinstance(what, Pin) else (what.frame, what.frame)
+    short = (after[span[0] : span[1] + 1] - place).norm(dim=-1)
+    said: list[str] = []
+    if float(short.max()) > SHORT_M:
+        k = span[0] + int(short.argmax())
+        said.append(
+            f"{what.limb} cannot reach where it is wanted: {100 * float(short.max()):.0f} cm are "
+            f"missing at frame {k}; it comes as near as it gets."
+        )
+    height = float(place[2]) - float(before[:, 2].min())
+    if isinstance(what, Pin) and what.limb.endswith("foot") and height > HANGS_M:
+        said.append(
+            f"{what.limb} is pinned in mid-air from frame {what.first} on, {100 * height:.0f} cm above "
+            "where it is lowest: nothing holds it there but the body's balance."
+        )
+    return said
