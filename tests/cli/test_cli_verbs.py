@@ -76,6 +76,7 @@ def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str
         "retarget": ["a.bvh", "--onto", "b.bvh", "-o", "c.bvh"],
         "train": ["residual-force", "a.bvh", "-o", "out"],
         "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
+        "complete": ["a.bvh", "--keyframes", "0,5", "-o", "out"],
     }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "fleet") else [])])
     code = (
         "import sys, poise.cli.console as c, poise.cli.main as m\n"

@@ -43,11 +43,12 @@ def test_limbs_are_pinned_and_touch() -> None:
     made, notes = directed(clip, (Pin("left_foot", 10, 13),), (TouchPoint("right_hand", 45, point),))
     assert notes == ()
     now = end(made, "foot", "left")
-    assert np.abs(now[10:14] - foot[10]).max() < 3e-3
+    assert np.abs(now[10:14] - foot[10]).max() < 2e-3
     assert np.linalg.norm(end(made, "hand", "right")[45] - point) < 2e-3
     # Everything else, and every other time, is as it was.
-    np.testing.assert_allclose(made.positions()[30], clip.positions()[30], atol=1e-12)
-    np.testing.assert_array_equal(made.root_pos, clip.root_pos)
+    np.testing.assert_allclose(made.positions()[58], clip.positions()[58], atol=1e-9)
+    # The body follows a leg that is too short by millimetres.
+    assert np.abs(made.root_pos - clip.root_pos).max() < 0.02
     # What was simulated is held at its middle place.
     still = pinned(clip, (Pin("left_foot", 10, 13),))
     assert np.ptp(end(still, "foot", "left")[10:14], axis=0).max() < 3e-3

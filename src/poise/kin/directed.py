@@ -23,6 +23,9 @@ EASE_S = 0.35
 HANGS_M, SHORT_M = 0.15, 0.01
 #: See `limbs.soft_reach`: what is asked for is asked for, so legs may be nearly straight.
 SOFT = 0.003
+#: Where a limb is too short the body comes after it: by so much at most (m), evened over so long (s), in
+#: so many rounds, each with so much of what is missing, until it is that near (m).
+MOST_M, COME_S, ROUNDS, STEP, FINE_M = 0.15, 0.08, 8, 1.3, 1e-3
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,9 @@ def directed(
 ) -> tuple[Clip, tuple[str, ...]]:
     """The motion with limbs on their pins and touch points, and what of that is doubtful.
 
-    A limb is led there by its own joints alone, and comes and goes in `EASE_S`; hands and feet keep
-    their turn in the world. What is out of reach is approached as far as the limb goes.
+    A limb is led there by its own joints, and comes and goes in `EASE_S`; hands and feet keep their
+    turn in the world. Where the limb is too short the body follows by a few centimetres, with its feet
+    where they are; what is out of reach then is approached as far as it goes.
 
     Raises:
         PoiseError: frames that the clip does not have, or limbs that the skeleton does not have.
@@ -104,13 +108,10 @@ def directed(
         pos = _ends(clip.skeleton, root, rot, joint)
         place = pos[span[0]] if isinstance(what, Pin) else torch.tensor(what.point).to(pos)
         share = ease(clip.frames, *span, clip.fps).to(pos)[:, None]
-        turned = rot.clone()
         goal = torch.lerp(pos, place.expand_as(pos), share)
-        rot = match_positions(clip.skeleton, rot, root, {joint: goal}, soft=SOFT)
-        untouched = (share[:, 0] == 0.0)[:, None, None]
-        rot = torch.where(untouched, turned, rot)
+        root, rot = _led(clip, root, rot, joint, goal)
         notes += _doubts(clip, what, pos, _ends(clip.skeleton, root, rot, joint), place)
-    return clip.replaced(rot=rot.numpy()), tuple(notes)
+    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy()), tuple(notes)
 
 
 def pinned(clip: Clip, pins: Sequence[Pin]) -> Clip:
@@ -126,8 +127,42 @@ def pinned(clip: Clip, pins: Sequence[Pin]) -> Clip:
         place = pos[pin.first : last + 1].median(0).values
         share = ease(clip.frames, pin.first, last, clip.fps).to(pos)[:, None]
         goal = torch.lerp(pos, place.expand_as(pos), share)
-        rot = match_positions(clip.skeleton, rot, root, {joint: goal}, soft=SOFT)
-    return clip.replaced(rot=rot.numpy())
+        root, rot = _led(clip, root, rot, joint, goal)
+    return clip.replaced(root_pos=root.numpy(), rot=rot.numpy())
+
+
+def _led(clip: Clip, root: Tensor, rot: Tensor, joint: int, goal: Tensor) -> tuple[Tensor, Tensor]:
+    """Root and rotations with the end of a limb on its goal `(T, 3)`.
+
+    Where the limb is too short the whole body comes after it, smoothly and by `MOST_M` at most, with
+    feet that stay where they are.
+    """
+    skeleton, start, shift = clip.skeleton, rot, torch.zeros_like(root)
+    feet = [j for j in find_anatomy(skeleton).of("foot") if j != joint]
+    goals: dict[int | str, Tensor] = {j: _ends(skeleton, root, rot, j) for j in feet}
+    for _ in range(ROUNDS):
+        kept = goals if bool(shift.any()) else {}
+        rot = match_positions(skeleton, start, root + shift, {**kept, joint: goal}, soft=SOFT)
+        miss = goal - _ends(skeleton, root + shift, rot, joint)
+        if float(miss.norm(dim=-1).max()) < FINE_M:
+            break
+        wide = gaussian_kernel(COME_S * clip.fps)
+        reach = len(wide) // 2
+        padded = torch.nn.functional.pad(miss.T[:, None], (reach, reach), mode="replicate")
+        smooth = torch.nn.functional.conv1d(padded, wide[None, None].to(miss))[:, 0].T
+        shift = shift + STEP * smooth
+        shift = shift * (MOST_M / shift.norm(dim=-1, keepdim=True).clamp_min(MOST_M))
+    moved = (rot - start).abs().amax((1, 2)) > 0
+    touched = moved & ((goal - _ends(skeleton, root, start, joint)).norm(dim=-1) > 0) | shift.any(-1)
+    return root + shift, torch.where(touched[:, None, None], rot, start)
+
+
+def gaussian_kernel(frames: float) -> Tensor:
+    """Weights of a Gaussian of so many frames' deviation, which sum to 1."""
+    reach = max(1, round(3 * frames))
+    t = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    weight = torch.exp(-0.5 * (t / max(frames, 1e-6)) ** 2)
+    return weight / weight.sum()
 
 
 def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:
