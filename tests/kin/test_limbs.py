@@ -198,3 +198,27 @@ def test_real_clips_move_by_what_is_asked_without_jumps(data_dir, file):
     assert float((after - before).max()) < 0.35
     same = match_positions(skeleton, rot, root, {j: pos[:, j] for j in ends})
     assert float(quat_angle(quat_mul(quat_conj(same), rot)).max()) < 1e-4
+
+
+def test_a_knee_beyond_straight_bends_to_its_usual_side_without_a_jump() -> None:
+    """A knee that is stretched 0 to 12 degrees beyond straight, asked to shorten by 2 cm."""
+    skeleton = toy_human.human()
+    clip = toy_human.swing(1.0)
+    knee, hip, foot = (skeleton.index(f"Left{n}") for n in ("Leg", "UpLeg", "Foot"))
+    root, rot = clip.tensors()
+    count = len(rot)
+    rot = torch.zeros_like(rot)
+    rot[..., 0] = 1.0
+    # Most of the clip bends it the usual way; then it is stretched further and further.
+    angle = torch.full((count,), 0.8, dtype=torch.float64)
+    angle[-14:] = torch.linspace(0.0, -0.21, 14, dtype=torch.float64)
+    rot[:, knee] = toy_human.turn("y", angle)
+    root = root * 0.0
+    offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
+    pos = forward_kinematics(skeleton.parents, offsets, root, rot)[0]
+    goal = pos[:, foot] + 0.02 * (pos[:, hip] - pos[:, foot]) / 0.8
+    out = match_positions(skeleton, rot, root, {foot: goal})
+    there = forward_kinematics(skeleton.parents, offsets, root, out)[0]
+    step = there[-13:, knee].diff(dim=0).norm(dim=-1)
+    assert float(step.max()) < 0.03
+    torch.testing.assert_close(there[-14:, foot], goal[-14:], atol=2e-3, rtol=0)

@@ -29,6 +29,9 @@ from poise.spatial import (
 SOFT = 0.02
 #: Sine of a bend below which the limb's usual bend plane takes over from the one of the moment.
 STRAIGHT = 0.1
+#: Sine up to which a limb that bends against its usual side (cosine of the axes below that) is stretched
+#: beyond straight, as simulated knees are by some degrees.
+STRETCHED, OPPOSITE = 0.5, -0.5
 _LIMBS = {"foot": ("thigh", "shin"), "hand": ("upper_arm", "forearm")}
 
 
@@ -199,12 +202,16 @@ def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor
         usual = across(quat_rotate_inv(upper_quat, upper)[0])
     usual = normalize(usual).expand_as(own)
     size = own.norm(dim=-1, keepdim=True)
+    # A limb a little beyond straight still bends to its usual side.
+    across_usual = (own * usual).sum(-1, keepdim=True) / size.clamp_min(1e-12)
+    beyond = (across_usual < OPPOSITE) & (size < STRETCHED)
+    own = torch.where(beyond, -own, own)
     # Full weight on the moment's own axis from 2 * STRAIGHT on.
     share = ((size - STRAIGHT) / STRAIGHT).clamp(0.0, 1.0)
     share = share * share * (3 - 2 * share)
     mixed = share * own / size.clamp_min(1e-12) + (1 - share) * usual
     axis = normalize(torch.where(mixed.norm(dim=-1, keepdim=True) < 0.1, usual, mixed))
-    return quat_rotate(upper_quat, axis), (own * axis).sum(-1)
+    return quat_rotate(upper_quat, axis), (torch.where(beyond, -own, own) * axis).sum(-1)
 
 
 def _turn(
