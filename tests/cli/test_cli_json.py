@@ -48,6 +48,10 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
         policy = toy_run(out / "policy")
         more = ["--save-policy", out / "p.safetensors", "--controller", "policy"]
         return [short, "--policy", policy, "-o", out / "o", *more], 3
+    if verb == "complete":
+        policy = toy_run(out / "policy")
+        more = ["--adapt", "0", "--controller", "policy", "--policy", policy, "-o", out / "o"]
+        return [short, "--keyframes", "0 20", *more], 3
     given: dict[str, list[Any]] = {
         "info": [short],
         "convert": [short, out / "o.bvh"],
@@ -80,7 +84,7 @@ def test_errors_are_documents_too(verb: str, tmp_path: Path, answered: Callable[
     found = answered(verb, "--no-such-option", code=2)
     check(found)
     assert f"poise {verb} --help" in found["error"]["hint"] and found["result"] is None
-    if verb not in ("train", "inbetween", "retarget", "doctor"):
+    if verb not in ("train", "inbetween", "complete", "retarget", "doctor"):
         more = ["-o", tmp_path / "o.bvh"] if verb in ("imitate", "track", "convert", "fleet") else []
         found = answered(verb, tmp_path / "absent.bvh", *more, code=2)
         assert found["inputs"] == [str(tmp_path / "absent.bvh")]
