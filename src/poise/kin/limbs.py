@@ -12,6 +12,7 @@ from torch import Tensor
 
 from poise.body import find_anatomy
 from poise.errors import PoiseError
+from poise.kin.series import find_runs
 from poise.motion import Skeleton
 from poise.spatial import (
     across,
@@ -29,9 +30,10 @@ from poise.spatial import (
 SOFT = 0.02
 #: Sine of a bend below which the limb's usual bend plane takes over from the one of the moment.
 STRAIGHT = 0.1
-#: Sine up to which a limb that bends against its usual side (cosine of the axes below that) is stretched
-#: beyond straight, as simulated knees are by some degrees.
-STRETCHED, OPPOSITE = 0.5, -0.5
+#: Sine of a bend from which on the side to which a limb bends is told.
+BENT = 0.02
+#: Sine of a bend beyond straight from which on a limb is not stretched but bends that way.
+BACKWARDS = 0.25
 _LIMBS = {"foot": ("thigh", "shin"), "hand": ("upper_arm", "forearm")}
 
 
@@ -169,6 +171,7 @@ def _reach(
     # A limb that is straighter than the soft reach allows may stay as straight as it is.
     span = torch.maximum(soft_reach(want, l1, l2, soft), torch.minimum(want, now))
     axis, sine = _bend_axis(-u, v, upper_quat)
+    span = now + _through_straight(sine) * (span - now)
     # |u - R v|^2 = d^2 gives A cos(delta) + B sin(delta) = (|u|^2 + |v|^2 - d^2) / 2 - C for R the turn
     # by delta about the axis n: A = u_n . v_n (parts across n), B = u . (n x v), C = (u . n) (v . n).
     c = (u * axis).sum(-1) * (v * axis).sum(-1)
@@ -178,9 +181,14 @@ def _reach(
     fold = torch.atan2(b, a)
     open_by = torch.acos((((l1**2 + l2**2 - span**2) / 2 - c) / size).clamp(-1.0, 1.0))
     # The limb is folded at delta = fold; it bends on the axis' positive side, except where it is
-    # stretched beyond straight and need not bend more than about that.
+    # stretched beyond straight and need not bend more than about that, or really bends that way.
     flexion = math.pi - open_by
-    over = (sine < 0) & (flexion < 1.5 * torch.asin((-sine).clamp(0.0, 1.0)) + 1e-9)
+    little = flexion < 1.5 * torch.asin((-sine).clamp(0.0, 1.0)) + 1e-9
+    over = torch.zeros_like(little)
+    for first, last in find_runs((sine < 0).numpy(), 0):
+        spell = slice(first, last + 1)
+        # One side for a whole spell: a knee that changed it within one would jump.
+        over[spell] = bool(little[spell].all()) or float(sine[spell].min()) < -BACKWARDS
     delta = fold - torch.where(over, -open_by, open_by)
     delta = torch.remainder(delta + math.pi, 2 * math.pi) - math.pi
     # Nothing to do stays nothing to do, whatever rounding says about a straight limb.
@@ -190,6 +198,25 @@ def _reach(
     return bend, shortest_arc(reached, goal - root)
 
 
+def _through_straight(sine: Tensor) -> Tensor:
+    """`(T,)`, how much of a correction a limb gets that bends either way, by the sine of its bend.
+
+    One that really bends backwards passes through straight on its way. What shortens it there would
+    bend it to one side before and to the other after that, in a jump; so nothing does.
+    """
+    share = torch.ones_like(sine)
+    small = (sine.abs() / BACKWARDS).clamp(max=1.0)
+    for first, last in find_runs((sine < 0).numpy(), 0):
+        if float(sine[first : last + 1].min()) >= -BACKWARDS:
+            continue
+        while first > 0 and 0 <= float(sine[first - 1]) < BACKWARDS:
+            first -= 1
+        while last + 1 < len(sine) and 0 <= float(sine[last + 1]) < BACKWARDS:
+            last += 1
+        share[first : last + 1] = small[first : last + 1]
+    return share
+
+
 def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor, Tensor]:
     """The unit axis `(T, 3)` about which a limb bends, and the signed sine of its bend about it.
 
@@ -197,21 +224,36 @@ def _bend_axis(upper: Tensor, lower: Tensor, upper_quat: Tensor) -> tuple[Tensor
     """
     cross = torch.linalg.cross(normalize(upper), normalize(lower))
     own = quat_rotate_inv(upper_quat, cross)
-    usual = own.sum(0)
+    signed = _side(own).unsqueeze(-1) * own
+    usual = signed.sum(0)
     if float(usual.norm()) < 1e-6 * len(own):
         usual = across(quat_rotate_inv(upper_quat, upper)[0])
     usual = normalize(usual).expand_as(own)
     size = own.norm(dim=-1, keepdim=True)
-    # A limb a little beyond straight still bends to its usual side.
-    across_usual = (own * usual).sum(-1, keepdim=True) / size.clamp_min(1e-12)
-    beyond = (across_usual < OPPOSITE) & (size < STRETCHED)
-    own = torch.where(beyond, -own, own)
     # Full weight on the moment's own axis from 2 * STRAIGHT on.
     share = ((size - STRAIGHT) / STRAIGHT).clamp(0.0, 1.0)
     share = share * share * (3 - 2 * share)
-    mixed = share * own / size.clamp_min(1e-12) + (1 - share) * usual
+    mixed = share * signed / size.clamp_min(1e-12) + (1 - share) * usual
     axis = normalize(torch.where(mixed.norm(dim=-1, keepdim=True) < 0.1, usual, mixed))
-    return quat_rotate(upper_quat, axis), (torch.where(beyond, -own, own) * axis).sum(-1)
+    return quat_rotate(upper_quat, axis), (own * axis).sum(-1)
+
+
+def _side(own: Tensor) -> Tensor:
+    """`(T,)` 1 where a limb bends to its usual side, -1 where it is stretched beyond straight.
+
+    own: `(T, 3)`, the axis of its bend in the upper bone's frame, as long as the bend's sine. It turns
+    round as the limb passes through straight; where it turns without that, the side is the same.
+    """
+    bent = (own.norm(dim=-1) > BENT).nonzero().squeeze(-1)
+    if not len(bent):
+        return torch.ones(len(own), dtype=own.dtype)
+    same = (own[bent[1:]] * own[bent[:-1]]).sum(-1) >= 0
+    ones = torch.ones(1, dtype=own.dtype)
+    side = torch.cat((ones, torch.where(same, 1.0, -1.0).to(own))).cumprod(0)
+    if float((side * own[bent].square().sum(-1)).sum()) < 0:
+        side = -side
+    last = (torch.searchsorted(bent, torch.arange(len(own)), right=True) - 1).clamp_min(0)
+    return side[last]
 
 
 def _turn(
