@@ -22,7 +22,7 @@ FASTEST = {
 #: Shares of the network's motion that are tried, the rest being interpolated.
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: m above its height on the floor from which on a body is in the air.
-ALOFT_M = 0.06
+ALOFT_M = 0.12
 
 #: Depth of the crouch before and after a jump, as a share of its height, and between which it lies, m; s
 #: that it takes to go down.
