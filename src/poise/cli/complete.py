@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +15,7 @@ from poise.cli.console import print_card, say, table, tell
 from poise.cli.inbetween import frames_of
 from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import claimed, may_deliver, may_write, places
-from poise.cli.progress import left, showing, working
+from poise.cli.progress import staged, working
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         with contextlib.ExitStack() as shown:
             done = complete(
                 clip, keys, tracker, config, model=o.model, adapt=o.adapt, retime=o.retime,
-                progress=_bar(shown),
+                progress=staged(shown),
             )  # fmt: skip
         with working("writing"):
             delivered = done.write(out, motion, o.hold_feet)
@@ -136,7 +135,7 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     may_write(path, o.force, o.clip)
     clip = o.reading.read(o.clip)
     with contextlib.ExitStack() as shown:
-        bar = _bar(shown)
+        bar = staged(shown)
         filled = inbetween(
             clip, keys, o.model, adapt=o.adapt, seed=o.seed, on_gap=lambda n, of: bar("filling", n, of)
         )
@@ -147,23 +146,6 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     )
     result = {"outcome": "filled", "keyframes": list(keys), "warnings": list(filled.warnings)}
     return Answer(result, {"motion": path}, filled.notes, outcome="filled")
-
-
-def _bar(shown: contextlib.ExitStack) -> Callable[[str, int, int], None]:
-    """Shows what is done, with the time left."""
-    began, now = time.monotonic(), ""
-    bar: Callable[[float, str], None] | None = None
-
-    def show(what: str, done: int, of: int) -> None:
-        nonlocal began, now, bar
-        if bar is None or what != now:
-            shown.close()
-            began, now = time.monotonic(), what
-            bar = shown.enter_context(showing(what))
-        share = done / max(of, 1)
-        bar(share, f"{what}, {100 * share:.0f} % done, {left(time.monotonic() - began, share)}")
-
-    return show
 
 
 def _say(done: Completed) -> None:

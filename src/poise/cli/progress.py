@@ -101,3 +101,21 @@ def working(what: str) -> Iterator[None]:
         return
     with console.status(Text(what)):
         yield
+
+
+def staged(shown: contextlib.ExitStack) -> Callable[[str, int, int], None]:
+    """Told what is done, and how much of how much, it shows a bar for each, with the time left; what
+    `shown` holds ends with the first."""
+    began, now = time.monotonic(), ""
+    bar: Callable[[float, str], None] | None = None
+
+    def show(what: str, done: int, of: int) -> None:
+        nonlocal began, now, bar
+        if bar is None or what != now:
+            shown.close()
+            began, now = time.monotonic(), what
+            bar = shown.enter_context(showing(what))
+        share = done / max(of, 1)
+        bar(share, f"{what}, {100 * share:.0f} % done, {left(time.monotonic() - began, share)}")
+
+    return show

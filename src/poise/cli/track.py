@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +15,7 @@ from poise.cli.console import print_card, say, tell
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import claimed, may_deliver, may_write, places
-from poise.cli.progress import clock, left, showing, working
+from poise.cli.progress import clock, showing, staged, working
 from poise.errors import PoiseError
 
 if TYPE_CHECKING:
@@ -238,20 +237,7 @@ def follow(tracker: Tracker, given: Sequence[Clip | Keypoints], config: TrackCon
 
     with contextlib.ExitStack() as shown:
         shown.enter_context(working("tracking"))
-        began, now = time.monotonic(), ""
-        bar: Callable[[float, str], None] | None = None
-
-        def show(what: str, done: int, steps: int) -> None:
-            nonlocal began, now, bar
-            if bar is None or what != now:
-                shown.close()
-                began, now = time.monotonic(), what
-                bar = shown.enter_context(showing(what))
-            share = done / steps
-            spent = time.monotonic() - began
-            bar(share, f"{what}, {100 * share:.0f} % done, {left(spent, share)}")
-
-        return track(given, tracker, config, progress=show)
+        return track(given, tracker, config, progress=staged(shown))
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:

@@ -18,7 +18,7 @@ from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery
 from poise.jobs.inbetween.fill import Inbetweened, inbetween
 from poise.jobs.result import Result, Shown, clip_of
-from poise.jobs.stages import Stage, stage_of
+from poise.jobs.stages import Stage, key_errors, stage_of
 from poise.jobs.track import TrackConfig, Tracked, track, write
 from poise.jobs.track.direction import Weight
 from poise.jobs.tracker import Tracker
@@ -178,23 +178,15 @@ def _completed(
     at: tuple[int, ...],
     factors: np.ndarray,
 ) -> Completed:
-    made = tracked.delivered(hold=False)
-    wanted, have = source.positions(), made.positions()
-    # What was simulated ends where the character was lost.
-    off = [
-        float(np.linalg.norm(have[min(k, len(have) - 1)] - wanted[s], axis=-1).mean()) * 1000
-        for k, s in zip(at, keys, strict=True)
-    ]
-    stages = tuple(
-        stage_of(name, motion, source, keys, at)
-        for name, motion in (
-            ("filled", filled.clip), ("simulated", made), ("delivered", tracked.delivered()),
-        )
-    )  # fmt: skip
+    made = {
+        "filled": filled.clip, "simulated": tracked.delivered(hold=False), "delivered": tracked.clip,
+    }  # fmt: skip
+    off = {name: key_errors(clip, source, keys, at) for name, clip in made.items()}
+    stages = tuple(stage_of(name, clip, off[name]) for name, clip in made.items())
     retiming = (
         None if (factors == 1.0).all() else Retiming(keys, at, source.fps, tuple(factors.tolist()))
     )
-    return Completed(source, keys, filled, tracked, at, tuple(off), stages, retiming)
+    return Completed(source, keys, filled, tracked, at, off["simulated"], stages, retiming)
 
 
 def _too_fast(done: Completed) -> np.ndarray:

@@ -46,15 +46,20 @@ class Stage:
         return asdict(self)
 
 
-def stage_of(name: str, made: Clip, source: Clip, keys: Sequence[int], at: Sequence[int]) -> Stage:
-    """The figures of a motion, of which the frames `at` are to be the frames `keys` of `source`."""
+def key_errors(made: Clip, source: Clip, keys: Sequence[int], at: Sequence[int]) -> tuple[float, ...]:
+    """How far the joints are from each keyframe, mean, mm: of `made` in the frames `at`, of `source` in
+    the frames `keys`. A motion that ends before one is where it ended."""
     have, wanted = made.positions(), source.positions()
-    off = [
-        float(np.linalg.norm(have[min(a, len(have) - 1)] - wanted[k], axis=-1).mean())
+    return tuple(
+        1000 * float(np.linalg.norm(have[min(a, len(have) - 1)] - wanted[k], axis=-1).mean())
         for a, k in zip(at, keys, strict=True)
-    ]
-    figures = examine(made).figures
+    )
+
+
+def stage_of(name: str, made: Clip, key_mm: Sequence[float]) -> Stage:
+    """The figures of a motion. key_mm: see `key_errors`."""
+    figures, pos = examine(made).figures, made.positions()
     names = ("foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk_m_per_s3")
-    speed = np.linalg.norm(np.diff(have, axis=0), axis=-1).max() * made.fps
+    speed = np.linalg.norm(np.diff(pos, axis=0), axis=-1).max() * made.fps
     slide, sinks, floats, jerk = (figures.get(n) for n in names)
-    return Stage(name, 1000 * float(np.mean(off)), slide, sinks, floats, jerk, float(speed))
+    return Stage(name, float(np.mean(key_mm)), slide, sinks, floats, jerk, float(speed))

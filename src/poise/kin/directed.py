@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.body import find_anatomy
 from poise.errors import PoiseError, did_you_mean
 from poise.kin.limbs import match_positions
+from poise.kin.series import gaussian_sums
 from poise.motion import Clip, Skeleton
 from poise.spatial import forward_kinematics
 
@@ -146,23 +147,12 @@ def _led(clip: Clip, root: Tensor, rot: Tensor, joint: int, goal: Tensor) -> tup
         miss = goal - _ends(skeleton, root + shift, rot, joint)
         if float(miss.norm(dim=-1).max()) < FINE_M:
             break
-        wide = gaussian_kernel(COME_S * clip.fps)
-        reach = len(wide) // 2
-        padded = torch.nn.functional.pad(miss.T[:, None], (reach, reach), mode="replicate")
-        smooth = torch.nn.functional.conv1d(padded, wide[None, None].to(miss))[:, 0].T
-        shift = shift + STEP * smooth
+        sums, weight, _ = gaussian_sums(miss, COME_S * clip.fps)
+        shift = shift + STEP * sums / weight
         shift = shift * (MOST_M / shift.norm(dim=-1, keepdim=True).clamp_min(MOST_M))
     moved = (rot - start).abs().amax((1, 2)) > 0
     touched = moved & ((goal - _ends(skeleton, root, start, joint)).norm(dim=-1) > 0) | shift.any(-1)
     return root + shift, torch.where(touched[:, None, None], rot, start)
-
-
-def gaussian_kernel(frames: float) -> Tensor:
-    """Weights of a Gaussian of so many frames' deviation, which sum to 1."""
-    reach = max(1, round(3 * frames))
-    t = torch.arange(-reach, reach + 1, dtype=torch.float64)
-    weight = torch.exp(-0.5 * (t / max(frames, 1e-6)) ** 2)
-    return weight / weight.sum()
 
 
 def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:
