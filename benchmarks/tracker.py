@@ -59,16 +59,17 @@ def config(seed: int) -> Perpetual:
     )
 
 
-def finer(tracker: Tracker, step: float, std: float, seed: int) -> Perpetual:
+def finer(tracker: Tracker, step: float, std: float, seed: int, recovery: float) -> Perpetual:
     """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
     actions, a nearer root, prices of changing actions and of feet that slide, large batches.
 
     Args:
         step: of the policy, fixed; it became smaller from run to run.
         std: deviation of the noise on its actions, rad.
+        recovery: share of the episodes that begin with a fall; with 0.15 getting up is forgotten.
     """
     kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
-    recovering = replace(kept.recovering, demonstration_share=0.15, demonstrations=512)
+    recovering = replace(kept.recovering, demonstration_share=recovery, demonstrations=512)
     return replace(
         kept,
         heading="hips",
@@ -91,6 +92,7 @@ def main() -> None:
     parser.add_argument("--from", type=Path, dest="earlier", help="the policy that goes on")
     parser.add_argument("--step", type=float, default=1e-4)
     parser.add_argument("--std", type=float, default=0.05)
+    parser.add_argument("--recovery", type=float, default=0.4)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--threads", type=int, default=0)
@@ -100,7 +102,7 @@ def main() -> None:
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
-    settings = finer(earlier, a.step, a.std, a.seed) if earlier else config(a.seed)
+    settings = finer(earlier, a.step, a.std, a.seed, a.recovery) if earlier else config(a.seed)
     source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source)

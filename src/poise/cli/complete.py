@@ -53,6 +53,10 @@ class Options:
     """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
     touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
     """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
+    span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
+    """Simulate only the part from A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
+    earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
+    """The folder of an earlier result of the same motion, for --range."""
     adapt: Annotated[int, arg(metavar="N")] = 20
     """Iterations of test-time adaptation for each gap; 0 does without."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -84,13 +88,14 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
+    from poise.jobs.track.simulation import retake_of
     from poise.plan import LookaheadConfig
     from poise.synth.gaps import check_keyframes
 
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     config = TrackConfig(
         seed=o.seed, controller=o.controller, lookahead=ahead, threads=o.threads,
-        direction=direction_of(o.weight, o.pin, o.touch),
+        direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
     )  # fmt: skip
     clip = o.reading.read(o.clip)
     check_keyframes(keys, clip.frames, str(o.clip))
@@ -125,7 +130,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
-    if o.weight or o.pin or o.touch or o.retime:
+    if o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
         raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
     from poise.jobs.inbetween.fill import inbetween
     from poise.motion.io import check_writable, write_clip

@@ -82,6 +82,10 @@ class Options:
     """Hands or feet that stay where they are in frames A to B, such as left_foot:12-40."""
     touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
     """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
+    span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
+    """Simulate only the part from A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
+    earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
+    """The folder of an earlier result of the same motion, for --range."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -134,6 +138,10 @@ def check(o: Options) -> None:
     check_range("threads", o.threads, 0)
     if o.learn and o.body == "own":
         raise PoiseError("the policy learns on its own body", hint="Leave --body own or --learn out")
+    if o.learn and o.earlier:
+        raise PoiseError(
+            "--learn learns the whole motion, and --range does a part", hint="Leave one out"
+        )
     if o.learn and o.noise:
         what = "--learn learns the motion without errors, and --noise adds some"
         raise PoiseError(what, hint="Leave one out")
@@ -156,6 +164,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     from poise.jobs.track import TrackConfig, write
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
+    from poise.jobs.track.simulation import retake_of
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 
@@ -166,7 +175,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         noise=noise, seed=o.seed, reset_on_fail=o.reset_on_fail, recover=o.recover,
         smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
         search=search, threads=o.threads, body=o.body, supports=stands,
-        direction=direction_of(o.weight, o.pin, o.touch),
+        direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
     )  # fmt: skip
     config.check(len(o.clips))
     given = [read(clip, o.reading) for clip in o.clips]

@@ -144,6 +144,8 @@ def complete(
         raise PoiseError("keyframes are completed for a single character, without noise or recovery")
     if config.lookahead == LookaheadConfig():
         config = replace(config, lookahead=replace(LookaheadConfig().with_budget(BUDGET), slack=SLACK))
+    if retime and config.retake is not None:
+        raise PoiseError("a range has the times of the earlier result", hint="Leave --retime out")
     source = clip_of(clip)
     keys = tuple(check_keyframes(keyframes, source.frames, source.name))
     more: dict[str, Any] = {} if adapt is None else {"adapt": adapt}

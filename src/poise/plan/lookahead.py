@@ -203,6 +203,10 @@ class Lookahead:
         self._worlds = [_World() for _ in range(env.num_envs)]
         self._rng.manual_seed(self.config.seed)
 
+    def remember(self, world: int, past: Tensor) -> None:
+        """Tells what a world's bodies `(k, B, 3)` m did before it acts: jerk is counted from there."""
+        self._worlds[world].past = list(past[-PAST:].float())
+
     @property
     def steps(self) -> int:
         """Control steps that were simulated for the decisions."""

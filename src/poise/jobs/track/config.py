@@ -7,6 +7,7 @@ from typing import Literal
 
 from poise.errors import PoiseError
 from poise.jobs.track.direction import Direction
+from poise.jobs.track.simulation import Retake
 from poise.kin.supports import Support
 from poise.motion.noise import Noise
 from poise.plan import LookaheadConfig, SamplingConfig
@@ -40,6 +41,8 @@ class TrackConfig:
         supports: "auto" puts boxes where a single motion sits, leans or steps on something
             (`kin.supports`), "none" leaves the floor alone; or supports beside the motion that comes in.
         direction: what counts more, stays put or is touched; for a single clip.
+        retake: a part that is simulated anew, while the rest stays as an earlier result has it; for a
+            single clip.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -55,6 +58,7 @@ class TrackConfig:
     body: Literal["policy", "own"] = "policy"
     supports: Literal["auto", "none"] | tuple[Support, ...] = "auto"
     direction: Direction = field(default_factory=Direction)
+    retake: Retake | None = None
 
     def __post_init__(self) -> None:
         validate(self)
@@ -73,6 +77,16 @@ class TrackConfig:
         if self.direction and (self.recover or self.count > 1):
             what = "several characters" if self.count > 1 else "one that comes back by itself"
             raise PoiseError(f"weights, pins and touches are for a single character, not {what}")
+        if self.retake is not None:
+            others = {
+                "one that comes or is put back": self.recover or self.reset_on_fail,
+                "several characters": self.count > 1,
+                "a motion with noise": bool(self.noise),
+                "a search, which looks for the whole motion": self.controller == "search",
+            }
+            if any(others.values()):
+                what = next(name for name, asked in others.items() if asked)
+                raise PoiseError(f"a range is for a single character that tracks, not {what}")
         if self.body == "own" and self.recover:
             raise PoiseError("recovery clips are those of the policy's body, so body='own' has none")
 
@@ -87,6 +101,7 @@ class TrackConfig:
             "putting a character back is": self.reset_on_fail,
             "a search is": self.controller == "search", "a body of its own is": self.body == "own",
             "weights, pins and touches are": bool(self.direction),
+            "a range is": self.retake is not None,
             "a support is": isinstance(self.supports, tuple),
         }  # fmt: skip
         if not clips:

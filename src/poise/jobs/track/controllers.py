@@ -19,6 +19,7 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import Placed
 from poise.jobs.track.recovering import Led, Replay, led_along, look_for, replay, sentence
+from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.tracker import Tracker
 from poise.metrics import mpjpe_global, success_rule
 from poise.plan import Lookahead, LookaheadConfig, SamplingResult
@@ -44,6 +45,7 @@ class Done(NamedTuple):
         failures: (character, frame) of each failure in the order of time.
         controller: which did it: "policy", "lookahead" or "search".
         found: what the search came to; None where nothing was searched.
+        simulation: the states of the episode, of a single character; None of several.
     """
 
     rollouts: RolloutSet
@@ -52,6 +54,7 @@ class Done(NamedTuple):
     failures: list[tuple[int, int]]
     controller: str
     found: SamplingResult | None = None
+    simulation: Simulation | None = None
 
 
 def done_by(
@@ -73,26 +76,26 @@ def done_by(
     """
     notes: list[str] = []
     if replayed is not None:
-        return _episode(imitation, config, replayed, replayed.by), notes
+        return episode(imitation, config, replayed, replayed.by), notes
     if config.looks_ahead and tracker.value is None:
         notes.append(NO_CRITIC)
     if config.looks_ahead and tracker.value is not None:
         ahead = look_ahead(tracker, imitation, config.lookahead, config.threads, config.seed, prices)
         try:
-            done = _episode(imitation, config, ahead, "lookahead", show)
+            done = episode(imitation, config, ahead, "lookahead", show)
         finally:
             ahead.copies.close()
         if config.count == 1 and not done.failures and loses(tracker, imitation):
             notes.append("The policy alone loses the motion.")
     else:
-        done = _episode(imitation, config, tracker.policy, "policy")
+        done = episode(imitation, config, tracker.policy, "policy")
     if config.searches and done.failures:
         how = replace(config.search, seed=config.seed)
         told = show and (lambda made, steps: show("searching", made, steps))
         found = look_for(tracker, imitation, how, 0, config.threads, told)
         notes.append(sentence(found, how, imitation.reference.rate_hz))
         if found.reached > done.failures[0][1]:
-            done = _episode(imitation, config, replay(found, tracker.policy), "search")
+            done = episode(imitation, config, replay(found, tracker.policy), "search")
         done = done._replace(found=found)
     return done, notes
 
@@ -152,32 +155,34 @@ def loses(tracker: Tracker, imitation: Imitation) -> bool:
     return not bool(results.succeeded)
 
 
-def _episode(
+def episode(
     imitation: Imitation, config: TrackConfig, acts: Acts, controller: str, show: Show | None = None
 ) -> Done:
-    """One episode of all characters."""
+    """One episode of all characters, each from its first frame."""
     count, task = config.count, imitation
     every = torch.arange(count)
     rows = crowd(task.humanoid, task.config.sim, count) if count > 1 else None
     env = task.env(1, None, False, 1, help_scale=0.0, backend=rows)
-    if isinstance(acts, Lookahead):
-        acts.watch(env)
+    if callable(watch := getattr(acts, "watch", None)):
+        watch(env)
     keeper = Keeper(env, acts) if config.reset_on_fail else None
     starts = torch.zeros_like(every)
     told = [] if show is None else [Told("looking ahead", int(task.reference.length[0]) - 1, show)]
     # The report shows one character.
-    touched = ContactForces() if count == 1 else None
-    observers = [*told, touched] if touched else told
+    touched, states = ContactForces(), States()
+    observers = [*told, touched, states] if count == 1 else told
     rollouts, recordings = run_episodes(
         lambda _: env, keeper or acts, every, starts, cycles=1, observers=observers
     )
-    if touched:
+    if count == 1:
         recordings[0] = replace(recordings[0], contacts=tuple(touched.frames))
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
     mended = keeper.fallen if keeper is not None else ()
     frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
-    return Done(rollouts, recordings, judged, frames, controller)
+    rate, lost = task.reference.rate_hz, frames[0][1] if frames else None
+    kept = states.simulation(task.humanoid, rate, lost) if count == 1 else None
+    return Done(rollouts, recordings, judged, frames, controller, simulation=kept)
 
 
 class Told:

@@ -17,6 +17,7 @@ from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
 from poise.jobs.track.recovering import Losses
+from poise.jobs.track.simulation import FILE, Simulation
 from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
 from poise.kin import hold_feet
@@ -60,7 +61,8 @@ class Tracked(Result):
     was lost and found again; None where it was not. found: what a search came to; None where
     nothing was searched. controller: which did the motion: "policy", "lookahead" or "search". parts:
     what became of each of several clips; none where it was one. supports: what stands in the world for
-    the motion to rest on, in the world of the body. pins: limbs that stay put.
+    the motion to rest on, in the world of the body. pins: limbs that stay put. simulation: the states of
+    a single character on a single clip, of which a part can be simulated anew (`Retake`).
     """
 
     tracker: Tracker
@@ -76,6 +78,7 @@ class Tracked(Result):
     parts: tuple[Part, ...] = ()
     supports: tuple[Support, ...] = ()
     pins: tuple[Pin, ...] = ()
+    simulation: Simulation | None = None
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -143,6 +146,9 @@ def write(
     said += tuple(p.sentence() for p in t.parts) or failures
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys)
+    if t.simulation is not None:
+        t.simulation.save(out / FILE)
+        done = replace(done, paths={**done.paths, "simulation": out / FILE})
     if not other:
         return _with_supports(t, done, out, hold)
     paths: dict[str, Path] = {}

@@ -27,6 +27,7 @@ from poise.jobs.track.parts import Span, cut, parts_of, with_parts
 from poise.jobs.track.placement import Placed, place, place_all
 from poise.jobs.track.points import fitted, follow, points_of
 from poise.jobs.track.rates import rate_notes
+from poise.jobs.track.retaking import retaken
 from poise.jobs.track.supports import with_supports
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
@@ -111,9 +112,12 @@ def track(
         notes += said
     ref = imitation.reference
     prices = config.direction.prices(given, imitation.humanoid.table, ref.frames, ref.rate_hz)
-    done, said = done_by(tracker, imitation, config, replayed, progress, prices)
+    if config.retake is None:
+        done, said = done_by(tracker, imitation, config, replayed, progress, prices)
+    else:
+        done, said = retaken(tracker, imitation, config, config.retake, progress, prices)
     notes += said
-    if not several:
+    if not several and config.retake is None:
         notes += rate_notes(
             tracker, given, placed.report.clips[0].flights,
             lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
@@ -147,6 +151,7 @@ def track(
     return Tracked(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
         done.controller, parts, supports, config.direction.pins,
+        None if several or config.recover else done.simulation,
     )  # fmt: skip
 
 

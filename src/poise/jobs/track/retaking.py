@@ -1,0 +1,282 @@
+"""A part of a motion simulated anew: from the state that was stored, and back into what was simulated.
+
+The character begins in the stored state of the part's first frame and follows the motion; toward the
+part's end its goal becomes what was simulated before, which it then follows for a while. Where the two
+are nearest, the one fades into the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from poise.env import Acts, ImitationEnv, Reference
+from poise.env.recovery.get_up import mixed
+from poise.errors import PoiseError
+from poise.eval import simulate
+from poise.eval.rolloutset import judge
+from poise.jobs.track.config import TrackConfig
+from poise.jobs.track.controllers import RULE, Done, Show, Told, episode, look_ahead
+from poise.jobs.track.simulation import Retake, Simulation, States
+from poise.jobs.tracker import Tracker
+from poise.metrics import mpjpe_global, success_rule
+from poise.plan import Lookahead
+from poise.plan.lookahead import PAST
+from poise.recipes.imitation import Imitation
+
+#: s over which the goal becomes the earlier simulation, for which that is followed at most, and over
+#: which the two fade into each other.
+LEAD_S, SETTLE_S, FADE_S = 0.3, 1.0, 0.4
+#: mm of distance that a second of waiting for a better moment is worth.
+PATIENCE_MM = 20.0
+#: Cost per metre of distance in a control step that leads back, beside the reward.
+PRICE = 120.0
+#: Seeds that are tried where a part is lost.
+TRIES = 3
+
+
+class Taken(NamedTuple):
+    """What was simulated anew.
+
+    Attributes:
+        made: from the part's first frame on.
+        first: that frame.
+        joined: the frame from which it fades into the earlier simulation; None where it does not.
+        apart_mm: mean distance of the two while they fade.
+    """
+
+    made: Simulation
+    first: int
+    joined: int | None
+    apart_mm: float
+
+
+def retaken(
+    tracker: Tracker,
+    imitation: Imitation,
+    config: TrackConfig,
+    retake: Retake,
+    show: Show | None = None,
+    prices: Tensor | None = None,
+) -> tuple[Done, Sequence[str]]:
+    """Does a part of a task's motion anew, and the rest as it was done; sentences on that.
+
+    Raises:
+        PoiseError: the earlier result is of another motion or body, the part lies outside of it, or no
+            seed does it.
+    """
+    rate, ref = imitation.reference.rate_hz, imitation.reference
+    before = retake.opened()
+    before.check(imitation.humanoid, int(ref.length[0]), rate)
+    first, last = part_of(before, retake)
+    goals, taken = _goals(imitation, before, last), 0
+    for k in range(TRIES):
+        how = replace(config, seed=config.seed + k)
+        taken = _take(tracker, goals, how, before, first, last, show, prices)
+        if isinstance(taken, Taken):
+            break
+    if not isinstance(taken, Taken):
+        raise PoiseError(
+            f"the part from {first / rate:.1f} s on was lost at {taken / rate:.1f} s with {TRIES} seeds",
+            hint="Widen --range, raise --budget, or track the whole motion",
+        )
+    whole = _joined(before, taken, rate)
+    return _played(imitation, config, whole), [_sentence(taken, before, first, last, rate)]
+
+
+def part_of(before: Simulation, retake: Retake) -> tuple[int, int]:
+    """The first and last frame of a part; a motion that was lost is done anew to its end.
+
+    Raises:
+        PoiseError: it lies beyond the motion's end, or it begins where the motion was lost.
+    """
+    rate = before.rate_hz
+    first, last = round(retake.first_s * rate), round(retake.last_s * rate)
+    end = before.frames - 1
+    if first > end - 2:
+        raise PoiseError(
+            f"the range begins at {retake.first_s:g} s and the motion ends at {end / rate:.2f} s"
+        )
+    if before.lost is not None and first >= before.lost:
+        raise PoiseError(
+            f"the range begins at {retake.first_s:g} s, where the motion was already lost, at "
+            f"{before.lost / rate:.1f} s",
+            hint="Begin the range before that",
+        )
+    return first, (end if before.lost is not None else min(max(last, first + 1), end))
+
+
+def _goals(imitation: Imitation, before: Simulation, last: int) -> Imitation:
+    """The task with a goal that becomes the earlier simulation toward frame `last`."""
+    ref = imitation.reference
+    lead = max(1, round(LEAD_S * ref.rate_hz))
+    share = eased((torch.arange(before.frames).double() - (last - lead)) / lead)
+    if before.lost is not None:
+        share = torch.zeros_like(share)
+    qpos = mixed(ref.qpos[: before.frames], before.qpos, share)
+    made = Reference(ref.humanoid, [qpos.numpy()], ref.rate_hz, ref.names)
+    return replace(imitation, reference=made)
+
+
+def _take(
+    tracker: Tracker, goals: Imitation, config: TrackConfig, before: Simulation, first: int, last: int,
+    show: Show | None, prices: Tensor | None,
+) -> Taken | int:  # fmt: skip
+    """Simulates a part; or the frame at which it was lost."""
+    rate, end = before.rate_hz, before.frames - 1
+    settle, fade = round(SETTLE_S * rate), max(2, round(FADE_S * rate))
+    joins = before.lost is None and last + fade < end
+    stop = min(last + settle + fade, end) if joins else end
+    env = goals.env(1, None, False, 1, help_scale=0.0)
+    acts: Acts = tracker.policy
+    if config.looks_ahead and tracker.value is not None:
+        if joins:
+            prices = (
+                torch.zeros(*goals.reference.pose.pos.shape[:2]) if prices is None else prices.clone()
+            )
+            prices[last:] += PRICE / prices.shape[1]
+        acts = look_ahead(tracker, goals, config.lookahead, config.threads, config.seed, prices)
+        acts.watch(env)
+    try:
+        obs = _set_down(env, before, first)
+        if isinstance(acts, Lookahead):
+            acts.remember(0, goals.reference.poser(*_rows(before, max(0, first - PAST), first)).pos)
+        seen, lost = States(), _Lost(first)
+        told = [] if show is None else [Told("looking ahead", stop - first, show)]
+        simulate(env, acts, obs, stop - first, seen, lost, *told)
+    finally:
+        env.close()
+        if isinstance(acts, Lookahead):
+            acts.copies.close()
+    if lost.frame is not None:
+        return lost.frame
+    made = seen.simulation(goals.humanoid, rate, None)
+    if not joins:
+        return Taken(made, first, None, 0.0)
+    # The mean distance over each window in which the one may fade into the other.
+    pose = goals.reference.poser
+    own, old = pose(made.qpos, made.qvel).pos, pose(*_rows(before, first, stop + 1)).pos
+    apart = mpjpe_global(own[last - first :], old[last - first :])
+    windows = apart.unfold(0, fade + 1, 1).mean(1)
+    waits = torch.arange(len(windows)) / rate * PATIENCE_MM
+    best = int((windows + waits).argmin())
+    return Taken(made, first, last + best, float(windows[best]))
+
+
+def _rows(before: Simulation, first: int, end: int) -> tuple[Tensor, Tensor]:
+    return before.qpos[first:end], before.qvel[first:end]
+
+
+def _set_down(env: ImitationEnv, before: Simulation, frame: int) -> Tensor:
+    """The character as it was at a frame; observations."""
+    zero = torch.zeros(1, dtype=torch.long)
+    env.reset_to(zero, zero + frame)
+    _write(env, before, frame)
+    env.age[:] = frame
+    if frame:
+        env.action[:] = before.action[frame - 1].to(env.action)
+    return env.observe()
+
+
+def _write(env: ImitationEnv, simulation: Simulation, frame: int) -> None:
+    state = env.backend.state
+    here = (getattr(simulation, name)[frame : frame + 1] for name in ("qpos", "qvel"))
+    env.backend.write(None, *(x.to(state.qpos) for x in here))
+
+
+@dataclass(eq=False)
+class _Lost:
+    """Observes whether the goal is lost. first: the frame of the first step. frame: where it was."""
+
+    first: int
+    frame: int | None = None
+
+    def see(self, env: ImitationEnv, step: int) -> bool:
+        """Looks at control step `step`; True: it is lost."""
+        off = mpjpe_global(env.pose().pos, env.goal_pose().pos)
+        if self.frame is None and not bool((off <= success_rule(RULE).limit_m * 1000.0).all()):
+            self.frame = self.first + step
+        return self.frame is not None
+
+
+def _joined(before: Simulation, taken: Taken, rate: float) -> Simulation:
+    """The whole motion, one simulation fading into the other."""
+    made, first = taken.made, taken.first
+    if taken.joined is None:
+        parts = {k: torch.cat((getattr(before, k)[:first], getattr(made, k)))
+                 for k in ("qpos", "qvel", "action")}  # fmt: skip
+        return replace(before, **parts, lost=None)
+    fade = max(2, round(FADE_S * rate))
+    end = taken.joined + fade
+    share = eased((torch.arange(first, end + 1) - taken.joined).double() / fade)
+    rows, own = slice(first, end + 1), slice(0, end + 1 - first)
+    qpos, qvel, action = (getattr(before, k).clone() for k in ("qpos", "qvel", "action"))
+    # The ends of the part are as they were, to the last bit.
+    inner = slice(first + 1, end)
+    qpos[inner] = mixed(made.qpos[own], before.qpos[rows], share)[1:-1]
+    qvel[rows] = torch.lerp(made.qvel[own], before.qvel[rows], share.unsqueeze(1))
+    steps = slice(first, end)
+    kept = share[:-1].to(action).unsqueeze(1)
+    action[steps] = torch.lerp(made.action[: end - first], before.action[steps], kept)
+    return replace(before, qpos=qpos, qvel=qvel, action=action)
+
+
+def _played(imitation: Imitation, config: TrackConfig, whole: Simulation) -> Done:
+    """One episode in which the character is in every frame as a simulation has it."""
+    by = "lookahead" if config.looks_ahead else "policy"
+    done = episode(imitation, config, _Player(whole), by)
+    pose = imitation.reference.poser(whole.qpos, whole.qvel)
+    pos, quat = done.rollouts.pos.clone(), done.rollouts.quat.clone()
+    pos[0, : whole.frames], quat[0, : whole.frames] = pose.pos, pose.quat
+    rollouts = replace(done.rollouts, pos=pos, quat=quat)
+    recording = replace(done.recordings[0], qpos=whole.qpos.numpy().copy())
+    judged = judge(rollouts, success_rule(RULE))
+    failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
+    lost = failed[0][1] if failed else None
+    return done._replace(
+        rollouts=rollouts, recordings=[recording], judged=judged, failures=failed,
+        simulation=replace(whole, lost=lost),
+    )  # fmt: skip
+
+
+class _Player:
+    """Puts the character where it was before each step, and acts as it did then."""
+
+    def __init__(self, whole: Simulation):
+        self.whole, self.step = whole, 0
+        self.env: ImitationEnv | None = None
+
+    def watch(self, env: ImitationEnv) -> None:
+        """Acts in `env` from now on."""
+        self.env, self.step = env, 0
+
+    def act(self, obs: Tensor) -> Tensor:
+        """The next action `(1, A)`; nothing is observed."""
+        assert self.env is not None
+        _write(self.env, self.whole, self.step)
+        action = self.whole.action[self.step : self.step + 1]
+        self.step += 1
+        return self.env.unfiltered(action.to(self.env.action))
+
+
+def eased(share: Tensor) -> Tensor:
+    """0 to 1 along a curve that begins and ends with speed and acceleration 0."""
+    s = share.clamp(0.0, 1.0)
+    return s**3 * (s * (6.0 * s - 15.0) + 10.0)
+
+
+def _sentence(taken: Taken, before: Simulation, first: int, last: int, rate: float) -> str:
+    said = f"From {first / rate:.2f} s to {last / rate:.2f} s the motion was simulated anew"
+    if before.lost is not None:
+        return f"{said}, since the earlier one was lost at {before.lost / rate:.1f} s."
+    if taken.joined is None:
+        return f"{said}, to its end."
+    begin, fade = taken.joined / rate, max(2, round(FADE_S * rate)) / rate
+    return (
+        f"{said}; from {begin:.2f} s to {begin + fade:.2f} s it fades into the earlier one, of which it "
+        f"is {taken.apart_mm:.0f} mm off there."
+    )
