@@ -83,7 +83,7 @@ class Options:
     touch: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="LIMB:FRAME:X,Y,Z")] = ()
     """Points that hands or feet reach, in m, Z up, such as right_hand:50:0.3,0.2,1.1."""
     span: Annotated[str | None, arg(name="range", metavar="A-B", help_behavior_hint="")] = None
-    """Simulate only the part from A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
+    """Simulate only A to B anew, in s, such as 2.0-3.5; the rest stays as --from has it."""
     earlier: Annotated[Path | None, arg(name="from", metavar="RESULT", help_behavior_hint="")] = None
     """The folder of an earlier result of the same motion, for --range."""
     noise: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="KIND:STRENGTH")] = ()
