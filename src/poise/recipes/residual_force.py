@@ -35,7 +35,7 @@ from poise.control import (
 )
 from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
 from poise.env.frame import TermFunction
-from poise.env.terms import done, obs, reward
+from poise.env.terms import done, next_frames, obs, reward
 from poise.kin import fit_humanoid
 from poise.kin.place import on_own_body
 from poise.learn import PPOConfig
@@ -62,11 +62,13 @@ class ResidualForce:
         help_schedule: from start to end by success (`control.SuccessHelp`) or linear in time over
             `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
         reward: world (App. B.1) or local (App. B.2).
-        observation: reference (state and next reference frame) or phase (the paper's).
+        observation: reference (state and next reference frame), phase (the paper's), or
+            Skeleton2Humanoid's state with one or two next frames (`env.terms.next_frames`).
         action: additive or absolute.
         faithful: to the paper or to its authors' code where their values disagree (rotation angle or
             half of it; reward weights).
-        done: bodies (mean distance over 0.5 m) or height (the paper's root height rule).
+        done: bodies (mean distance over 0.5 m), height (the paper's root height rule), or below (the
+            root 0.5 m lower than the reference's, Skeleton2Humanoid's).
         residual_std: deviation of the noise on the residual action, in units of the limits; `ppo.std` is
             that of the joints. 0.3 is the paper's; with the joints' 0.055 the help is hardly tried.
         completion_bonus: a clip done to its end is worth what holding on as in its last step would be;
@@ -82,10 +84,10 @@ class ResidualForce:
     help_schedule: Literal["success", "linear"] = "success"
     help_steps: tuple[int, int] = (1600, 16000)
     reward: Literal["world", "local"] = "world"
-    observation: Literal["reference", "phase"] = "reference"
+    observation: Literal["reference", "phase", "next frame", "next two"] = "reference"
     action: Literal["additive", "absolute"] = "additive"
     faithful: Literal["paper", "code"] = "paper"
-    done: Literal["bodies", "height"] = "bodies"
+    done: Literal["bodies", "height", "below"] = "bodies"
     residual_std: float = 0.3
     completion_bonus: bool = True
     expert: bool = True
@@ -226,6 +228,37 @@ def completion_bonus(config: ResidualForce) -> float:
     return gamma / max(1.0 - gamma, 1.0 / config.horizon) if config.completion_bonus else 0.0
 
 
+def observations(config: ResidualForce, humanoid: Humanoid, frames: int) -> tuple[ObsTerm, ...]:
+    """What the policy sees. frames: how many of the next reference frames, each on its own."""
+    own: tuple[TermFunction, ...] = (
+        obs.root_height,
+        obs.root_tilt,
+        obs.root_velocity,
+        obs.joint_angles,
+        obs.joint_velocities,
+    )
+    if not frames:
+        own += (obs.phase,)
+    if config.observation != "phase":
+        own += (obs.body_positions,)
+    if config.observation == "reference":
+        own += (obs.target_joints, obs.target_root, obs.target_bodies)
+    out = tuple(ObsTerm(t.__name__, t) for t in own)
+    if not frames:
+        return out
+    # Where there is no head, the pelvis takes its place.
+    head = {"head": humanoid.head or 0}
+    out += (ObsTerm("joints_from_head", next_frames.joints_from_head, head),)
+    for k in range(frames):
+        at = {"step": k}
+        out += (
+            ObsTerm(f"angles_{k + 1}", next_frames.next_angles, at),
+            ObsTerm(f"joints_{k + 1}", next_frames.next_joints, at | head),
+            ObsTerm(f"velocities_{k + 1}", next_frames.next_velocities, at),
+        )
+    return out
+
+
 def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
     """Imitation as terms."""
     help_ = residual(config, humanoid)
@@ -233,25 +266,17 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
     if help_ is not None:
         weight = 0.05 if config.faithful == "code" else 0.1
         rewards += (RewardTerm("residual", reward.residual, weight, imitation=False),)
-    observations: tuple[ObsTerm | TermFunction, ...] = (
-        obs.root_height,
-        obs.root_tilt,
-        obs.root_velocity,
-        obs.joint_angles,
-        obs.joint_velocities,
-        obs.phase,
-    )
-    if config.observation == "reference":
-        observations += (obs.body_positions, obs.target_joints, obs.target_root, obs.target_bodies)
-    dones: tuple[DoneTerm, ...] = (
-        DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5})
-        if config.done == "bodies"
-        else DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1}),
-    )
+    dones = {
+        "bodies": DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5}),
+        "height": DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1}),
+        "below": DoneTerm("root_below", done.root_below, {"margin": 0.5}),
+    }
+    frames = {"next frame": (1,), "next two": (1, 2)}.get(config.observation, ())
     return TaskConfig(
-        obs=tuple(t if isinstance(t, ObsTerm) else ObsTerm(t.__name__, t) for t in observations),
+        obs=observations(config, humanoid, len(frames)),
         rewards=rewards,
-        dones=dones,
+        dones=(dones[config.done],),
+        window=frames,
         pd=PDTargets(config.action),
         residual=help_,
         help=schedule(config),

@@ -14,6 +14,11 @@ def root_too_low(frame: Frame, margin: float = 0.1) -> Tensor:
     return frame.sim.pos[:, 0, 2] < frame.min_height - margin
 
 
+def root_below(frame: Frame, margin: float = 0.5) -> Tensor:
+    """The root is more than `margin` m lower than the reference's now (Skeleton2Humanoid)."""
+    return frame.sim.pos[:, 0, 2] < frame.ref.pos[:, 0, 2] - margin
+
+
 def bodies_too_far(
     frame: Frame, limit: float = 0.5, bodies: Tensor | None = None, grace: int = 0
 ) -> Tensor:

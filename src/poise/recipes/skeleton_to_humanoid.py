@@ -1,0 +1,117 @@
+"""Skeleton2Humanoid (Li et al., ACM MM 2022), stage III: motion corrected by a policy at test time.
+
+Stage I makes skeleton motion between keyframes and adapts to what it is asked, stage II brings it onto a
+humanoid, stage III lets a policy imitate it with a residual force that becomes less while it learns.
+
+| paper                                        | here                                               |
+|----------------------------------------------|----------------------------------------------------|
+| Sec. 3.1 in-betweening (Harvey et al.)       | `jobs.inbetween`, `nets.rtn`, `nets.between`       |
+| Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.adapt`                                      |
+| Sec. 3.3, App. A analytic IK                 | `kin.ik`                                           |
+| Sec. 3.4.1 state with the next two frames    | `env.terms.next_frames`, `observation="next two"`  |
+| Sec. 3.4.1 action (u_t, eta_t), Eq. 8        | `control.PDTargets`, `control.ImplicitResidual`    |
+| Sec. 3.4.2 curriculum, Eq. 9                 | `control.LinearHelp`                               |
+| App. B an episode ends 0.5 m too low         | `env.terms.done.root_below`                        |
+| baseline UHC (Luo et al. 2021), in-house     | `uhc`                                              |
+
+A policy of stage III is trained on the very motions that it corrects, one policy for each length of
+transition: it is an optimiser of a set of motions. What needs no training is the universal policy with
+lookahead, without any help: `jobs.complete`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from poise.errors import PoiseError
+from poise.learn import PPOConfig
+from poise.recipes.imitation import Clips, Imitation
+from poise.recipes.residual_force import ResidualForce
+from poise.recipes.residual_force import build as imitation_of
+
+#: Eq. 9: S_init in N and N m, what is left of it at i_end, and both iterations of 1,500.
+INITIAL, LEFT, FALLS, ITERATIONS = 220.0, 100.0, (100, 1300), 1500
+#: Samples of an iteration in the paper.
+BATCH = 50_000
+#: The rows of Table 4, and the curriculum that goes on to no force at all.
+Variant = Literal["uhc", "one frame", "no curriculum", "full", "full to zero"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a policy is trained.
+
+    Attributes:
+        num_envs: characters side by side.
+        horizon: control steps of each in an iteration.
+        iterations: of PPO; the curriculum's iterations are the same shares of them as in the paper.
+    """
+
+    num_envs: int = 512
+    horizon: int = 16
+    iterations: int = 240
+
+    @classmethod
+    def paper(cls) -> Budget:
+        """1,500 iterations of about 50,000 samples."""
+        return cls(num_envs=1024, horizon=BATCH // 1024 + 1, iterations=ITERATIONS)
+
+    @property
+    def falls(self) -> tuple[int, int]:
+        """Control steps of each character between which the force becomes less."""
+        first, last = (round(i / ITERATIONS * self.iterations) * self.horizon for i in FALLS)
+        return first, max(first + 1, last)
+
+
+def settings(variant: Variant = "full", budget: Budget | None = None, **changes: Any) -> ResidualForce:
+    """The settings of stage III or of its baseline; `changes` are settings that differ.
+
+    UHC differs from the whole by what the paper's Table 4 takes away: the second of the next frames
+    and the curriculum. All have the same force, action, reward, network and number of samples.
+
+    Not stated in the paper, and ours: which of Residual Force Control's rewards (that in world
+    coordinates), whether forces act on all joints or on the root (on the root, as UHC's code has it),
+    signed forces where it prints k_r in [0, 1], and the learner's settings.
+    """
+    if variant not in ("uhc", "one frame", "no curriculum", "full", "full to zero"):
+        raise PoiseError(f"there is no variant '{variant}'")
+    budget = budget or Budget()
+    constant = variant in ("uhc", "no curriculum")
+    stated: dict[str, Any] = {
+        "observation": "next frame" if variant in ("uhc", "one frame") else "next two",
+        "help_start": None if constant else INITIAL,
+        "help_limit": INITIAL if constant else 0.0 if variant == "full to zero" else LEFT,
+        "help_schedule": "linear",
+        "help_steps": budget.falls,
+        "done": "below",
+        "action": "additive",
+        "reward": "world",
+        "completion_bonus": False,
+        "expert": False,
+        "num_envs": budget.num_envs,
+        "ppo": learner(budget),
+    }
+    return replace(ResidualForce(), **(stated | changes))
+
+
+def learner(budget: Budget) -> PPOConfig:
+    """PPO with the paper's network, 1024-512-256."""
+    hidden = (1024, 512, 256)
+    ppo = ResidualForce().ppo
+    return replace(ppo, policy_hidden=hidden, value_hidden=hidden, horizon=budget.horizon)
+
+
+def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
+    """Body, reference and task of the converted motions; train with `.trainer()`, or as any run of
+    residual forces (`jobs.runs`)."""
+    return imitation_of(clips, config or settings())
+
+
+#: See `benchmarks/skeleton_to_humanoid.json`.
+RECIPE: dict[str, Any] = {
+    "name": "skeleton-to-humanoid",
+    "config": ResidualForce,
+    "build": build,
+    "expected": {},
+}
