@@ -36,7 +36,7 @@ from poise.motion import Clip, ClipLibrary, read_clip, shifted, trim
 from poise.motion.windows import pack_frames
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.skeleton_to_humanoid import Budget, settings
+from poise.recipes.skeleton_to_humanoid import Budget, build, settings
 from poise.spatial import forward_kinematics
 
 PAST, AFTER, FPS = 10, 5, 30.0
@@ -172,8 +172,7 @@ def main() -> None:
     test = windows(args.data, n, args.count)
     budget = Budget(iterations=args.iterations)
     adapted = filled(test.truth, n, 20)
-    seeds = {s: settings("full", budget, seed=s) for s in args.seeds}
-    task = begin(args.work / "body", ClipLibrary.of(adapted), next(iter(seeds.values())))
+    task = build(ClipLibrary.of(adapted), settings("full", budget))
     joints = [r.joint for r in task.humanoid.table.rows]
     names = task.humanoid.skeleton.names
     std = torch.stack([test.std[names[j]] for j in joints])

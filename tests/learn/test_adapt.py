@@ -115,3 +115,17 @@ def test_settings_that_make_no_sense_are_refused() -> None:
     for wrong in ({"iterations": -1}, {"lr": 0.0}, {"contacts": "none"}, {"optimizer": "lbfgs"}):
         with pytest.raises(PoiseError):
             Adaptation(**wrong)  # type: ignore[arg-type]
+
+
+def test_minibatches_take_a_step_each() -> None:
+    net, k = network(), known(bank(), dtype=torch.float32)
+    assert len(k.target_root) > 1
+    losses: list[float] = []
+    often = Adaptation(iterations=3, lr=1e-4, steps="minibatch", batch=1)
+    own = adapt(net, k, 12, often, lambda i, n, loss: losses.append(loss))
+    assert len(losses) == 3 and losses[-1] < losses[0]
+    # One batch that holds all is one step, however it is called.
+    one = adapt(net, k, 12, replace(often, batch=1000)).fill(k, 12).pos
+    whole = adapt(net, k, 12, replace(often, steps="whole")).fill(k, 12).pos
+    assert torch.allclose(one, whole, atol=1e-6)
+    assert not torch.allclose(own.fill(k, 12).pos, whole, atol=1e-6)

@@ -101,6 +101,24 @@ def test_transitions_of_the_recurrent_network_grow_longer() -> None:
     assert [learner.longest(k) for k in (0, 25, 50, 99)] == [5, 18, 30, 30]
 
 
+def test_losses_of_an_untrained_network_count_as_their_weights_say() -> None:
+    whole = trainer("rtn")
+    learner = whole.objective
+    assert isinstance(learner, RTNObjective)
+    stats = learner.step(whole.sampler, 0, whole.generator)
+    c = learner.config
+    weights = c.quat + c.pos + c.root + c.contact + c.adversarial + c.slide
+    assert float(stats["loss"]) == pytest.approx(weights, rel=1e-4)
+    settled = learner.scales.first.clone()
+    learner.step(whole.sampler, 1, whole.generator)
+    # The scales stay, and travel with the state.
+    assert torch.equal(learner.scales.first, settled)
+    assert torch.equal(whole.state()["module/scales/first"], settled)
+    plain = trainer("rtn", equalise=False)
+    stats = plain.objective.step(plain.sampler, 0, plain.generator)
+    assert float(stats["loss"]) != pytest.approx(weights, rel=1e-2)
+
+
 @pytest.mark.parametrize("kind", ["transformer", "rtn"])
 def test_training_lowers_the_loss(kind: str) -> None:
     whole = trainer(kind, steps=60, **({"ramp": 0.01} if kind == "rtn" else {}))

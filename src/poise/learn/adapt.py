@@ -34,7 +34,10 @@ class Adaptation:
     """How a network is adapted to what it is asked."""
 
     iterations: int = 5
-    """Steps, each on the whole test set or on one sequence; choose them on validation."""
+    """Passes over the test set, or over one sequence; choose them on validation."""
+    steps: Literal["whole", "minibatch"] = "whole"
+    """whole: one step of each pass, down the mean loss of all sequences. minibatch: a step after each
+    `batch` of them, as the paper's "several epochs on the whole test data" reads."""
     lr: float = 1e-5
     beta: float = 0.01
     """Weight of the root's path."""
@@ -43,7 +46,8 @@ class Adaptation:
     so that predicting no contact at all also lowers the loss."""
     optimizer: Literal["sgd", "adam"] = "adam"
     batch: int = 128
-    """Sequences of which gradients are computed at once; it changes memory and time alone."""
+    """Sequences of which gradients are computed at once; with `steps="whole"` it changes memory and time
+    alone."""
 
     def __post_init__(self) -> None:
         if self.iterations < 0 or self.lr <= 0 or self.beta < 0 or self.batch < 1:
@@ -87,8 +91,8 @@ def adapt(
 ) -> N:
     """A copy of the network adapted to a whole test set of one length; the given one stays as it is.
 
-    An iteration is one step down the mean loss of all sequences, so that as many iterations do as much
-    to a large set as to the small one that they were chosen on.
+    With `steps="whole"` an iteration is one step down the mean loss of all sequences, so that as many
+    iterations do as much to a large set as to the small one that they were chosen on.
 
     Args:
         known: all sequences; the gradients of `config.batch` at a time are computed, in order.
@@ -102,21 +106,30 @@ def adapt(
     params = [p for p in own.parameters() if p.requires_grad_(True) is p]
     kind = torch.optim.Adam if config.optimizer == "adam" else torch.optim.SGD
     optimizer = kind(params, lr=config.lr)
-    count = len(known.target_root)
+    count, often = len(known.target_root), config.steps == "minibatch"
     for iteration in range(1, config.iterations + 1):
         total = 0.0
         optimizer.zero_grad(set_to_none=True)
         for low in range(0, count, config.batch):
             part = Known(*(x[low : low + config.batch] for x in known))
+            own_count = len(part.target_root)
             with torch.enable_grad():
-                loss = test_loss(own, part, own.fill(part, length), config).sum() / count  # type: ignore[arg-type]
-                loss.backward()
-            total += float(loss.detach())
-        if not total < float("inf"):
-            raise TrainingError("the loss of the adaptation is not finite", hint="Lower its lr")
-        optimizer.step()
+                losses = test_loss(own, part, own.fill(part, length), config)  # type: ignore[arg-type]
+                (losses.sum() / (own_count if often else count)).backward()
+            total += float(losses.detach().sum()) / count
+            if often:
+                _stepped(optimizer, total)
+                optimizer.zero_grad(set_to_none=True)
+        if not often:
+            _stepped(optimizer, total)
         if on_iteration is not None:
             on_iteration(iteration, own, total)
     for p in params:
         p.requires_grad_(False)
     return own
+
+
+def _stepped(optimizer: torch.optim.Optimizer, loss: float) -> None:
+    if not loss < float("inf"):
+        raise TrainingError("the loss of the adaptation is not finite", hint="Lower its lr")
+    optimizer.step()

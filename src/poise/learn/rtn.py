@@ -39,9 +39,32 @@ class RTNTraining:
     adversarial: float = 0.1
     slide: float = 0.1
     """alpha of Skeleton2Humanoid's Eq. 3, contacts detached; 0 trains as Harvey et al. do."""
+    equalise: bool = True
+    """Each loss is first divided by what it is for the untrained network, as the paper has it; without,
+    the critics' verdict is 85 % of the sum."""
     grad_norm: float = 1.0
     products: Literal["auto", "float32", "bfloat16"] = "auto"
     """How matrices are multiplied; states, losses and weights are float32 in any case."""
+
+
+#: The parts of the generator's loss.
+LOSSES = ("quat", "pos", "root", "contact", "adversarial", "slide")
+
+
+class Scales(torch.nn.Module):
+    """What losses are divided by: their values when they were first asked for; 0 before."""
+
+    first: Tensor
+
+    def __init__(self, count: int):
+        super().__init__()
+        self.register_buffer("first", torch.zeros(count))
+
+    def of(self, losses: Tensor) -> Tensor:
+        """The scales `(count,)`; the first `losses (count,)` settle them."""
+        if not bool(self.first.any()):
+            self.first.copy_(losses.clamp_min(1e-6))
+        return self.first
 
 
 class RTNObjective:
@@ -55,6 +78,7 @@ class RTNObjective:
         self.critics = torch.nn.ModuleList(
             [Critic(channels, window, generator=generator) for window in (10, 2)]
         )
+        self.scales = Scales(len(LOSSES))
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
         kind = {"lr": config.lr, "betas": (0.5, 0.9), "amsgrad": True}
         self.optimizers: dict[str, torch.optim.Optimizer] = {
@@ -64,7 +88,7 @@ class RTNObjective:
 
     def modules(self) -> Mapping[str, torch.nn.Module]:
         """What is trained, by name."""
-        return {"net": self.net, "critics": self.critics}
+        return {"net": self.net, "critics": self.critics, "scales": self.scales}
 
     def longest(self, step: int) -> int:
         """P_cur, the longest transition at a step: from `shortest` to P_max along a line."""
@@ -102,7 +126,8 @@ class RTNObjective:
     def loss(
         self, steps: Steps, pos: Tensor, batch: Windows, truth: Tensor, fake: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """L1 of local quaternions, root, positions and contacts, the critics' verdict, Eq. 3's slide."""
+        """L1 of local quaternions, root, positions and contacts, the critics' verdict, Eq. 3's slide;
+        the parts that are returned are as they are, before they are made equal."""
         past, c = self.net.config.past, self.config
         gap = slice(past, past + steps.root.shape[1])
         feet = list(self.net.layout.feet)
@@ -117,7 +142,12 @@ class RTNObjective:
             "adversarial": 0.5 * verdict,
             "slide": 100 * (moved * steps.contact.detach()).mean(),
         }
-        total = sum((getattr(c, k) * v for k, v in parts.items()), torch.zeros(()))
+        if c.equalise:
+            scales = self.scales.of(torch.stack([parts[k].detach() for k in LOSSES]))
+            weighted = (getattr(c, k) * parts[k] / scales[i] for i, k in enumerate(LOSSES))
+        else:
+            weighted = (getattr(c, k) * v for k, v in parts.items())
+        total = sum(weighted, torch.zeros(()))
         return total, {k: v.detach() for k, v in parts.items()}
 
     def _judge(self, real: Tensor, fake: Tensor) -> Tensor:

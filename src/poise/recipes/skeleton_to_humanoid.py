@@ -72,7 +72,8 @@ def settings(variant: Variant = "full", budget: Budget | None = None, **changes:
 
     Not stated in the paper, and ours: which of Residual Force Control's rewards (that in world
     coordinates), whether forces act on all joints or on the root (on the root, as UHC's code has it),
-    signed forces where it prints k_r in [0, 1], and the learner's settings.
+    signed forces where it prints k_r in [0, 1], and the learner's settings. `expert=False` begins from
+    nothing, as the paper does; by default all begin from the same cloned expert (`jobs.warm_start`).
     """
     if variant not in ("uhc", "one frame", "no curriculum", "full", "full to zero"):
         raise PoiseError(f"there is no variant '{variant}'")
@@ -88,7 +89,6 @@ def settings(variant: Variant = "full", budget: Budget | None = None, **changes:
         "action": "additive",
         "reward": "world",
         "completion_bonus": False,
-        "expert": False,
         "num_envs": budget.num_envs,
         "ppo": learner(budget),
     }

@@ -94,8 +94,7 @@ class Inbetween:
     def paper(cls, **changes: Any) -> Inbetween:
         """Harvey et al. 2020 on LAFAN1 as stated, with the loss of Skeleton2Humanoid's Eq. 3.
 
-        Its alpha is stated nowhere and neither is the width of the LSTM; both are ours, and so is that
-        the losses are weighted as they are rather than made equal for an untrained network first.
+        Its alpha is stated nowhere and neither is the width of the LSTM; both are ours.
         """
         own: dict[str, Any] = {
             "net": "rtn", "name": LAFAN1.name, "final": LAFAN1.final, "contacts": "harvey", "fps": 30.0,
@@ -103,7 +102,7 @@ class Inbetween:
             "rtn": RTNConfig(encoder=(512, 256), decoder=(512, 256), past=10, longest=30, noise=0.5),
             "rtn_training": RTNTraining(
                 batch=32, lr=1e-3, decay=False, shortest=5, quat=1.0, pos=1.0, root=0.5, contact=0.1,
-                adversarial=0.1, products="float32",
+                adversarial=0.1, equalise=True, products="float32",
             ),
         }  # fmt: skip
         return cls(**(own | changes))
@@ -119,7 +118,7 @@ class Inbetween:
         own = cls.paper()
         rtn, how = (
             replace(own.rtn, hidden=768),
-            replace(own.rtn_training, adversarial=0.01, grad_norm=1.0),
+            replace(own.rtn_training, adversarial=0.01, grad_norm=1.0, equalise=False),
         )
         return replace(own, **({"mirror": True, "rtn": rtn, "rtn_training": how} | changes))
 
