@@ -30,10 +30,16 @@ class Options:
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file that holds the keyframes."""
     keyframes: Annotated[str, arg(metavar="0,30,60")]
-    """Frames that stay, counted from 0, in rising order; frames outside of them stay too."""
+    """Frames that stay, counted from 0, in rising order; frames outside of them stay too. Or all, with
+    --times: each frame of the file is a pose."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
     """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
     into a folder of its name."""
+    times: Annotated[str | None, arg(metavar="0,1.2,2.5", help_behavior_hint="")] = None
+    """Times of the keyframes, in s from the first; by default they stay where they are in the file.
+    They may be rough: see --retime."""
+    partial: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="FRAME[:PARTS]")] = ()
+    """Further frames of which only hands, feet and pelvis stay, or some of them: 45:hands,pelvis."""
     kinematic: Flag = False
     """Only fill the frames, without a body: keyframes are met exactly. See poise inbetween."""
     retime: Flag = False
@@ -75,7 +81,12 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, fills, simulates, writes."""
     o = options
-    keys = frames_of(o.keyframes)
+    every = o.keyframes == "all"
+    if every and o.times is None:
+        raise PoiseError(
+            "--keyframes all leaves nothing to fill", hint="Say when with --times 0,1.2,2.5"
+        )
+    keys = () if every else frames_of(o.keyframes)
     check_range("adapt", o.adapt, 0, 1000)
     check_range("seed", o.seed, 0)
     check_range("threads", o.threads, 0)
@@ -91,21 +102,24 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.track.simulation import retake_of
     from poise.plan import LookaheadConfig
     from poise.synth.gaps import check_keyframes
+    from poise.synth.sparse import partials_of, times_of
 
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     config = TrackConfig(
         seed=o.seed, controller=o.controller, lookahead=ahead, threads=o.threads,
         direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
     )  # fmt: skip
+    times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)
+    keys = tuple(range(clip.frames)) if every else keys
     check_keyframes(keys, clip.frames, str(o.clip))
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
     with claimed(out):
         with contextlib.ExitStack() as shown:
             done = complete(
-                clip, keys, tracker, config, model=o.model, adapt=o.adapt, retime=o.retime,
-                progress=staged(shown),
+                clip, keys, tracker, config, model=o.model, adapt=o.adapt, retime=o.retime, times=times,
+                partial=partial, progress=staged(shown),
             )  # fmt: skip
         with working("writing"):
             delivered = done.write(out, motion, o.hold_feet)
@@ -130,6 +144,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
+    if o.times is not None or o.partial:
+        raise PoiseError("--times and --partial need a body", hint="Leave --kinematic out")
     if o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
         raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
     from poise.jobs.inbetween.fill import inbetween

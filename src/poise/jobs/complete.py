@@ -29,6 +29,7 @@ from poise.plan import LookaheadConfig
 from poise.settings import changed
 from poise.synth.gaps import check_keyframes
 from poise.synth.retime import Retiming, retimed
+from poise.synth.sparse import Partial, moved_to, timed
 
 #: How much more a keyframe counts than the frames between.
 KEY_WEIGHT = 20.0
@@ -48,8 +49,8 @@ class Completed(Result):
     """What came of keyframes.
 
     Attributes:
-        source: what came in.
-        keyframes: its frames that are kept.
+        source: what came in, on the times that were asked for.
+        keyframes: frames that are kept, as they were asked for.
         filled: the kinematic stage, on the times of the result.
         tracked: the physical stage.
         at: frames of the result at which each keyframe is; `keyframes` unless times were changed.
@@ -120,6 +121,8 @@ def complete(
     model: InbetweenModel | str | Path | None = None,
     adapt: int | None = None,
     retime: bool = False,
+    times: Sequence[float] | None = None,
+    partial: Sequence[Partial] = (),
     progress: Show | None = None,
     **settings: Any,
 ) -> Completed:
@@ -134,6 +137,8 @@ def complete(
         policy, config, settings: see `track`.
         model, adapt: see `inbetween`.
         retime: gaps that no body does in their time get more of it, see `Retiming`.
+        times: s, at which each keyframe is to be, from the first on; by default where it is.
+        partial: further frames of which only hands, feet or the pelvis stay.
         progress: is told what is done.
 
     Raises:
@@ -148,6 +153,13 @@ def complete(
         raise PoiseError("a range has the times of the earlier result", hint="Leave --retime out")
     source = clip_of(clip)
     keys = tuple(check_keyframes(keyframes, source.frames, source.name))
+    for sparse in partial:
+        if not keys[0] < sparse.frame < keys[-1]:
+            what = f"a keyframe of parts must lie between keyframes, got frame {sparse.frame}"
+            raise PoiseError(what, source.name)
+    given, asked = source, keys
+    if times is not None:
+        source, keys = timed(source, keys, times)
     more: dict[str, Any] = {} if adapt is None else {"adapt": adapt}
     factors = np.ones(len(keys) - 1)
     best: tuple[float, Completed] | None = None
@@ -156,11 +168,17 @@ def complete(
         told = None if progress is None else _telling(progress, "filling")
         filled = inbetween(stretched, at, model, on_gap=told, **more)
         weights = tuple(Weight("all", KEY_WEIGHT, k, k) for k in at)
-        direction = replace(config.direction, weights=(*config.direction.weights, *weights))
+        led = tuple(touch for p in partial for touch in p.touches(given, moved_to(p.frame, asked, at)))
+        direction = replace(
+            config.direction,
+            weights=(*config.direction.weights, *weights),
+            touches=(*config.direction.touches, *led),
+        )
         # A retimed motion is searched at last, when its times are settled.
         how = config if round_ + 1 == ROUNDS or not retime else replace(config, controller="lookahead")
         tracked = track(filled.clip, policy, replace(how, direction=direction), progress=progress)
         done = _completed(source, keys, filled, tracked, at, factors)
+        done = replace(done, keyframes=asked)
         score = float(np.mean(done.met_mm)) + 1e6 * bool(tracked.failures)
         if best is None or score < best[0]:
             best = score, done

@@ -16,10 +16,13 @@ from poise.kin.series import gaussian_sums
 from poise.motion import Clip, Skeleton
 from poise.spatial import forward_kinematics
 
-#: Ends of limbs that can be pinned and can touch.
+#: Ends of limbs that can be pinned and can touch; the pelvis, too, can be led to a point.
 LIMBS = ("left_foot", "right_foot", "left_hand", "right_hand")
+PELVIS = "pelvis"
 #: s over which a limb comes to a pin or a touch, and leaves it.
 EASE_S = 0.35
+#: The same for the pelvis, which is heavier.
+PELVIS_S = 0.7
 #: m off the floor from which on a pinned foot hangs in the air; m out of reach that is worth a sentence.
 HANGS_M, SHORT_M = 0.15, 0.01
 #: See `limbs.soft_reach`: what is asked for is asked for, so legs may be nearly straight.
@@ -45,10 +48,10 @@ class Pin:
 
 @dataclass(frozen=True)
 class TouchPoint:
-    """A point that a hand or foot reaches.
+    """A point that a hand, a foot or the pelvis reaches.
 
     Attributes:
-        limb: one of `LIMBS`.
+        limb: one of `LIMBS`, or `PELVIS`.
         frame: of the clip.
         point: m, in the clip's world.
     """
@@ -73,10 +76,10 @@ def end_of(skeleton: Skeleton, limb: str) -> int:
     return joints[0]
 
 
-def ease(frames: int, first: int, last: int, fps: float) -> Tensor:
-    """`(T,)` 1 from frame `first` to `last`, rising and falling in `EASE_S` along a smooth step."""
+def ease(frames: int, first: int, last: int, fps: float, seconds: float = EASE_S) -> Tensor:
+    """`(T,)` 1 from frame `first` to `last`, rising and falling in `seconds` along a smooth step."""
     t = torch.arange(frames, dtype=torch.float64)
-    away = torch.maximum(first - t, t - last).clamp_min(0.0) / (EASE_S * fps)
+    away = torch.maximum(first - t, t - last).clamp_min(0.0) / (seconds * fps)
     left = (1.0 - away).clamp(0.0, 1.0)
     return left * left * (3.0 - 2.0 * left)
 
@@ -97,7 +100,8 @@ def directed(
         return clip, ()
     notes: list[str] = []
     root, rot = clip.tensors()
-    for what in (*pins, *touches):
+    # Limbs reach from where the pelvis is led.
+    for what in (*sorted(touches, key=lambda t: t.limb != PELVIS), *pins):
         span = (what.first, what.last) if isinstance(what, Pin) else (what.frame, what.frame)
         if not 0 <= span[0] <= span[1] < clip.frames:
             raise PoiseError(
@@ -105,6 +109,9 @@ def directed(
                 f"{clip.frames - 1}",
                 clip.name,
             )
+        if isinstance(what, TouchPoint) and what.limb == PELVIS:
+            root, rot = _pelvis_led(clip, root, rot, what)
+            continue
         joint = end_of(clip.skeleton, what.limb)
         pos = _ends(clip.skeleton, root, rot, joint)
         place = pos[span[0]] if isinstance(what, Pin) else torch.tensor(what.point).to(pos)
@@ -153,6 +160,19 @@ def _led(clip: Clip, root: Tensor, rot: Tensor, joint: int, goal: Tensor) -> tup
     moved = (rot - start).abs().amax((1, 2)) > 0
     touched = moved & ((goal - _ends(skeleton, root, start, joint)).norm(dim=-1) > 0) | shift.any(-1)
     return root + shift, torch.where(touched[:, None, None], rot, start)
+
+
+def _pelvis_led(clip: Clip, root: Tensor, rot: Tensor, what: TouchPoint) -> tuple[Tensor, Tensor]:
+    """Root and rotations with the root at a point in one frame, and feet where they are as far as legs
+    reach."""
+    skeleton = clip.skeleton
+    feet: dict[int | str, Tensor] = {
+        j: _ends(skeleton, root, rot, j) for j in find_anatomy(skeleton).of("foot")
+    }
+    share = ease(clip.frames, what.frame, what.frame, clip.fps, PELVIS_S).to(root)[:, None]
+    moved = root + share * (torch.tensor(what.point).to(root) - root[what.frame])
+    led = match_positions(skeleton, rot, moved, feet, soft=SOFT)
+    return moved, torch.where((share > 0)[:, None], led, rot)
 
 
 def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError, did_you_mean
-from poise.kin.directed import LIMBS, Pin, TouchPoint, directed, ease
+from poise.kin.directed import LIMBS, PELVIS, Pin, TouchPoint, directed, ease
 from poise.motion import Clip
 
 #: Cost per metre of distance in a control step of a part that counts twice, and of limbs that are
@@ -20,7 +20,7 @@ PRICE, HELD_PRICE = 10.0, 40.0
 PARTS = {
     "hands": ("hand",), "feet": ("foot",), "arms": ("upper_arm", "forearm", "hand"),
     "legs": ("thigh", "shin", "foot"), "head": ("neck", "head"), "trunk": ("pelvis", "spine"),
-    "root": ("pelvis",), "all": (),
+    "root": ("pelvis",), "pelvis": ("pelvis",), "all": (),
 }  # fmt: skip
 SIDED = ("hand", "foot", "arm", "leg")
 #: Highest weight.
@@ -54,7 +54,7 @@ class Direction:
     Attributes:
         weights: what counts more than the rest; lookahead alone looks at it.
         pins: hands and feet that stay where they are.
-        touches: points that hands and feet reach.
+        touches: points that hands, feet and the pelvis reach.
     """
 
     weights: tuple[Weight, ...] = ()
@@ -160,7 +160,7 @@ def _touch(word: str) -> TouchPoint:
     try:
         limb, frame, place = word.split(":")
         x, y, z = (float(v) for v in place.split(","))
-        return TouchPoint(_limb(limb), int(frame), (x, y, z))
+        return TouchPoint(limb if limb == PELVIS else _limb(limb), int(frame), (x, y, z))
     except ValueError:
         hint = "Write right_hand:50:0.3,0.2,1.1, a limb, a frame and a place in m"
         raise PoiseError(f"--touch '{word}' makes no sense", hint=hint) from None
