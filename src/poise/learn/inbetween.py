@@ -42,7 +42,7 @@ class Objective(Protocol):
         """Everything with weights, by name; "net" is the network itself."""
         ...
 
-    def step(self, sampler: Sampler, step: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def step(self, sampler: Any, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         """One update of step number `step`, and its figures, among them "loss"."""
         ...
 
@@ -74,7 +74,7 @@ class InbetweenTrainer:
 
     Args:
         objective: made for `steps` steps.
-        data: the training set.
+        data: the training set, or what the objective draws its windows from.
         seed: of the windows that are drawn.
         steps: of the whole training.
         block: steps between two reports.
@@ -86,7 +86,7 @@ class InbetweenTrainer:
     def __init__(
         self,
         objective: Objective,
-        data: FrameData,
+        data: FrameData | Any,
         seed: int = 0,
         steps: int = 20_000,
         batch: int = 64,
@@ -97,7 +97,8 @@ class InbetweenTrainer:
     ):
         if min(steps, batch, block) < 1 or not 0 <= ema < 1:
             raise PoiseError(f"steps, batch and block must be at least 1 and ema in [0, 1), got {ema}")
-        self.objective, self.sampler = objective, Sampler(data, stretch)
+        self.objective = objective
+        self.sampler = Sampler(data, stretch) if isinstance(data, FrameData) else data
         self.steps, self.batch, self.block, self.ema = steps, batch, block, ema
         self.metadata, self.seed = dict(metadata or {}), seed
         self.generator = make_generator(seed, "in-between windows")
