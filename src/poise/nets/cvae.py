@@ -12,7 +12,7 @@ A frame is the one before it plus what is said of it, so that a segment begins w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -121,13 +121,16 @@ class CVAE(nn.Module):
 
 
 def _gru(features: int, hidden: int, generator: torch.Generator) -> nn.GRU:
-    module = cast(nn.GRU, nn.utils.skip_init(nn.GRU, features, hidden, batch_first=True))
+    # Nothing is drawn from the global generator.
+    with torch.random.fork_rng(devices=[]):
+        module = nn.GRU(features, hidden, batch_first=True)
     _fill(module, hidden, generator)
     return module
 
 
 def _cell(features: int, hidden: int, generator: torch.Generator) -> nn.GRUCell:
-    module = cast(nn.GRUCell, nn.utils.skip_init(nn.GRUCell, features, hidden))
+    with torch.random.fork_rng(devices=[]):
+        module = nn.GRUCell(features, hidden)
     _fill(module, hidden, generator)
     return module
 

@@ -108,7 +108,7 @@ def motions_of(
 
 
 def read_motions(
-    folder: Path, tracker: Tracker, config: CVAEConfig, hold_out: Sequence[str] = (),
+    folder: Path, tracker: Tracker, sizes: CVAEConfig, hold_out: Sequence[str] = (),
     tell: Callable[[str], None] = lambda _: None, **how: object,
 ) -> Motions:  # fmt: skip
     """A folder's clips on a policy's body; `how` as `perpetual.run.clips_of` takes it."""
@@ -116,7 +116,7 @@ def read_motions(
     library, notes = clips_of(folder, body, hold_out, tell=tell, onto=tracker.target, **how)  # type: ignore[arg-type]
     for note in notes:
         tell(note)
-    return motions_of(library, tracker, config, tell)
+    return motions_of(library, tracker, sizes, tell)
 
 
 def train_generator(

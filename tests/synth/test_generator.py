@@ -1,0 +1,169 @@
+"""Frames that know no place, and a kinematic policy that goes on from its own past."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from poise.env.goals import GeneratorGoal
+from poise.errors import PoiseError
+from poise.jobs.endless.model import GeneratorModel, load_generator
+from poise.jobs.endless.training import Endless, Motions, motions_of, train_generator
+from poise.jobs.open import open_run
+from poise.jobs.tracker import Tracker
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint
+from poise.learn.cvae import CVAETraining, Frames, falling
+from poise.motion import ClipLibrary
+from poise.nets.cvae import CVAE, Code, CVAEConfig
+from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
+from poise.synth.generator import Kinematic
+from poise.synth.place_free import ROOT, coordinates, features_of
+from toy_policy import walk
+
+SMALL = CVAEConfig(past=10, future=12, latent=8, hidden=32, layers=(32,))
+
+
+@pytest.fixture(scope="module")
+def tracker() -> Tracker:
+    return open_run(None).tracker
+
+
+@pytest.fixture(scope="module")
+def motions(tracker: Tracker) -> Motions:
+    return motions_of(ClipLibrary.of([walk()]), tracker, SMALL, lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def trained(motions: Motions, tmp_path_factory: pytest.TempPathFactory) -> tuple[GeneratorModel, Path]:
+    folder = tmp_path_factory.mktemp("run")
+    config = Endless(SMALL, CVAETraining(batch=16), steps=120, ema=0.9)
+    return train_generator(motions, folder, config)[0], folder
+
+
+def moved(qpos: Tensor, yaw: float) -> Tensor:
+    """A motion turned about +Z and moved along the floor."""
+    q = axis_angle_to_quat(torch.tensor([0.0, 0, 1]).double(), torch.tensor(yaw).double())
+    q = q.expand(len(qpos), 4)
+    away = torch.tensor([3.0, -4.0, 0.0]).double()
+    place = quat_rotate(q, qpos[:, :3]) + away
+    return torch.cat((place, quat_mul(q, qpos[:, 3:7]), qpos[:, 7:]), 1)
+
+
+def test_frames_and_coordinates_are_the_same_motion(motions: Motions) -> None:
+    qpos = motions.seeds[0]
+    frames = features_of(qpos, 30.0)
+    assert frames.shape == (len(qpos), ROOT + qpos.shape[1] - 7)
+    back = coordinates(frames[None, 1:], qpos[None, 0], 30.0)[0]
+    torch.testing.assert_close(back, qpos[1:], atol=1e-9, rtol=0)
+    # They know neither place nor heading.
+    torch.testing.assert_close(features_of(moved(qpos, 2.0), 30.0), frames, atol=1e-9, rtol=0)
+
+
+def test_windows_lie_within_clips() -> None:
+    frames = Frames(torch.arange(30.0)[:, None], torch.tensor([0, 20, 30]))
+    assert frames.count(12) == 9
+    drawn = frames.draw(200, 12, torch.Generator().manual_seed(0))[..., 0]
+    assert bool((torch.diff(drawn, dim=1) == 1).all()) and set(drawn[:, 0].tolist()) == set(range(9))
+    with pytest.raises(PoiseError, match="no clip has 21 frames"):
+        frames.draw(1, 21, torch.Generator())
+
+
+def test_divergence_and_step_sizes_by_hand() -> None:
+    code = Code(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, np.log(4.0)]]))
+    assert float(code.divergence()) == pytest.approx(0.5 * (1 + 3 - np.log(4.0)))
+    assert [falling(k, 100, 0.2) for k in (0, 19, 60, 100)] == pytest.approx([1, 1, 0.5, 0])
+
+
+def test_training_lowers_the_loss_and_goes_on_bit_for_bit(motions: Motions, tmp_path: Path) -> None:
+    config = Endless(SMALL, CVAETraining(batch=8), steps=100, ema=0.9)
+    losses: list[float] = []
+    whole, _ = train_generator(
+        motions, tmp_path / "a", config, on_block=lambda s: losses.append(s.parts["square"])
+    )
+    assert losses[-1] < losses[0]
+    train_generator(motions, tmp_path / "b", config, on_block=lambda s: False)
+    resumed, _ = train_generator(motions, tmp_path / "b", config)
+    same = zip(whole.net.state_dict().values(), resumed.net.state_dict().values(), strict=True)
+    assert all(torch.equal(a, b) for a, b in same)
+    with pytest.raises(PoiseError, match="other settings"):
+        train_generator(motions, tmp_path / "b", Endless(SMALL, steps=7))
+
+
+def test_a_segment_begins_where_the_past_ends(
+    trained: tuple[GeneratorModel, Path], tracker: Tracker
+) -> None:
+    made = trained[0].generator(tracker.humanoid)
+    rng = torch.Generator().manual_seed(3)
+    past = made.begin(4, rng)
+    assert past.shape == (4, 10, tracker.humanoid.model.nq)
+    assert float(past[:, -1, :2].abs().max()) == 0.0
+    future = made.generate(past, torch.arange(4), rng)
+    steps = torch.diff(torch.cat((past[:, -1:], future), 1), dim=1)[..., 7:].abs().amax((0, 2))
+    usual = torch.diff(past, dim=1)[..., 7:].abs().max()
+    assert float(steps.max()) < 3 * float(usual)
+    low, high = trained[0].bounds
+    assert bool(((future[..., 7:] >= low) & (future[..., 7:] <= high)).all())
+    # Where a character is and which way it faces does not matter.
+    z = torch.Generator().manual_seed(5)
+    one = made.generate(past[:1], torch.zeros(1).long(), z)[0]
+    z = torch.Generator().manual_seed(5)
+    there = made.generate(moved(past[0], 1.0)[None], torch.zeros(1).long(), z)[0]
+    torch.testing.assert_close(moved(one, 1.0)[:, :3], there[:, :3], atol=1e-4, rtol=0)
+
+
+def test_it_is_saved_and_drives_a_goal(
+    trained: tuple[GeneratorModel, Path], tracker: Tracker, tmp_path: Path
+) -> None:
+    model, folder = trained
+    again = load_generator(folder)
+    rng = torch.Generator().manual_seed(1)
+    one = model.generator(tracker.humanoid).endless(30, rng)
+    two = again.generator(tracker.humanoid).endless(30, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(one, two, atol=1e-4, rtol=0)
+    assert one.shape == (40, tracker.humanoid.model.nq) and bool(one.isfinite().all())
+    goal = GeneratorGoal(again.generator(tracker.humanoid), tracker.humanoid, 30.0, 2, seed=7)
+    goal.draw(torch.arange(2))
+    goal.aim(None, None)
+    for _ in range(20):
+        goal.advance(None, None)
+    assert not goal.notes and bool(goal.now().isfinite().all())
+    model.save(tmp_path / "half.safetensors", half=True)
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.7 * folder.joinpath(
+        "generator.safetensors"
+    ).stat().st_size
+
+
+def test_what_makes_no_sense_is_refused(
+    trained: tuple[GeneratorModel, Path], motions: Motions, tracker: Tracker, tmp_path: Path
+) -> None:
+    model, folder = trained
+    with pytest.raises(PoiseError, match="temperature"):
+        model.generator(tracker.humanoid, -1.0)
+    with pytest.raises(PoiseError, match="pasts of 10 frames"):
+        Kinematic(model.net, motions.seeds[:, :5], 30.0)
+    with pytest.raises(PoiseError, match="the longest has 86"):
+        motions_of(ClipLibrary.of([walk()]), tracker, CVAEConfig(), lambda _: None)
+    tensors, meta = load_checkpoint(folder / "generator.safetensors")
+    file = tmp_path / "bad.safetensors"
+    save_checkpoint(file, {**tensors, "seeds": tensors["seeds"][:, :3]}, meta)
+    with pytest.raises(PoiseError, match="'seeds' is missing or damaged"):
+        load_generator(file)
+    save_checkpoint(file, tensors, {**meta, "kind": "tracker"})
+    with pytest.raises(PoiseError, match="no kinematic policy"):
+        load_generator(file)
+    other = GeneratorModel(model.net, model.seeds, model.bounds, ("a",), 30.0)
+    with pytest.raises(PoiseError, match="another body"):
+        other.generator(tracker.humanoid)
+    with pytest.raises(PoiseError, match="past 2 frames"):
+        CVAEConfig(past=1)
+
+
+def test_the_network_goes_on_from_any_number_of_frames() -> None:
+    net = CVAE(14, SMALL, generator=torch.Generator().manual_seed(0))
+    past, z = torch.randn(3, 10, 14), torch.randn(3, 8)
+    assert net.decode(past, z, 5).shape == (3, 5, 14)
+    torch.testing.assert_close(net.decode(past, z)[:, :5], net.decode(past, z, 5))
