@@ -11,13 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from poise.errors import PoiseError
-from poise.nets.cvae import CVAE
+from poise.nets.cvae import CVAE, Code
+from poise.nets.mlp import bfloat16_is_fast
 from poise.settings import validate
 
 
@@ -36,9 +38,10 @@ class CVAETraining:
         own_past: share of batches in which a second segment follows what was made of the first.
         noise: deviation of the noise on pasts, in deviations of the frames.
         grad_norm: gradients are scaled down to it.
+        products: how matrices are multiplied; weights and losses are float32 in any case.
     """
 
-    batch: int = 128
+    batch: int = 64
     lr: float = 1e-3
     held: float = 0.5
     beta: float = 10.0
@@ -47,6 +50,7 @@ class CVAETraining:
     own_past: float = 0.5
     noise: float = 0.05
     grad_norm: float = 1.0
+    products: Literal["auto", "float32", "bfloat16"] = "auto"
 
     def __post_init__(self) -> None:
         validate(self)
@@ -57,7 +61,8 @@ class CVAETraining:
     def paper(cls) -> CVAETraining:
         """200 epochs at a constant step size and 800 in which it falls; minibatches of 256. An epoch's
         batch is 10,000 windows, so that the whole is 40,000 steps."""
-        return cls(batch=256, held=0.2, smooth=0.0, own_past=0.0, noise=0.0, grad_norm=1e9)
+        return cls(batch=256, held=0.2, smooth=0.0, own_past=0.0, noise=0.0, grad_norm=1e9,
+                   products="float32")  # fmt: skip
 
 
 class Frames:
@@ -101,6 +106,7 @@ class CVAEObjective:
 
     def __init__(self, net: CVAE, config: CVAETraining, steps: int):
         self.net, self.config, self.steps = net, config, steps
+        self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
         self.optimizers: dict[str, torch.optim.Optimizer] = {
             "net": torch.optim.Adam(net.parameters(), lr=config.lr)
         }
@@ -139,8 +145,10 @@ class CVAEObjective:
     ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
         """The loss of one segment, its parts, and what was made `(N, f, D)`."""
         c = self.config
-        code = self.net.encode(past, future)
-        made = self.net.decode(past, code.draw(rng))
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            code = self.net.encode(past, future)
+            made = self.net.decode(past, code.draw(rng)).float()
+        code = Code(code.mean.float(), code.log_var.float())
         count = len(past)
         square = (made - future).square().sum() / count / (2 * c.beta)
         divergence = code.divergence().mean()

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
-from poise.nets.mlp import MLP
+from poise.nets.mlp import MLP, bare_linear
 
 _MIN_STD = 1e-3
 
@@ -82,7 +82,7 @@ class CVAE(nn.Module):
         self.coming = _gru(features, c.hidden, generator)
         self.posterior = MLP(2 * c.hidden, c.layers, 2 * c.latent, "relu", 0.1, generator=generator)
         self.begin = MLP(c.hidden + c.latent, c.layers, c.hidden, "relu", generator=generator)
-        self.cell = _cell(c.hidden + c.latent + features, c.hidden, generator)
+        self.cell = Cell(c.hidden + c.latent, features, c.hidden, generator)
         self.said = MLP(c.hidden, c.layers, features, "relu", 0.1, generator=generator)
 
     @torch.no_grad()
@@ -105,8 +105,9 @@ class CVAE(nn.Module):
         h = self.seen(past)[1][0]
         context = torch.cat((h, z), -1)
         memory, y, out = self.begin(context), past[:, -1], list[Tensor]()
+        steady = self.cell.steady(context)
         for _ in range(frames or self.config.future):
-            memory = self.cell(torch.cat((context, y), -1), memory)
+            memory = self.cell(steady, y, memory)
             y = y + self.said(memory)
             out.append(y)
         return torch.stack(out, 1)
@@ -120,17 +121,38 @@ class CVAE(nn.Module):
         return self.decode(self.scaled(past), z) * self.std + self.mean
 
 
+class Cell(nn.Module):
+    """A gated recurrent unit (Cho et al. 2014) with a part of its input that stays the same.
+
+        r, u = sigma(a_r + b_r), sigma(a_u + b_u),  n = tanh(a_n + r b_n),  h' = (1 - u) n + u h
+
+    with a = W [context; y] + c and b = V h + d. What the context adds is worked out once.
+    """
+
+    def __init__(self, context: int, features: int, hidden: int, generator: torch.Generator):
+        super().__init__()
+        self.of_context = bare_linear(context, 3 * hidden)
+        self.of_input = bare_linear(features, 3 * hidden, bias=False)
+        self.of_memory = bare_linear(hidden, 3 * hidden)
+        _fill(self, hidden, generator)
+
+    def steady(self, context: Tensor) -> Tensor:
+        """What a context `(N, C)` adds to every step, `(N, 3 h)`."""
+        return self.of_context(context)
+
+    def forward(self, steady: Tensor, y: Tensor, memory: Tensor) -> Tensor:
+        """The memory `(N, h)` after an input `y (N, D)`."""
+        a_r, a_u, a_n = (steady + self.of_input(y)).chunk(3, -1)
+        b_r, b_u, b_n = self.of_memory(memory).chunk(3, -1)
+        update = torch.sigmoid(a_u + b_u)
+        new = torch.tanh(a_n + torch.sigmoid(a_r + b_r) * b_n)
+        return torch.lerp(new, memory, update)
+
+
 def _gru(features: int, hidden: int, generator: torch.Generator) -> nn.GRU:
     # Nothing is drawn from the global generator.
     with torch.random.fork_rng(devices=[]):
         module = nn.GRU(features, hidden, batch_first=True)
-    _fill(module, hidden, generator)
-    return module
-
-
-def _cell(features: int, hidden: int, generator: torch.Generator) -> nn.GRUCell:
-    with torch.random.fork_rng(devices=[]):
-        module = nn.GRUCell(features, hidden)
     _fill(module, hidden, generator)
     return module
 

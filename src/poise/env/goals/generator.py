@@ -41,6 +41,7 @@ class GeneratorGoal(BufferedGoal):
 
     Args:
         generator: the model. num_envs: worlds. seed: of all that it draws.
+        lead: frames that are always known ahead, as many as a controller looks ahead.
     """
 
     def __init__(
@@ -51,15 +52,16 @@ class GeneratorGoal(BufferedGoal):
         num_envs: int = 1,
         device: torch.device | str = "cpu",
         seed: int = 0,
+        lead: int = 0,
     ):
         if generator.past < 1 or generator.future < 1:
             raise PoiseError(
                 f"a generator sees and makes at least 1 frame, got past {generator.past} and future "
                 f"{generator.future}"
             )
-        size = generator.past + 2 * generator.future + 2
+        size = generator.past + 2 * generator.future + lead + 2
         super().__init__(humanoid, rate_hz, num_envs, size, torch.device(device), seed)
-        self.generator = generator
+        self.generator, self.lead = generator, lead
 
     def draw(self, ids: Tensor) -> None:
         """New motions in worlds `ids`."""
@@ -79,7 +81,8 @@ class GeneratorGoal(BufferedGoal):
     def supply(self, ids: Tensor) -> None:
         g = self.generator
         begun = self.count[ids] > 0
-        short = ids[begun & (self.at[ids] + 1 >= self.count[ids]) & (self.at[ids] < self.last[ids])]
+        known = self.count[ids] - self.lead
+        short = ids[begun & (self.at[ids] + 1 >= known) & (self.at[ids] < self.last[ids])]
         if not len(short):
             return
         index = self.count[short].unsqueeze(1) - g.past + torch.arange(g.past, device=self.device)

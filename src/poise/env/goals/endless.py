@@ -1,0 +1,164 @@
+"""Motion without end that survives falls: a generator's motion, and where a character loses it, a
+recovery motion after which the generator goes on from how the character stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.env.goals.generator import GeneratorGoal, MotionGenerator
+from poise.env.goals.led import FALLS, LOST, REST, RETURNS, TRACKS, WAITS_S
+from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.recovery.planner import DOWN, plan_recovery
+from poise.spatial.directions import facing, heading_angle
+
+
+class EndlessGoal(GeneratorGoal):
+    """Worlds follow a generator. A character that has lost its motion is waited for until it rests; it
+    then follows a recovery motion to standing at ease, and the generator goes on from that as its past.
+
+    Args:
+        recovery_clips: of the library that the policy has learned; None never comes back.
+        plans: whether recovery motions are planned here; a copy of such a world, in which a controller
+            tries something for some steps, does without.
+
+    Attributes:
+        doing: `(N,)`, `TRACKS`, `FALLS` or `RETURNS`.
+        falls: (world, control step) of every time a motion was lost.
+        back: (world, control step) of every time one was up again.
+    """
+
+    def __init__(
+        self,
+        generator: MotionGenerator,
+        humanoid: Humanoid,
+        rate_hz: float,
+        recovery_clips: RecoveryClips | None,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        seed: int = 0,
+        lead: int = 0,
+        plans: bool = True,
+    ):
+        super().__init__(generator, humanoid, rate_hz, num_envs, device, seed, lead)
+        self.plans, self.recovery_clips = plans, recovery_clips
+        self.get_up = None
+        if recovery_clips is not None:
+            self.get_up = GetUpPlanner(recovery_clips, humanoid.table, rate_hz)
+        self.doing, self._since = torch.zeros_like(self.at), torch.zeros_like(self.at)
+        self.steps = torch.zeros_like(self.at)
+        self.falls, self.back = list[tuple[int, int]](), list[tuple[int, int]]()
+        # Recovery motions lie in a table; what of it each world has yet to read.
+        self._ways = self.qpos[0, :0].clone()
+        self._next, self._end = torch.zeros_like(self.at), torch.zeros_like(self.at)
+        # The frame with which a recovery motion ends.
+        self._until = torch.zeros_like(self.at)
+
+    # --- frames -------------------------------------------------------------------------------
+
+    def draw(self, ids: Tensor) -> None:
+        super().draw(ids)
+        self.doing[ids], self._since[ids] = TRACKS, 0
+        self._next[ids], self._end[ids] = 0, 0
+
+    def supply(self, ids: Tensor) -> None:
+        """A recovery motion's frames first, then the generator's, whose past they are."""
+        while True:
+            known = self.count[ids] - self.lead
+            short = (self.at[ids] + 1 >= known) & (self._next[ids] < self._end[ids])
+            if not bool(short.any()):
+                break
+            for i in ids[short].tolist():
+                first = int(self._next[i])
+                last = min(first + self.generator.future, int(self._end[i]))
+                one = torch.tensor([i], device=self.device)
+                for row in self._ways[first:last]:
+                    self.append(one, row[None])
+                self._next[i] = last
+        super().supply(ids)
+
+    def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
+        # A motion waits for a character that falls.
+        falling = self.doing == FALLS
+        self.steps += 1
+        return super().advance(falling if waited is None else waited | falling, held)
+
+    # --- falls --------------------------------------------------------------------------------
+
+    def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
+        """Notes worlds that have lost their motion, and leads those that have come to rest back."""
+        if self.recovery_clips is None:
+            return False
+        falling, returning = self.doing == FALLS, self.doing == RETURNS
+        ref = self.layout.unpacked(self.now()).pos
+        off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
+        up = returning & ~off & (self.at >= self._until)
+        for i in up.nonzero().squeeze(-1).tolist():
+            self.back.append((i, int(self.steps[i])))
+        self.doing[up] = TRACKS
+        lost = off & ~falling & ~up
+        for i in (lost & ~returning).nonzero().squeeze(-1).tolist():
+            self.falls.append((i, int(self.steps[i])))
+        self.doing[lost], self._since[lost] = FALLS, 0
+        self._since += 1
+        late = self._since > WAITS_S * self.rate_hz
+        rests = falling & ((linvel.norm(dim=-1).mean(-1) < REST) | late)
+        # What has not fallen needs no rest.
+        rests |= lost & returning & (qpos[:, 2] > DOWN * float(self.recovery_clips.ease[2]))
+        rests &= torch.full_like(rests, self.plans)
+        for i in rests.nonzero().squeeze(-1).tolist():
+            self._lead(i, qpos[i].double().cpu())
+        return bool((rests | falling | up).any())
+
+    def _lead(self, world: int, qpos: Tensor) -> None:
+        """A recovery motion for a world from where its character is, at the end of which it stands as
+        long as the generator's past is."""
+        planner, clips = self.get_up, self.recovery_clips
+        assert planner is not None and clips is not None
+        low = float(qpos[2]) < DOWN * float(clips.ease[2])
+        end = planner.up(qpos)[-1] if low else qpos
+        stand = facing(clips.ease, heading_angle(end[3:7]))
+        stand[:2] = end[:2]
+        way = plan_recovery(planner, qpos, stand)
+        way = torch.cat((way, way[-1:].expand(self.generator.past, -1))).to(self._ways)
+        # The old table stays what it is in snapshots.
+        used = self._next < self._end
+        self._ways = torch.cat((self._ways if bool(used.any()) else self._ways[:0], way))
+        one = torch.tensor([world], device=self.device)
+        self._end[world] = len(self._ways)
+        self._next[world] = len(self._ways) - len(way)
+        self.clear(one)
+        self.at[world], self._until[world] = 0, len(way) - self.generator.past
+        self.doing[world] = RETURNS
+        self.append(one, way[:1])
+        self._next[world] += 1
+        self.supply(one)
+        self._stale[world] = True
+
+    def where(self, env: int) -> str:
+        kind = {TRACKS: "", FALLS: ", lost", RETURNS: ", getting up"}[int(self.doing[env])]
+        return f"endless motion, control step {int(self.steps[env])}{kind}"
+
+    # --- persistence --------------------------------------------------------------------------
+
+    def rows(self) -> dict[str, Tensor]:
+        own = {"doing": self.doing, "since": self._since, "steps": self.steps, "next": self._next,
+               "end": self._end, "until": self._until}  # fmt: skip
+        return {**super().rows(), **own}
+
+    def state(self) -> dict[str, Tensor]:
+        return {**super().state(), "goal ways": self._ways}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        super().load_state(state)
+        self._ways = state["goal ways"].clone()
+
+    def shared(self) -> dict[str, Tensor]:
+        return {"ways": self._ways}
+
+    def load_shared(self, shared: Mapping[str, Tensor]) -> None:
+        self._ways = shared["ways"]
