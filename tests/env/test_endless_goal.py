@@ -1,0 +1,114 @@
+"""Motion without end: what is lost is waited for, got up from, and gone on with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from poise.env import ImitationEnv
+from poise.env.goals import EndlessGoal
+from poise.env.goals.led import FALLS, RETURNS, TRACKS
+from poise.jobs.open import open_run
+from poise.jobs.track.placement import place
+from poise.jobs.track.tracking import imitation_of
+from poise.jobs.tracker import Tracker
+from poise.recipes.imitation import Imitation
+
+
+class Stands:
+    """Goes on with the last frame of its past."""
+
+    past, future = 5, 10
+
+    def __init__(self, pose: Tensor):
+        self.pose = pose
+
+    def begin(self, count: int, rng: torch.Generator) -> Tensor:
+        return self.pose.expand(count, self.past, -1).clone()
+
+    def generate(self, past: Tensor, ids: Tensor, rng: torch.Generator) -> Tensor:
+        return past[:, -1:].repeat(1, self.future, 1)
+
+    def rows(self) -> Mapping[str, Tensor]:
+        return {}
+
+
+@pytest.fixture(scope="module")
+def tracker() -> Tracker:
+    return open_run(None).tracker
+
+
+@pytest.fixture(scope="module")
+def task(tracker: Tracker) -> Imitation:
+    made = imitation_of(tracker, [place(tracker.example, tracker)])
+    return replace(made, task=replace(made.task, help_by="all"))
+
+
+def begun(task: Imitation, goal: EndlessGoal) -> tuple[ImitationEnv, Tensor]:
+    """An environment with its characters on the goal."""
+    env = task.env(goal.num_envs, auto_reset=False, threads=1, help_scale=0.0)
+    goal.draw(torch.arange(goal.num_envs))
+    env.backend.write(None, *goal.start(None))
+    env.age[:] = 0
+    return env, env.set_goal(goal)
+
+
+def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, task: Imitation) -> None:
+    assert tracker.recovery_clips is not None
+    ease = tracker.recovery_clips.ease.double()
+    goal = EndlessGoal(Stands(ease), task.humanoid, 30.0, tracker.recovery_clips, 2, lead=12)
+    env, obs = begun(task, goal)
+    for _ in range(20):
+        obs = env.step(tracker.policy.act(obs)).final_obs
+    assert goal.doing.tolist() == [TRACKS, TRACKS] and not goal.falls
+    # As many frames are known as a controller looks ahead.
+    assert bool((goal.count - goal.at > goal.lead).all())
+    # The second one lies on its back a metre away.
+    lying = env.backend.state.qpos.clone()
+    up = tracker.recovery_clips.ups[0][0]
+    lying[1] = up.to(lying)
+    lying[1, :2] = torch.tensor([1.0, 0.5]).to(lying)
+    still = torch.zeros_like(env.backend.state.qvel)
+    env.backend.write(None, lying, still)
+    obs = env.observe()
+    assert goal.doing.tolist() == [TRACKS, FALLS] and [w for w, _ in goal.falls] == [1]
+    shot, done = None, set[int]()
+    for _ in range(400):
+        obs = env.step(tracker.policy.act(obs)).final_obs
+        done.add(int(goal.doing[1]))
+        if shot is None and int(goal.doing[1]) == RETURNS:
+            shot = env.snapshot(), goal.ahead().clone()
+        if goal.back:
+            break
+    assert done >= {FALLS, RETURNS} and goal.back and goal.back[0][0] == 1
+    assert goal.doing.tolist() == [TRACKS, TRACKS]
+    # It stands where it got up, and the generator goes on from there.
+    state = env.backend.state.qpos
+    assert float(state[1, 2]) > 0.8 * float(ease[2])
+    for _ in range(60):
+        obs = env.step(tracker.policy.act(obs)).final_obs
+    assert len(goal.back) == 1 and len(goal.falls) == 1
+    aims = goal.start(None)[0][1, :2]
+    assert float((aims - env.backend.state.qpos[1, :2]).norm()) < 0.3
+    assert float((aims - lying[1, :2]).norm()) < 1.5
+    # A snapshot in the middle of getting up is that again.
+    assert shot is not None
+    env.restore(shot[0])
+    torch.testing.assert_close(goal.ahead(), shot[1])
+    again = EndlessGoal(Stands(ease), task.humanoid, 30.0, tracker.recovery_clips, 2, lead=12)
+    again.load_state(goal.state())
+    assert torch.equal(again.doing, goal.doing) and torch.equal(again.at, goal.at)
+    env.close()
+
+
+def test_without_recovery_clips_nothing_is_watched(tracker: Tracker, task: Imitation) -> None:
+    assert tracker.recovery_clips is not None
+    goal = EndlessGoal(Stands(tracker.recovery_clips.ease.double()), task.humanoid, 30.0, None)
+    env, _ = begun(task, goal)
+    assert not goal.watch(env.backend.state.qpos, env.pose().pos + 9.0, env.pose().linvel)
+    assert int(goal.doing) == TRACKS
+    env.close()
