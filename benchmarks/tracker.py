@@ -59,21 +59,25 @@ def config(seed: int) -> Perpetual:
     )
 
 
-def finer(tracker: Tracker, step: float, std: float, seed: int, recovery: float) -> Perpetual:
+def finer(
+    tracker: Tracker, step: float, std: float, seed: int, recovery: float, smooth: float
+) -> Perpetual:
     """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
     actions, a nearer root, prices of changing actions and of feet that slide, large batches.
 
     Args:
         step: of the policy, fixed; it became smaller from run to run.
         std: deviation of the noise on its actions, rad.
-        recovery: share of the episodes that begin with a fall; with 0.15 getting up is forgotten.
+        recovery: share of the episodes that begin with a fall.
+        smooth: share of the last action that actions keep. With 0.5 all that a policy without knew of
+            getting up is gone at once, and an hour does not bring it back.
     """
     kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
     recovering = replace(kept.recovering, demonstration_share=recovery, demonstrations=512)
     return replace(
         kept,
         heading="hips",
-        filter=0.5,
+        filter=smooth,
         window=(2, 4, 8),
         root=0.2,
         action_rate=3.0,
@@ -92,6 +96,7 @@ def main() -> None:
     parser.add_argument("--from", type=Path, dest="earlier", help="the policy that goes on")
     parser.add_argument("--step", type=float, default=1e-4)
     parser.add_argument("--std", type=float, default=0.05)
+    parser.add_argument("--filter", type=float, default=0.0)
     parser.add_argument("--recovery", type=float, default=0.4)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0)
@@ -102,7 +107,7 @@ def main() -> None:
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
-    settings = finer(earlier, a.step, a.std, a.seed, a.recovery) if earlier else config(a.seed)
+    settings = finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter) if earlier else config(a.seed)
     source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source)

@@ -38,12 +38,17 @@ EXPLAINED = {
     "for users of the library": (
         "jobs/imitate.py:imitate", "eval/card.py:read_score", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
-        "env/goals/generator.py:GeneratorGoal", "env/goals/stream.py:StreamGoal",
+        "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
         "sim/props/carrier.py:Carrier", "sim/props/door.py:Door", "sim/props/lift.py:Lift",
         "sim/props/sphere.py:Ball", "sim/mechanics.py:Mechanics", "sim/mechanics.py:Mechanics.step_map",
         "env/teams.py:Teams",
+    ),
+    "motion without end, which becomes a verb when a generator comes with Poise": (
+        "jobs/endless/dreaming.py:dream", "jobs/endless/dreaming.py:Dreamt.falls_per_hour",
+        "jobs/endless/training.py:read_motions", "jobs/endless/training.py:train_generator",
+        "synth/generator.py:Kinematic.endless",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

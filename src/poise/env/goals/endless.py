@@ -66,7 +66,7 @@ class EndlessGoal(GeneratorGoal):
         self._next[ids], self._end[ids] = 0, 0
 
     def supply(self, ids: Tensor) -> None:
-        """A recovery motion's frames first, then the generator's, whose past they are."""
+        """A recovery motion's frames first, then the generator's, which sees them as its past."""
         while True:
             known = self.count[ids] - self.lead
             short = (self.at[ids] + 1 >= known) & (self._next[ids] < self._end[ids])

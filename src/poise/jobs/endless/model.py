@@ -60,7 +60,7 @@ class GeneratorModel:
         if tuple(humanoid.hinges) != self.hinges:
             raise PoiseError(
                 "the generator is of another body",
-                hint="Give the policy on whose body it was trained, or train a generator for this one",
+                hint="Give the policy that it was trained with, or train a generator for this one",
             )
         return Kinematic(self.net, self.seeds, self.fps, temperature, self.bounds)
 
