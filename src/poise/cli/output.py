@@ -10,7 +10,9 @@ from pathlib import Path
 from poise.errors import PoiseError
 
 #: What `imitate` and `track` write into their folder.
-_RESULTS = ("simulated.*", "simulated_*.*", "body.bvh", "score.json", "report.html")
+_RESULTS = (
+    "simulated.*", "simulated_*.*", "body.bvh", "score.json", "report.html", "simulation.safetensors",
+)  # fmt: skip
 
 
 def may_write(path: Path, force: bool, *read: Path) -> None:

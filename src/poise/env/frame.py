@@ -62,6 +62,11 @@ class Layout:
         self._shapes = tuple(getattr(pose, name).shape[1:] for name in FIELDS)
         self._widths = [*(math.prod(shape) for shape in self._shapes), len(Place._fields)]
 
+    @property
+    def width(self) -> int:
+        """W, the numbers of a row."""
+        return sum(self._widths)
+
     def pack(self, pose: Pose, place: Tensor) -> Tensor:
         """Poses and their places `(N, 4)` as rows `(N, W)`."""
         return torch.cat((packed_pose(pose), place), 1)

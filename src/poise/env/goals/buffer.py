@@ -28,6 +28,7 @@ class BufferedGoal(Goal):
         at: `(N,)` the frame that each world is at.
         qpos: `(N, L, 7 + n)`, frame k at k mod L.
         qvel: `(N, L, 6 + n)`, the velocities there.
+        packs: `(N, L, W)` packed poses there, so that each frame becomes a pose once.
         count: `(N,)` how many frames are known.
         low: `(N,)` the lowest root height so far, m.
         last: `(N,)` index of the last frame of all, where that is known; else far away.
@@ -52,6 +53,7 @@ class BufferedGoal(Goal):
         self.qpos = torch.zeros(num_envs, size, nq, dtype=torch.float64, device=device)
         self.qpos[..., 3] = 1.0
         self.qvel = torch.zeros(num_envs, size, nv, dtype=torch.float64, device=device)
+        self.packs = torch.zeros(num_envs, size, self.layout.width, device=device)
         self.at = torch.zeros(num_envs, dtype=torch.long, device=device)
         self.count, self._wait = torch.zeros_like(self.at), torch.zeros_like(self.at)
         self.low = torch.full((num_envs,), torch.inf, dtype=torch.float64, device=device)
@@ -78,6 +80,7 @@ class BufferedGoal(Goal):
         none = at == 0 if still is None else (at == 0) | still
         self.qvel[ids, at % self.size] = torch.where(none.unsqueeze(-1), 0.0, qvel)
         self.qpos[ids, at % self.size] = qpos
+        self.packs[ids, at % self.size] = self._pack(qpos, self.qvel[ids, at % self.size])
         self.low[ids] = torch.minimum(self.low[ids], qpos[:, 2])
         self.count[ids] += 1
 
@@ -95,12 +98,22 @@ class BufferedGoal(Goal):
 
     def packed(self, ids: Tensor, index: Tensor) -> Tensor:
         """Packed poses `(n, W)` of frames `index (n,)`; the place says where the motion ends."""
-        qpos, qvel = (x.cpu() for x in self.coordinates(ids, index))
-        pose = self._poser.live(qpos, qvel)
-        end = (index >= self.last[ids]).float().cpu()
-        low = torch.where(self.low[ids].isfinite(), self.low[ids], 0.0).float().cpu()
-        place = torch.stack((torch.zeros_like(end), low, end, torch.zeros_like(end)), 1)
-        return self.layout.pack(pose, place).to(self.device)
+        known = self.count[ids]
+        kept = torch.minimum(index, self.last[ids])
+        at = torch.maximum(torch.minimum(kept, known - 1), known - self.size).clamp_min(0)
+        out = self.packs[ids, at % self.size]
+        beyond = ((kept >= known) | (known == 0)).nonzero().squeeze(-1)
+        if len(beyond):
+            out[beyond] = self._pack(*self.coordinates(ids[beyond], index[beyond]))
+        end = (index >= self.last[ids]).to(out)
+        low = torch.where(self.low[ids].isfinite(), self.low[ids], 0.0).to(out)
+        out[:, -4:] = torch.stack((torch.zeros_like(end), low, end, torch.zeros_like(end)), 1)
+        return out
+
+    def _pack(self, qpos: Tensor, qvel: Tensor) -> Tensor:
+        """Packed poses `(n, W)` of coordinates; their place is yet to be told."""
+        pose = self._poser.live(qpos.cpu(), qvel.cpu())
+        return self.layout.pack(pose, torch.zeros(len(qpos), 4)).to(self.device)
 
     # --- what a goal tells --------------------------------------------------------------------
 
@@ -165,5 +178,5 @@ class BufferedGoal(Goal):
         self._stale[:] = True
 
     def rows(self) -> dict[str, Tensor]:
-        names = ("at", "qpos", "qvel", "count", "last", "low")
+        names = ("at", "qpos", "qvel", "packs", "count", "last", "low")
         return {name: getattr(self, name) for name in names}
