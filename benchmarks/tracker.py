@@ -60,7 +60,7 @@ def config(seed: int) -> Perpetual:
 
 
 def finer(
-    tracker: Tracker, step: float, std: float, seed: int, recovery: float, smooth: float
+    tracker: Tracker, step: float, std: float, seed: int, recovery: float, smooth: float, hips: bool
 ) -> Perpetual:
     """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
     actions, a nearer root, prices of changing actions and of feet that slide, large batches.
@@ -71,12 +71,13 @@ def finer(
         recovery: share of the episodes that begin with a fall.
         smooth: share of the last action that actions keep. With 0.5 all that a policy without knew of
             getting up is gone at once, and an hour does not bring it back.
+        hips: whether headings are those of the hips from now on, which changes all that is observed.
     """
     kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
     recovering = replace(kept.recovering, demonstration_share=recovery, demonstrations=512)
     return replace(
         kept,
-        heading="hips",
+        heading="hips" if hips else kept.heading,
         filter=smooth,
         window=(2, 4, 8),
         root=0.2,
@@ -97,6 +98,7 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=1e-4)
     parser.add_argument("--std", type=float, default=0.05)
     parser.add_argument("--filter", type=float, default=0.0)
+    parser.add_argument("--hips", action="store_true")
     parser.add_argument("--recovery", type=float, default=0.4)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0)
@@ -107,7 +109,11 @@ def main() -> None:
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
-    settings = finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter) if earlier else config(a.seed)
+    settings = (
+        finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter, a.hips)
+        if earlier
+        else config(a.seed)
+    )
     source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source)
