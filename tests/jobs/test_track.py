@@ -100,7 +100,8 @@ def test_a_clip_on_the_bodys_own_skeleton(tracker: Tracker, tmp_path: Path) -> N
     motion = tracked.motion()
     assert (motion.frames, motion.fps, motion.skeleton) == (40, 30.0, clip.skeleton)
     done = write(tracked, tmp_path / "out", tmp_path / "out.bvh")
-    assert set(done.paths) == {"simulated", "score", "report"} and done.paths["simulated"].exists()
+    assert set(done.paths) == {"simulated", "score", "report", "simulation"}
+    assert done.paths["simulated"].exists()
     assert json.loads((tmp_path / "out/score.json").read_text())["help"]["limit_n"] == 0.0
     back = read_clip(tmp_path / "out.bvh")
     assert back.skeleton.names == clip.skeleton.names and back.frames == 40
@@ -135,7 +136,7 @@ def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) ->
     source = swing(0.5, 60.0, scale=1.1)
     tracked = track(source, tracker, controller="policy")
     done = write(tracked, tmp_path, tmp_path / "out.npz", hold=False)
-    assert set(done.paths) == {"simulated", "body", "score", "report"}
+    assert set(done.paths) == {"simulated", "body", "score", "report", "simulation"}
     back, body = read_clip(done.paths["simulated"]), read_clip(done.paths["body"])
     assert back.skeleton.names == source.skeleton.names and back.frames == source.frames
     np.testing.assert_allclose(back.skeleton.offsets[1:], source.skeleton.offsets[1:], atol=1e-5)
