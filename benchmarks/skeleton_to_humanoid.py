@@ -180,7 +180,10 @@ def main() -> None:
 
     def keep(key: str, row: dict[str, Any]) -> None:
         rows[key] = row
-        found["command"] = "python benchmarks/skeleton_to_humanoid.py --data DIR --work DIR -o FILE.json"
+        how = f"--length {n} --count {args.count} --iterations {args.iterations}"
+        found["command"] = (
+            f"python benchmarks/skeleton_to_humanoid.py --data DIR --work DIR -o FILE.json {how}"
+        )
         args.o.write_text(json.dumps(found, indent=1) + "\n")
         print(key, json.dumps(row), file=sys.stderr, flush=True)
 

@@ -31,7 +31,7 @@ def trainer(kind: str, seed: int = 0, steps: int = STEPS, **changes: object) -> 
         config = RTNTraining(batch=4, **changes)  # type: ignore[arg-type]
         critics = torch.Generator().manual_seed(1)
         learner = RTNObjective(net, config, frames.std, steps, critics)  # type: ignore[arg-type]
-    return InbetweenTrainer(learner, frames, seed, steps, batch=4, block=4)
+    return InbetweenTrainer(learner, Sampler(frames), seed, steps, batch=4, block=4)
 
 
 def test_windows_start_at_every_frame_that_leaves_room() -> None:

@@ -13,8 +13,9 @@ from poise.cli.main import main
 from poise.errors import PoiseError
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
+from poise.jobs.track.direction import direction_of
 from poise.kin.directed import PELVIS, TouchPoint, directed
-from poise.motion import Clip, write_clip
+from poise.motion import Clip, read_clip, write_clip
 from poise.plan import LookaheadConfig
 from poise.synth.sparse import Partial, moved_to, partials_of, timed, times_of
 from toy_human import swing
@@ -57,13 +58,13 @@ def test_words() -> None:
 
 def test_parts_of_a_keyframe_are_where_the_clip_has_them() -> None:
     clip = swing(1.0)
-    touches = Partial(12, ("left_hand", "pelvis")).touches(clip, 30)
-    assert [(t.limb, t.frame) for t in touches] == [("left_hand", 30), ("pelvis", 30)]
+    touches = Partial(12, ("left_hand", "pelvis")).touches(clip)
+    assert [(t.limb, t.frame) for t in touches] == [("left_hand", 12), ("pelvis", 12)]
     hand = find_anatomy(clip.skeleton).of("hand", "left")[0]
     np.testing.assert_allclose(touches[0].point, clip.positions()[12, hand])
-    assert len(Partial(12).touches(clip, 3)) == 5
+    assert len(Partial(12).touches(clip)) == 5
     with pytest.raises(PoiseError, match="wanted in frame 99"):
-        Partial(99).touches(clip, 3)
+        Partial(99).touches(clip)
 
 
 def test_the_pelvis_is_led_over_feet_that_stay() -> None:
@@ -77,6 +78,14 @@ def test_the_pelvis_is_led_over_feet_that_stay() -> None:
     moved = np.linalg.norm(made.positions()[:, feet] - clip.positions()[:, feet], axis=-1)
     assert moved.max() < 5e-3
     np.testing.assert_allclose(made.root_pos[0], clip.root_pos[0], atol=1e-9)
+
+
+def test_a_directors_frames_are_those_of_the_file() -> None:
+    asked = direction_of(("head=2:12-20", "hands=3"), ("left_foot:10-15",), ("right_hand:20:1,0,1",))
+    there = asked.moved(lambda frame: moved_to(frame, (10, 20), (10, 40)))
+    assert [(w.first, w.last) for w in there.weights] == [(16, 40), (None, None)]
+    assert [(p.first, p.last) for p in there.pins] == [(10, 25)]
+    assert [t.frame for t in there.touches] == [40]
 
 
 def test_poses_become_a_motion(tmp_path: Path, capsys) -> None:
@@ -97,6 +106,10 @@ def test_poses_become_a_motion(tmp_path: Path, capsys) -> None:
     quick = ["--adapt", "0", "--budget", "60", "--threads", "1", "--controller", "lookahead"]
     assert main([*words, "--times", "0,1,2", *quick]) == 0
     assert json.loads(capsys.readouterr().out)["result"]["at"] == [0, 30, 60]
+    filled = tmp_path / "filled.bvh"
+    still = ["complete", str(file), "--keyframes", "all", "--kinematic", "-o", str(filled)]
+    assert main([*still, "--times", "0,1,2", "--adapt", "0"]) == 0
+    assert read_clip(filled).frames == 61
 
 
 def test_what_is_known_in_part_is_minded() -> None:
@@ -106,12 +119,10 @@ def test_what_is_known_in_part_is_minded() -> None:
     keys, frame = (0, source.frames - 1), source.frames // 2
     plain = complete(source, keys, tracker, **how)
     known = complete(source, keys, tracker, partial=(Partial(frame),), **how)
-    goal = np.array([t.point for t in Partial(frame).touches(source, frame)])
+    goal = np.array([t.point for t in Partial(frame).touches(source)])
 
     def off(done) -> float:
-        there = np.array(
-            [t.point for t in Partial(frame).touches(done.tracked.delivered(hold=False), frame)]
-        )
+        there = np.array([t.point for t in Partial(frame).touches(done.tracked.delivered(hold=False))])
         return float(np.linalg.norm(there - goal, axis=-1).mean())
 
     assert off(known) < off(plain)

@@ -144,17 +144,21 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     """The filled frames alone."""
-    if o.times is not None or o.partial:
-        raise PoiseError("--times and --partial need a body", hint="Leave --kinematic out")
-    if o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
+    if o.partial or o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
         raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
     from poise.jobs.inbetween.fill import inbetween
     from poise.motion.io import check_writable, write_clip
+    from poise.synth.gaps import check_keyframes
+    from poise.synth.sparse import timed, times_of
 
     path = o.out if o.out.suffix else o.out / f"filled{o.clip.suffix}"
     check_writable(path)
     may_write(path, o.force, o.clip)
     clip = o.reading.read(o.clip)
+    keys = check_keyframes(keys or tuple(range(clip.frames)), clip.frames, str(o.clip))
+    asked = keys
+    if o.times is not None:
+        clip, keys = timed(clip, keys, times_of(o.times))
     with contextlib.ExitStack() as shown:
         bar = staged(shown)
         filled = inbetween(
@@ -165,7 +169,10 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     say(
         f"{path.name}: {filled.clip.frames} frames at {filled.clip.fps:.5g} fps, keyframes {o.keyframes}"
     )
-    result = {"outcome": "filled", "keyframes": list(keys), "warnings": list(filled.warnings)}
+    result = {
+        "outcome": "filled", "keyframes": list(asked), "at": list(keys),
+        "warnings": list(filled.warnings),
+    }  # fmt: skip
     return Answer(result, {"motion": path}, filled.notes, outcome="filled")
 
 

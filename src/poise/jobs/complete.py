@@ -168,12 +168,11 @@ def complete(
         told = None if progress is None else _telling(progress, "filling")
         filled = inbetween(stretched, at, model, on_gap=told, **more)
         weights = tuple(Weight("all", KEY_WEIGHT, k, k) for k in at)
-        led = tuple(touch for p in partial for touch in p.touches(given, moved_to(p.frame, asked, at)))
-        direction = replace(
-            config.direction,
-            weights=(*config.direction.weights, *weights),
-            touches=(*config.direction.touches, *led),
-        )
+        led = tuple(touch for p in partial for touch in p.touches(given))
+        asked_for = replace(config.direction, touches=(*config.direction.touches, *led))
+        # Its frames are those of the clip that came in.
+        direction = asked_for.moved(lambda frame, at=at: moved_to(frame, asked, at))
+        direction = replace(direction, weights=(*direction.weights, *weights))
         # A retimed motion is searched at last, when its times are settled.
         how = config if round_ + 1 == ROUNDS or not retime else replace(config, controller="lookahead")
         tracked = track(filled.clip, policy, replace(how, direction=direction), progress=progress)

@@ -1,4 +1,4 @@
-"""Trains an in-betweening network: blocks of steps, checkpoints that go on bit for bit, a log."""
+"""Trains a network of kinematic motion: blocks of steps, checkpoints that go on bit for bit, a log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import LATEST, load_checkpoint, remove_partial, save_checkpoint
-from poise.learn.frames import FrameData, Sampler
 from poise.learn.log import Log
 from poise.learn.rollout import TrainingError
 from poise.learn.run import interruptible
@@ -74,31 +73,28 @@ class InbetweenTrainer:
 
     Args:
         objective: made for `steps` steps.
-        data: the training set, or what the objective draws its windows from.
+        sampler: what the objective draws its windows from.
         seed: of the windows that are drawn.
         steps: of the whole training.
         block: steps between two reports.
         ema: how much of the averaged weights stays at each step; early steps count less.
-        stretch: of the windows' speed, see `Sampler`.
         metadata: JSON data that every checkpoint carries.
     """
 
     def __init__(
         self,
         objective: Objective,
-        data: FrameData | Any,
+        sampler: Any,
         seed: int = 0,
         steps: int = 20_000,
         batch: int = 64,
         block: int = 50,
         ema: float = 0.999,
         metadata: Mapping[str, Any] | None = None,
-        stretch: float = 1.0,
     ):
         if min(steps, batch, block) < 1 or not 0 <= ema < 1:
             raise PoiseError(f"steps, batch and block must be at least 1 and ema in [0, 1), got {ema}")
-        self.objective = objective
-        self.sampler = Sampler(data, stretch) if isinstance(data, FrameData) else data
+        self.objective, self.sampler = objective, sampler
         self.steps, self.batch, self.block, self.ema = steps, batch, block, ema
         self.metadata, self.seed = dict(metadata or {}), seed
         self.generator = make_generator(seed, "in-between windows")
@@ -180,7 +176,7 @@ class InbetweenTrainer:
         """
         tensors, meta = load_checkpoint(path)
         if meta.get("kind") != "inbetween trainer":
-            raise PoiseError("the checkpoint is not of an in-betweening network", path)
+            raise PoiseError("the checkpoint is of another kind of training", path)
         same = (meta["steps"], meta["seed"]) == (self.steps, self.seed)
         if not same or meta["metadata"] != self.metadata:
             raise PoiseError(

@@ -39,8 +39,8 @@ class Partial:
                 hint = did_you_mean(part, list(PARTS))
                 raise PoiseError(f"there is no part '{part}' of a keyframe", hint=hint)
 
-    def touches(self, source: Clip, at: int) -> tuple[TouchPoint, ...]:
-        """The places of its parts in `source`, to be reached in frame `at`.
+    def touches(self, source: Clip) -> tuple[TouchPoint, ...]:
+        """The places of its parts in `source`.
 
         Raises:
             PoiseError: a frame that the source does not have.
@@ -52,7 +52,7 @@ class Partial:
         limbs = dict.fromkeys(limb for part in self.parts for limb in PARTS[part])
         joints = {limb: 0 if limb == PELVIS else end_of(source.skeleton, limb) for limb in limbs}
         return tuple(
-            TouchPoint(limb, at, (float(pos[j, 0]), float(pos[j, 1]), float(pos[j, 2])))
+            TouchPoint(limb, self.frame, (float(pos[j, 0]), float(pos[j, 1]), float(pos[j, 2])))
             for limb, j in joints.items()
         )
 

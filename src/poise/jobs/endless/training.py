@@ -14,15 +14,13 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.jobs.endless.model import GENERATOR, GeneratorModel
 from poise.jobs.perpetual.run import clips_of
-from poise.jobs.run_file import RUN_FILE
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.cvae import CVAEObjective, CVAETraining, Frames
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
 from poise.motion import ClipLibrary
 from poise.nets.cvae import CVAE, CVAEConfig
-from poise.settings import from_data, to_data, validate
+from poise.settings import to_data, validate
 from poise.synth.place_free import ROOT, features_of
 
 #: Pasts that are kept, from which motions begin.
@@ -132,24 +130,16 @@ def train_generator(
         the model, and whether Ctrl-C ended the training early.
 
     Raises:
-        PoiseError: the folder holds a run with other settings.
+        PoiseError: the folder holds a training with other settings or of another library.
     """
     c = config or Endless()
-    run, said = folder / RUN_FILE, to_data(c)
-    if run.exists():
-        _, meta = load_checkpoint(run)
-        if from_data(Endless, meta.get("config", {}), run) != c:
-            hint = "Resume it as it is or choose another folder"
-            raise PoiseError("the folder holds a run with other settings", folder, hint)
-    else:
-        save_checkpoint(run, {}, {"kind": "endless run", "recipe": "endless", "config": said})
     features = ROOT + len(motions.hinges)
     net = CVAE(features, c.net, generator=torch.Generator().manual_seed(c.seed))
     net.calibrate(motions.frames.frames)
     learner = CVAEObjective(net, c.training, c.steps)
     trainer = InbetweenTrainer(
         learner, motions.frames, c.seed, c.steps, c.training.batch, ema=c.ema,
-        metadata={"config": said},
+        metadata={"config": to_data(c), "clips": list(motions.clips)},
     )  # fmt: skip
     _, stopped = train_inbetween(trainer, folder, minutes, on_block, tensorboard=False)
     made = copy.deepcopy(trainer.averaged).eval()

@@ -248,13 +248,12 @@ def train(
     meta = {"config": to_data(c), "clips": len(task.bank.clips)}
     trainer = InbetweenTrainer(
         objective(task, steps),
-        task.data,
+        Sampler(task.data, c.stretch),
         c.seed,
         steps,
         c.batch,
         ema=c.ema,
         metadata=meta,
-        stretch=c.stretch,
     )
     check = None if task.validation is None else validation(task)
     stats, stopped = train_inbetween(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -63,6 +63,18 @@ class Direction:
 
     def __bool__(self) -> bool:
         return bool(self.weights or self.pins or self.touches)
+
+    def moved(self, to: Callable[[int], int]) -> Direction:
+        """The same with every frame where `to` says that it is."""
+
+        def there(frame: int | None) -> int | None:
+            return None if frame is None else to(frame)
+
+        return Direction(
+            tuple(replace(w, first=there(w.first), last=there(w.last)) for w in self.weights),
+            tuple(replace(p, first=to(p.first), last=to(p.last)) for p in self.pins),
+            tuple(replace(t, frame=to(t.frame)) for t in self.touches),
+        )
 
     def applied(self, clip: Clip) -> tuple[Clip, tuple[str, ...]]:
         """The clip with its pins and touches, and sentences on them."""
