@@ -36,7 +36,7 @@ TWINS = (r"fairmotion.*01_01", r"135_06")
 #: Walks, which backwards are steps back.
 BACKWARDS = ("expmaps.*walking", "02_0[12]", "131_0[12]")
 #: CMU's files state 120 Hz throughout, but some were captured at 60.
-SIXTY = (("(^|-)90_", 60.0), ("salsa", 60.0))
+SIXTY = (("(^|-)90_(?!05)", 60.0), ("salsa", 60.0))
 
 
 def config(seed: int) -> Perpetual:
@@ -86,7 +86,8 @@ def finer(
         recovering=recovering,
         evaluate_every=12,
         cooling=0.0,
-        ppo=replace(kept.ppo, policy_lr=step, std=std),
+        # A critic that does not know the new prices yet would undo what the policy knows.
+        ppo=replace(kept.ppo, policy_lr=step, std=std, critic_warmup=8),
     )
 
 

@@ -141,6 +141,12 @@ def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
     assert learned.recovery_clips is not None and kept is not None
     for name, value in learned.recovery_clips.state().items():
         assert torch.allclose(kept.state()[name], value, atol=1e-6)
+    # It is kept where the policy goes on with a library in which nothing gets up.
+    more = tmp_path / "more"
+    for made in (begin(more, library(), config, earlier=learned), resume(more, config)):
+        assert made.recovery_clips is not None
+        for name, value in learned.recovery_clips.state().items():
+            assert torch.equal(made.recovery_clips.state()[name], value)
     again = try_recovery(open_run(run).task, learned.policy, 2, 1)
     assert again.rows == try_recovery(open_run(run).task, learned.policy, 2, 1).rows
 

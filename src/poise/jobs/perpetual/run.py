@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.body import BodyConfig
+from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.jobs.library.clips import LibraryConfig, Target
 from poise.jobs.library.folder import library_of, split
@@ -28,7 +29,7 @@ from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, WarmStart, load_checkpoint
 from poise.learn.checkpoint import PolicyMeta
 from poise.learn.run import interruptible
-from poise.learn.state import prefixed
+from poise.learn.state import prefixed, under
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.config import WIDE, config_of
@@ -140,7 +141,8 @@ def begin(
                 "the clips are on another skeleton than the policy's body",
                 hint="Bring them onto it: library_of(folder, tracker.target)",
             )
-    imitation = build(library, config, table)
+    # What a policy knows of coming back it keeps, whatever its new library holds of that.
+    imitation = build(library, config, table, earlier.recovery_clips if earlier else None)
     imitation.check_memory(config.num_envs, device)
     if not held:
         meta = {"recipe": RECIPE["name"], "config": to_data(config), "source": source}
@@ -178,7 +180,9 @@ def reopen(file: RunFile) -> Imitation:
 
 
 def _rebuilt(file: RunFile) -> Imitation:
-    return build(file.library(), config_of(file.meta["config"], file.path), file.table())
+    told = under(WAYS, file.tensors)
+    known = RecoveryClips.of(told) if told else None
+    return build(file.library(), config_of(file.meta["config"], file.path), file.table(), known)
 
 
 def knows_recovery(folder: Path) -> bool:

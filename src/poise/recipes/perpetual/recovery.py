@@ -67,8 +67,15 @@ def _standing(heights: Tensor) -> Tensor:
     return heights.kthvalue(1 + int(STANDS * (len(heights) - 1))).values
 
 
-def known_recovery_clips(config: Perpetual, reference: Reference) -> RecoveryClips | None:
-    """The recovery clips of a library on its own body; None where recovery is not learned by it."""
+def known_recovery_clips(
+    config: Perpetual, reference: Reference, known: RecoveryClips | None = None
+) -> RecoveryClips | None:
+    """The recovery clips by which a policy learns to come back, on a library's own body; None where
+    recovery is not learned by such.
+
+    known: what a policy that goes on comes back by already; it stands in place of the library's, which
+        may hold no clip that gets up from the belly, say.
+    """
     if not (config.recovery and config.recovering.demonstrations) or config.shapes.own:
         return None
-    return find_recovery_clips(reference, standing(reference), walking_clips(reference))
+    return known or find_recovery_clips(reference, standing(reference), walking_clips(reference))

@@ -34,6 +34,7 @@ from torch import Tensor
 from poise.body import BodyTable, Humanoid
 from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
 from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskConfig
+from poise.env.recovery.clips import RecoveryClips
 from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_reward import recovery_terms
 from poise.kin import fit_humanoid
@@ -169,10 +170,16 @@ def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:
     return PDTargets("absolute", range_scale(ranges))
 
 
-def build(library: Clips, config: Perpetual | None = None, table: BodyTable | None = None) -> Imitation:
+def build(
+    library: Clips,
+    config: Perpetual | None = None,
+    table: BodyTable | None = None,
+    known: RecoveryClips | None = None,
+) -> Imitation:
     """Body, reference and task for a library of one skeleton; train it with `perpetual.run.train`.
 
     table: the body of a policy that goes on to learn, see `fit_humanoid`; by default one is made.
+    known: the recovery clips of that policy; by default those of the library.
     """
     config = config or Perpetual()
     library, own = on_own_body(as_library(library), config.body)
@@ -180,7 +187,7 @@ def build(library: Clips, config: Perpetual | None = None, table: BodyTable | No
     table = table or own
     humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
     reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
-    recovery_clips = known_recovery_clips(config, reference)
+    recovery_clips = known_recovery_clips(config, reference, known)
     if recovery_clips is None:
         # Without recovery clips a point goal is practised by a primitive of its own.
         config = replace(config, recovering=replace(config.recovering, primitive="own"))
