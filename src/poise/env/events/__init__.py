@@ -1,5 +1,6 @@
 """Events: what happens to worlds when episodes begin, at intervals and on conditions."""
 
+from poise.env.events.ends import touches_of
 from poise.env.events.event import Condition, Event, Happening
 from poise.env.events.in_scene import InScene, MeteredPart, ScenePart
 from poise.env.events.pushes import Pushes, Pushing
@@ -19,4 +20,5 @@ __all__ = [
     "Switch",
     "Throw",
     "near",
+    "touches_of",
 ]
