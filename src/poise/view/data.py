@@ -80,6 +80,8 @@ class Report:
         things: what stands in the world, such as a chair; their `body` counts for nothing.
         pushes: of each frame `(K, 6)`, points in the world, m, and the forces that touch the character
             there, N; () where none were recorded.
+        pushed: whether `pushes` are a push that is the point of the page, which then opens with them,
+            overlaid on the goal that gives way; else contacts, shown on demand.
         helps: of each frame `(K, 6)`, points and residual forces of several bodies in the same way; they
             are drawn in place of `force`, which is their sum. () where the root alone is helped.
         others: other characters of the same body in the simulation's world.
@@ -104,6 +106,7 @@ class Report:
     facts: dict[str, str]
     things: tuple[Shape, ...] = ()
     pushes: tuple[np.ndarray, ...] = ()
+    pushed: bool = False
     helps: tuple[np.ndarray, ...] = ()
     others: tuple[Track, ...] = ()
     keys: tuple[int, ...] = ()
@@ -256,6 +259,7 @@ def payload(report: Report) -> dict[str, Any]:
             {"kind": s.kind, "size": s.size, "pos": s.pos, "quat": s.quat} for s in report.things
         ],
         "pushes": _pushes(report.pushes),
+        "pushed": report.pushed,
         "helps": _pushes(report.helps),
         "keys": [k for k in report.keys if 0 <= k < len(report.reference.pos)],
         "others": [encode_track(track) for track in report.others],

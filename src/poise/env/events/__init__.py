@@ -3,6 +3,7 @@
 from poise.env.events.ends import touches_of
 from poise.env.events.event import Condition, Event, Happening
 from poise.env.events.in_scene import InScene, MeteredPart, ScenePart
+from poise.env.events.push import OnePush, Push
 from poise.env.events.pushes import Pushes, Pushing
 from poise.env.events.things import Move, SetDown, Switch, Throw, near
 
@@ -13,6 +14,8 @@ __all__ = [
     "InScene",
     "MeteredPart",
     "Move",
+    "OnePush",
+    "Push",
     "Pushes",
     "Pushing",
     "ScenePart",
