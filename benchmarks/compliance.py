@@ -59,7 +59,7 @@ def stiffness(tracker: Tracker, svg: Path | None, threads: int) -> dict[str, Any
         x = np.log10(COMMANDS)
         low, high = (np.log10([np.quantile(by[k], q) for k in COMMANDS]) for q in (0.1, 0.9))
         line_plot(
-            [("measured, median and 80 %", x, np.log10(middle), (low, high)), ("commanded", x, x)],
+            [("measured", x, np.log10(middle), (low, high)), ("commanded", x, x)],
             "Stiffness of a standing character's hands", "commanded, log10 of N/m",
             "measured, log10 of N/m", svg,
         )  # fmt: skip

@@ -42,7 +42,7 @@ EXPLAINED = {
         "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
-        "sim/props/carrier.py:Carrier", "sim/props/door.py:Door", "sim/props/lift.py:Lift",
+        "sim/props/door.py:Door", "sim/props/lift.py:Lift",
         "env/teams.py:Teams",
     ),
     "motion without end, which becomes a verb when a generator comes with Poise": (

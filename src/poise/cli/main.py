@@ -44,6 +44,8 @@ _FIRST = (
     ("poise doctor walk.bvh", "what is wrong with the motion"),
     ("poise doctor", "whether this machine is ready"),
 )
+#: `poise play compliant SCENE`.
+COMPLIANT = "compliant"
 _PIPE_CLOSED = 141
 
 
@@ -111,10 +113,14 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     from poise.cli.console import notes, say, tell
     from poise.cli.parse import parse
 
-    module = import_module(f"poise.cli.{verb}")
+    name, prog = verb, f"poise {verb}"
+    if verb == "play" and rest[:1] == [COMPLIANT] and not Path(COMPLIANT).exists():
+        # A scene of the policy that comes with Poise, and no run.
+        name, prog, rest = "play_compliant", f"{prog} {COMPLIANT}", rest[1:]
+    module = import_module(f"poise.cli.{name}")
     # A command that prints the settings alone need name no files.
     blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
-    options = parse(module.Options, rest, f"poise {verb}", blank)
+    options = parse(module.Options, rest, prog, blank)
     if blank is None:
         inputs += inputs_of(options)
         # What is imported now takes seconds.

@@ -25,6 +25,8 @@ Coordinates are those of `qvel`: root m and rad, then hinges in rad. The root's 
 are never displaced, as in the paper (its y is our z).
 """
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

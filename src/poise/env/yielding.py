@@ -1,5 +1,7 @@
 """Compliance in an environment: what pushes characters displaces their goals, at the physics rate."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from poise.env.events import Push
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
 from poise.kin import hold_feet, lowest_height, qpos_to_clip
@@ -177,7 +176,7 @@ def make_report(
     error = np.linalg.norm((pos - pos[:, :1]) - (ref - ref[:, :1]), axis=-1).mean(-1) * 1000
     low = lowest_height(table, r.pos[row, :frames], r.quat[row, :frames]).numpy()
     helped = imitation.config.method != "deepmimic"
-    pushed = any(isinstance(p, Push) for p in imitation.task.plugins)
+    pushed = imitation.task.compliance is not None
     return Report(
         title=f"{source.name}, simulated",
         subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and "

@@ -9,6 +9,8 @@ from poise.errors import PoiseError
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
+from poise.kin import qpos_to_clip
+from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 
 
@@ -26,5 +28,9 @@ def standing(tracker: Tracker, seconds: float) -> Imitation:
     ease = tracker.recovery_clips.ease.double().numpy()
     rate = tracker.config.sim.control_hz
     frames = max(2, round(seconds * rate) + 1)
-    still = Reference(task.humanoid, [ease[None].repeat(frames, 0)], rate, ["standing"])
-    return replace(task, reference=still)
+    qpos, body = ease[None].repeat(frames, 0), task.humanoid
+    clip = qpos_to_clip(qpos, body.table, body.skeleton, rate, name="standing")
+    still = Reference(body, [qpos], rate, [clip.name])
+    fit = replace(task.report.clips[0], name=clip.name)
+    report = replace(task.report, clips=(fit,))
+    return replace(task, library=ClipLibrary.of(clip), reference=still, report=report)

@@ -14,20 +14,19 @@ import numpy as np
 import torch
 
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, ScenePart, SetDown, Throw, touches_of
+from poise.env.events import ScenePart
 from poise.env.goals import DisplacedGoal
+from poise.env.scenes import Throws
 from poise.env.yielding import Yielding
 from poise.jobs.compliant.standing import standing
 from poise.jobs.compliant.stiffness import FALLEN
 from poise.jobs.tracker import Tracker
 from poise.recipes.imitation import Imitation
-from poise.sim import Character, Scene, SceneSim, SimConfig, Touch
-from poise.sim.props import Ball
+from poise.sim import SimConfig
 
 #: s: it stands before the throw; contacts and torques count for so long from the first contact on; it
 #: is looked at whether it falls up to the end.
 WAITS_S, COUNTS_S, LASTS_S = 1.5, 0.5, 4.0
-NAME = "anna"
 #: N; a weaker contact is none.
 TOUCHES_N = 1.0
 
@@ -79,36 +78,25 @@ def throws(
     if rate_hz is not None:
         physics = SimConfig(rate_hz=rate_hz, control_hz=physics.control_hz)
         task = replace(task, config=replace(task.config, sim=physics))
-    bodies, prefix = task.humanoid.bodies, f"{NAME}/"
-    touches = touches_of("felt", "ball", bodies, prefix)
-    scene = Scene(
-        (Ball(mass=1.0), Character(task.humanoid, NAME)),
-        touches=(*touches, Touch("hit", "ball", NAME)),
-        sim=physics,
+    stage = Throws(speed=(2.0, 3.0), every_s=(WAITS_S, WAITS_S), seed=seed).stage(
+        task.humanoid, task.reference
     )
-    spine = (task.humanoid.rows_of("spine") or (0,))[-1]
-    wait = (WAITS_S, WAITS_S)
-    throw = Throw("ball", at=prefix + bodies[spine], speed=(2.0, 3.0), every_s=wait, seed=seed)
-    part = InScene(
-        metered=("hit",),
-        felt=tuple(t.name for t in touches),
-        events=(SetDown("ball", (30.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)), throw),
-    )
-    own = replace(task.task, plugins=(part,), compliance=given, dones=(), help_by="all")
-    task = replace(task, task=own)
+    own = replace(task.task, plugins=stage.plugins, compliance=given, dones=(), help_by="all")
+    task = replace(task, task=own, props=stage.props, touches=stage.touches)
     found = list[tuple[np.ndarray, ...]]()
     for k, level in enumerate(levels):
-        found.append(_at(tracker, task, SceneSim(scene, count, threads=threads), level))
+        found.append(_at(tracker, task, count, threads, level))
         if show is not None:
             show(k + 1, len(levels))
     columns = (np.stack(c) for c in zip(*found, strict=True))
     return Thrown(tuple(levels), *columns)
 
 
-def _at(tracker: Tracker, task: Imitation, sim: SceneSim, level: float) -> tuple[np.ndarray, ...]:
+def _at(
+    tracker: Tracker, task: Imitation, count: int, threads: int, level: float
+) -> tuple[np.ndarray, ...]:
     """The rows `(M,)` of `Thrown` at one level."""
-    count = sim.num_envs
-    env = task.env(1, None, False, help_scale=0.0, guard=False, backend=sim.characters())
+    env = task.env(count, None, False, threads, help_scale=0.0, guard=False)
     yields = env.plugin(Yielding)
     part, goal = env.plugin(ScenePart), env.goal
     assert yields is not None and part is not None and isinstance(goal, DisplacedGoal)

@@ -63,9 +63,10 @@ Poise.replay = (data) => {
         Array.from(rows.subarray(k, k + 6), (v, i) => (i < 3 ? v : v / scale)));
     const pushes = data.pushes && state.touch ? rows(data.pushes, pushScale) : [];
     const helps = data.helps && state.force ? rows(data.helps, scale) : [];
+    const movers = data.movers.map(({ way }) => way.subarray(7 * t, 7 * t + 7));
     const lit = [0, 1].map((k) => Boolean(data.contacts && data.contacts[2 * t + k]));
     const shift = [[-half * sx, -half * sy], [half * sx, half * sy]];
-    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, helps, lit };
+    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, helps, movers, lit };
   }
 
   function tag(id, pose, shift) {
