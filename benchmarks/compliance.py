@@ -3,6 +3,7 @@ costs.
 
 python benchmarks/compliance.py stiffness --json benchmarks/compliance.json --svg docs/stiffness.svg
 python benchmarks/compliance.py throws --json benchmarks/compliance.json
+python benchmarks/compliance.py hands --json benchmarks/compliance.json
 python benchmarks/compliance.py cost --json benchmarks/compliance.json
 
 All by the policy that comes with Poise, alone and without help; no training. Each part writes its
@@ -25,14 +26,20 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
+import poise
 from poise.control import Compliance, Stiffness
 from poise.env.events import Pushes
+from poise.env.scenes import Hands
+from poise.jobs.compliant.play import play
 from poise.jobs.compliant.standing import standing
 from poise.jobs.compliant.stiffness import Measured, measure
 from poise.jobs.compliant.throws import slope, throws
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
+from poise.motion import read_clip
 from poise.view import line_plot
+
+WALK = Path(poise.__file__).parent / "data/walk.bvh"
 
 COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
 LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
@@ -152,10 +159,29 @@ def cost(tracker: Tracker) -> dict[str, Any]:
     return out
 
 
+def hands(tracker: Tracker, threads: int) -> dict[str, Any]:
+    """Hand in hand, walking (the embedded walk) and standing: figures by level and by stiffness."""
+    walk = read_clip(WALK)
+    ways = {
+        "level 0.16": Compliance(0.16), "level 0.2": Compliance(0.2),
+        "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5),
+        "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
+    }  # fmt: skip
+    out: dict[str, Any] = {"episodes": 16}
+    for name, clip in (("walking", walk), ("standing", None)):
+        rows: dict[str, Any] = {}
+        for way, given in ways.items():
+            made = play(Hands(), tracker, clip, given, 16, 8.0, threads)
+            rows["without"] = dict(made.stiff)
+            rows[way] = dict(made.figures)
+        out[name] = rows
+    return out
+
+
 def main() -> None:
     """One part of it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("stiffness", "throws", "cost"))
+    parser.add_argument("part", choices=("stiffness", "throws", "hands", "cost"))
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--svg", type=Path)
     parser.add_argument("--threads", type=int, default=1)
@@ -168,6 +194,8 @@ def main() -> None:
         found = stiffness(tracker, args.svg, args.threads)
     elif args.part == "throws":
         found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads)
+    elif args.part == "hands":
+        found = hands(tracker, args.threads)
     else:
         found = cost(tracker)
     told = json.loads(args.json.read_text()) if args.json.exists() else {}

@@ -113,10 +113,7 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     from poise.cli.console import notes, say, tell
     from poise.cli.parse import parse
 
-    name, prog = verb, f"poise {verb}"
-    if verb == "play" and rest[:1] == [COMPLIANT] and not Path(COMPLIANT).exists():
-        # A scene of the policy that comes with Poise, and no run.
-        name, prog, rest = "play_compliant", f"{prog} {COMPLIANT}", rest[1:]
+    name, prog, rest = parser_of(verb, rest)
     module = import_module(f"poise.cli.{name}")
     # A command that prints the settings alone need name no files.
     blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
@@ -131,6 +128,14 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     for path in answer.outputs.values():
         say(str(path))
     return answer
+
+
+def parser_of(verb: str, rest: list[str]) -> tuple[str, str, list[str]]:
+    """The module in `cli` that parses a command line, how its help calls it, and what it parses."""
+    if verb == "play" and rest[:1] == [COMPLIANT] and not Path(COMPLIANT).exists():
+        # A scene of the policy that comes with Poise, and no run.
+        return "play_compliant", f"poise play {COMPLIANT}", rest[1:]
+    return verb, f"poise {verb}", rest
 
 
 def _begins(verb: str, inputs: Sequence[Path]) -> str:

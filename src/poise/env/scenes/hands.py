@@ -1,5 +1,7 @@
 """Hand in hand with a partner that moves kinematically (Deep Compliant Control, Sec. 5.3)."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

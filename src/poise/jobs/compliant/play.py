@@ -4,6 +4,8 @@ played = play(Hands(), clip=read_clip("walk.bvh"), given=Stiffness(200.0))
 played.figures["force_mean_n"], played.write(Path("out"))
 """
 
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
 import json
