@@ -17,7 +17,7 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, track, write
 from poise.jobs.track.placement import place
-from poise.jobs.track.pushed import PushConfig, from_the_front, row_of, unforeseen, with_push
+from poise.jobs.track.pushed import PushConfig, back_after, from_the_front, row_of, unforeseen, with_push
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
 from poise.recipes.imitation import Imitation
@@ -115,6 +115,14 @@ def test_parts_by_their_words(tracker: Tracker) -> None:
     kinds = tuple(replace(r, kind="forearm" if r.kind == "hand" else r.kind) for r in table.rows)
     with pytest.raises(PoiseError, match="the body has no left hand to push"):
         row_of(replace(table, rows=kinds), "left_hand")
+
+
+def test_when_a_part_is_back() -> None:
+    assert back_after([0.3, 0.2, 0.09, 0.2, 0.09, 0.05, 0.05, 0.3], 6.0) == pytest.approx(4 / 6)
+    assert back_after([0.0, 0.0], 30.0) == 0.0
+    assert back_after([0.2, 0.2], 30.0) is None and back_after([0.2, 0.05], 30.0) == pytest.approx(
+        1 / 30
+    )
 
 
 def test_a_push_from_the_front_is_against_where_it_looks(task: Imitation) -> None:

@@ -99,7 +99,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             done = write(tracked, out, motion, o.hold_feet)
     assert tracked.pushed is not None
     print_card(done.card)
-    said, lost = outcome(tracked, False), is_lost(tracked)
+    said, lost = outcome(tracked, False, hint=False), is_lost(tracked)
     say(said)
     say(tracked.pushed.sentence())
     if lost:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,8 +23,8 @@ from poise.spatial import quat_rotate
 
 #: N; more is no push.
 MOST_N = 10_000.0
-#: m, how near to the clip a pushed part is back again.
-BACK_M = 0.1
+#: m, how near to the clip a pushed part is back again, and s, for how long it must stay there.
+BACK_M, STAYS_S = 0.1, 0.5
 #: Kinds of the body table by the words for what is pushed.
 KINDS = {
     "hand": "hand", "elbow": "forearm", "shoulder": "upper_arm", "head": "head", "chest": "spine",
@@ -88,8 +89,8 @@ class Pushed:
         first_s, last_s: when.
         goal_m: how far the goal gave way at that part, the greatest distance.
         moved_m: how far the part was from where the clip has it, at most from the push on.
-        back_s: how long after the push it was back within 0.1 m of the clip and stayed there; None where
-            it was not.
+        back_s: how long after the push it was back within 0.1 m of the clip, for half a second or to the
+            end; None where it was not.
         least_share: share of the displacement that the hinges' ranges let through at the worst moment.
     """
 
@@ -188,6 +189,18 @@ def from_the_front(humanoid: Humanoid, qpos: Tensor) -> tuple[float, float, floa
     return -x, -y, 0.0
 
 
+def back_after(moved: Sequence[float], rate_hz: float) -> float | None:
+    """s after which a part stays within `BACK_M` for `STAYS_S`, or to the end; None where it does not.
+
+    moved: m, how far it is off in each frame from the end of the push on.
+    """
+    stays = max(1, round(STAYS_S * rate_hz))
+    for k in range(len(moved)):
+        if max(moved[k : k + stays]) <= BACK_M:
+            return k / rate_hz
+    return None
+
+
 class PushSeen:
     """An observer of what a push does to the first character.
 
@@ -224,9 +237,7 @@ class PushSeen:
         push = self._push
         assert push is not None
         first, last = push.first, min(push.first + push.steps, len(self._moved) - 1)
-        away = [k for k in range(last, len(self._moved)) if self._moved[k] > BACK_M]
-        end = away[-1] + 1 if away else last
-        back = None if end >= len(self._moved) else (end - last) / rate_hz
+        back = back_after(self._moved[last:], rate_hz)
         return Pushed(
             humanoid.bodies[push.row], push.force, first / rate_hz, last / rate_hz,
             max(self._goal[first:]), max(self._moved[first:]), back, self._share,
