@@ -87,7 +87,9 @@ def test_python_snippets_run(
     code = _blocks(page, "python")[index]
     for long, short in _SHORTER:
         code = code.replace(long, short)
-    for name in re.findall(r"(?:read_clip|imitate|track|inbetween|complete|read)\(\"([\w.]+)\"", code):
+    for name in re.findall(
+        r"(?:read_clip|imitate|track|push|inbetween|complete|read)\(\"([\w.]+)\"", code
+    ):
         shutil.copy(_example_clip(request), tmp_path / name)
     if "policy.safetensors" in code:
         shutil.copytree(request.getfixturevalue("policy"), tmp_path, dirs_exist_ok=True)
@@ -106,13 +108,14 @@ def test_commands_are_shown() -> None:
 
 @pytest.mark.parametrize(("page", "line"), _commands())
 def test_commands_parse(page: str, line: str) -> None:
-    from poise.cli.main import VERBS
+    from poise.cli.main import VERBS, parser_of
     from poise.cli.parse import parse
 
     verb, *rest = shlex.split(line, comments=True)[1:]
     assert verb in VERBS
     try:
-        parse(import_module(f"poise.cli.{verb}").Options, rest, f"poise {verb}")
+        name, prog, rest = parser_of(verb, rest)
+        parse(import_module(f"poise.cli.{name}").Options, rest, prog)
     except PoiseError as problem:
         pytest.fail(f"{page}: {line}: {problem}")
 
@@ -123,7 +126,7 @@ def test_named_options_exist(capsys: pytest.CaptureFixture[str]) -> None:
     from poise.cli.parse import parse
 
     known = {"--help", "--version"}
-    for verb in VERBS:
+    for verb in (*VERBS, "play_compliant"):
         with contextlib.suppress(SystemExit):
             parse(import_module(f"poise.cli.{verb}").Options, ["--help"], f"poise {verb}")
         known |= set(re.findall(r"--[a-z][\w-]*", capsys.readouterr().out))

@@ -54,6 +54,10 @@ def _shortened(line: str) -> list[str]:
             argv[argv.index("--iterations") + 1] = "3"
     if argv[:2] == ["train", "perpetual"]:
         argv += [*TINY, "--no-expert", "--single", "--no-style", "--no-recovery"]
+    if argv[:2] == ["play", "compliant"]:
+        argv += ["--count", "1", "--duration", "1", "--threads", "1"]
+    if argv[0] == "push" and "--controller" not in argv:
+        argv += ["--controller", "policy"]
     if argv[0] == "complete":
         argv += ["--adapt", "0", "--budget", "40", "--threads", "1"]
     if argv[:2] == ["train", "inbetween"]:

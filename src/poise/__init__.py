@@ -4,6 +4,7 @@
 
     made = poise.imitate("walk.bvh", minutes=3)     # a policy is trained on the clip
     tracked = poise.track("kick.bvh")               # by the policy that comes with Poise
+    pushed = poise.push("walk.bvh", 150.0, at="hand")  # the same, while something pushes it
     filled = poise.inbetween("dance.bvh", (0, 30, 60))
     done = poise.complete("dance.bvh", (0, 30, 60))  # the same with a body
     made.card, made.clip, made.notes, made.save("out")
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
     from poise.jobs.inbetween.training import Inbetween
     from poise.jobs.open import Run, open_run
+    from poise.jobs.push import push
     from poise.jobs.track import TrackConfig, Tracked, track
     from poise.motion import Clip, ClipLibrary
     from poise.motion import read_clip as read
@@ -50,6 +52,7 @@ _PLACES = {
     "imitate": "poise.jobs.imitate",
     "inbetween": "poise.jobs.inbetween.fill",
     "open_run": "poise.jobs.open",
+    "push": "poise.jobs.push",
     "read": "poise.motion:read_clip",
     "track": "poise.jobs.track",
     "write": "poise.motion:write_clip",
@@ -73,6 +76,7 @@ __all__ = [
     "imitate",
     "inbetween",
     "open_run",
+    "push",
     "read",
     "track",
     "write",

@@ -77,7 +77,7 @@ def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str
         "train": ["residual-force", "a.bvh", "-o", "out"],
         "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
         "complete": ["a.bvh", "--keyframes", "0,5", "-o", "out"],
-    }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "fleet") else [])])
+    }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "push", "fleet") else [])])
     code = (
         "import sys, poise.cli.console as c, poise.cli.main as m\n"
         "def tell(text, style=''):\n"

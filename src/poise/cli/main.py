@@ -30,6 +30,7 @@ VERBS = {
     "inbetween": "fill the frames between keyframes of a clip with a trained network",
     "complete": "from keyframes to a body: fill the frames, and let a character do them",
     "track": "let a trained policy do any motion, without training",
+    "push": "a motion with a push in it: the character gives way and comes back",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
@@ -43,6 +44,8 @@ _FIRST = (
     ("poise doctor walk.bvh", "what is wrong with the motion"),
     ("poise doctor", "whether this machine is ready"),
 )
+#: `poise play compliant SCENE`.
+COMPLIANT = "compliant"
 _PIPE_CLOSED = 141
 
 
@@ -110,10 +113,11 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     from poise.cli.console import notes, say, tell
     from poise.cli.parse import parse
 
-    module = import_module(f"poise.cli.{verb}")
+    name, prog, rest = parser_of(verb, rest)
+    module = import_module(f"poise.cli.{name}")
     # A command that prints the settings alone need name no files.
     blank = module.blank() if "--print-config" in rest and hasattr(module, "blank") else None
-    options = parse(module.Options, rest, f"poise {verb}", blank)
+    options = parse(module.Options, rest, prog, blank)
     if blank is None:
         inputs += inputs_of(options)
         # What is imported now takes seconds.
@@ -124,6 +128,14 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
     for path in answer.outputs.values():
         say(str(path))
     return answer
+
+
+def parser_of(verb: str, rest: list[str]) -> tuple[str, str, list[str]]:
+    """The module in `cli` that parses a command line, how its help calls it, and what it parses."""
+    if verb == "play" and rest[:1] == [COMPLIANT] and not Path(COMPLIANT).exists():
+        # A scene of the policy that comes with Poise, and no run.
+        return "play_compliant", f"poise play {COMPLIANT}", rest[1:]
+    return verb, f"poise {verb}", rest
 
 
 def _begins(verb: str, inputs: Sequence[Path]) -> str:

@@ -15,12 +15,13 @@ _RESULTS = (
 )  # fmt: skip
 
 
-def may_write(path: Path, force: bool, *read: Path) -> None:
+def may_write(path: Path, force: bool, *read: Path, flag: str = "--force") -> None:
     """Refuses to write where something would be lost, before any work is done.
 
     Args:
         force: an existing file may be written over.
         read: files that are read, which nothing is written over.
+        flag: the option by which it may.
 
     Raises:
         PoiseError: a file that is there or is read; a folder, a symbolic link, a pipe or a device.
@@ -36,7 +37,7 @@ def may_write(path: Path, force: bool, *read: Path) -> None:
     if not path.is_file():
         raise PoiseError("is a pipe or a device, which a file would replace", path, "Name a file")
     if not force:
-        raise PoiseError("is there already", path, "Choose another name, or write over it with --force")
+        raise PoiseError("is there already", path, f"Choose another name, or write over it with {flag}")
 
 
 def places(out: Path) -> tuple[Path, Path | None]:
@@ -58,11 +59,13 @@ def places(out: Path) -> tuple[Path, Path | None]:
     return out.with_suffix(""), out
 
 
-def may_deliver(folder: Path, motion: Path | None, force: bool, *read: Path) -> None:
+def may_deliver(
+    folder: Path, motion: Path | None, force: bool, *read: Path, flag: str = "--force"
+) -> None:
     """Refuses to write results over others, see `may_write`."""
     held = sorted(p for name in _RESULTS for p in folder.glob(name))
     for path in (*([motion] if motion else ()), *held):
-        may_write(path, force, *read)
+        may_write(path, force, *read, flag=flag)
 
 
 @contextlib.contextmanager

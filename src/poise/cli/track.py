@@ -292,8 +292,9 @@ def advice(options: Options, tracked: Tracked) -> str:
     return "W" + learns[1:]
 
 
-def outcome(tracked: Tracked, reset: bool) -> str:
-    """Where the character failed, in a sentence, and what was missing."""
+def outcome(tracked: Tracked, reset: bool, hint: bool = True) -> str:
+    """Where the character failed, in a sentence, and what was missing. hint: whether the option that
+    puts it back is named."""
     from poise.jobs.track.missing import shortfalls
 
     reference, times = tracked.imitation.reference, tracked.failed_s
@@ -321,9 +322,10 @@ def outcome(tracked: Tracked, reset: bool) -> str:
         by = "with lookahead" if tracked.controller == "lookahead" else "by the policy alone"
         return f"Tracked {by} to its end, {seconds:.1f} s, without help, {off}."
     if not reset:
+        back = " --reset-on-fail puts it back and goes on." if hint else ""
         return (
             f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; what "
-            f"follows is not tracking.{more} --reset-on-fail puts it back and goes on."
+            f"follows is not tracking.{more}{back}"
         )
     named = ", ".join(f"{t:.1f}" for t in times[:NAMED]) + (", ..." if len(times) > NAMED else "")
     return (

@@ -13,7 +13,7 @@ from poise.env import observables
 from poise.env.controls import Controls
 from poise.env.frame import FIELDS, Frame, Pose, placed
 from poise.env.goals.goal import Goal
-from poise.env.make import goal_of, plugins_of
+from poise.env.make import displaced_goal, goal_of, plugins_of
 from poise.env.plugins import Ended, Plugin, combined, ends_of
 from poise.env.reference import Reference
 from poise.env.snapshot import Snapshot, put, put_state, state_of, take
@@ -63,7 +63,8 @@ class ImitationEnv:
     ):
         self.num_envs, self.device = backend.num_envs, backend.device
         self.backend, self.task, self.substeps, self._guard = backend, task, substeps, guard
-        self.goal = goal if isinstance(goal, Goal) else goal_of(goal, task, backend, seed, weights)
+        goal = goal if isinstance(goal, Goal) else goal_of(goal, task, backend, seed, weights)
+        self.goal = displaced_goal(goal, task)
         humanoid = self.goal.humanoid
         self.hinges = len(humanoid.hinges)
         self._limit_n = task.residual.limit_n if task.residual and task.residual.capped else None
@@ -144,7 +145,9 @@ class ImitationEnv:
 
     def set_goal(self, goal: Goal) -> Tensor:
         """Goes on with another goal of the same body, wherever the characters stand; observations."""
-        self.goal = goal
+        self.goal = displaced_goal(goal, self.task)
+        for plugin in self.plugins:
+            plugin.follow(self.goal)
         self.goal.aim(None, self._held())
         return self.observe()
 

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from poise.env.body_assignment import BodyAssignment
 from poise.env.goals.clip import ClipGoal
+from poise.env.goals.displaced import DisplacedGoal
 from poise.env.goals.goal import Goal
 from poise.env.help import HelpBudget
 from poise.env.plugins import Plugin
@@ -13,6 +14,7 @@ from poise.env.recovery.clock import RecoveryClock
 from poise.env.reference import Reference
 from poise.env.starts import AdaptiveSampling, Starts
 from poise.env.task import TaskConfig
+from poise.env.yielding import Yielding
 from poise.sim import Backend
 
 
@@ -47,5 +49,17 @@ def plugins_of(
             # Falls are those of the first body, which all worlds still have.
             _ = clock.falls
         out.append(BodyAssignment(backend, goal.bodies))
-    own = (make(goal, backend) for make in task.plugins)
-    return budget, (*out, *([clock] if clock else []), *own)
+    own = [make(goal, backend) for make in task.plugins]
+    out += [*([clock] if clock else []), *own]
+    if task.compliance is not None:
+        assert isinstance(goal, DisplacedGoal)
+        additive = task.pd.mode == "additive"
+        out.append(Yielding(task.compliance, goal, backend, additive, tuple(out)))
+    return budget, tuple(out)
+
+
+def displaced_goal(goal: Goal, task: TaskConfig) -> Goal:
+    """A goal that what pushes can displace, where the task has compliance."""
+    if task.compliance is None or isinstance(goal, DisplacedGoal):
+        return goal
+    return DisplacedGoal(goal)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +22,23 @@ if TYPE_CHECKING:
 
 #: Coordinates of episodes' starts: qpos `(n, nq)` and qvel `(n, nv)`, float64.
 Start = tuple[Tensor, Tensor]
+
+
+class Felt(NamedTuple):
+    """Forces on N characters, K on each; 0 is none.
+
+    Attributes:
+        body: `(N, K)` rows of MuJoCo's bodies, of a character alone: 1 is its root.
+        point: `(N, K, 3)` m, where they act, world axes.
+        force: `(N, K, 3)` N, world axes.
+        driven: whether they are in the `Drive`, such as a push, or come by the physics, such as
+            contacts.
+    """
+
+    body: Tensor
+    point: Tensor
+    force: Tensor
+    driven: bool = True
 
 
 @dataclass(eq=False)
@@ -99,6 +116,13 @@ class Plugin:
 
     def push_substep(self, drive: Drive) -> None:
         """Adds forces to what drives the worlds, anew before each physics step."""
+
+    def felt(self) -> Felt | None:
+        """Forces on the characters to which compliance gives way; None where there are none."""
+        return None
+
+    def follow(self, goal: Goal) -> None:
+        """The environment goes on with another goal."""
 
     def tick(self) -> None:
         """One control step has been made."""

@@ -45,27 +45,25 @@ class Poser:
         """The same poses by MuJoCo, one after another: for the few frames that become known in a step,
         for which torch takes milliseconds. What a frame's pose is does not depend on the others."""
         model, data = self.humanoid.model, self._data
-        bodies = model.nbody - 1
-        out = np.empty((len(qpos), bodies, 13))
-        centres = np.empty((len(qpos), 3))
+        frames, bodies = len(qpos), model.nbody
+        pos, quat, com, cvel = (np.empty((frames, bodies, k)) for k in (3, 4, 3, 6))
         for i, (q, v) in enumerate(zip(qpos.numpy(), qvel.numpy(), strict=True)):
             data.qpos, data.qvel = q, v
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
-            turning, moving = data.cvel[1:, :3], data.cvel[1:, 3:]
-            # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
-            arm = data.xpos[1:] - data.subtree_com[model.body_rootid[1:]]
-            out[i, :, :3], out[i, :, 3:7] = data.xpos[1:], data.xquat[1:]
-            out[i, :, 7:10], out[i, :, 10:] = moving + np.cross(turning, arm), turning
-            centres[i] = data.subtree_com[1]
-        pos, quat, linvel, angvel = torch.from_numpy(out).float().split((3, 4, 3, 3), -1)
+            pos[i], quat[i], com[i], cvel[i] = data.xpos, data.xquat, data.subtree_com, data.cvel
+        turning, moving = cvel[:, 1:, :3], cvel[:, 1:, 3:]
+        # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
+        arm, centres = pos[:, 1:] - com[:, model.body_rootid[1:]], com[:, 1]
+        out = np.concatenate((pos[:, 1:], quat[:, 1:], moving + np.cross(turning, arm), turning), -1)
+        at, turned, linvel, angvel = torch.from_numpy(out).float().split((3, 4, 3, 3), -1)
         small = qpos.float()
         return Pose(
             small,
             qvel.float(),
-            pos,
-            quat,
+            at,
+            turned,
             linvel,
             angvel,
             torch.from_numpy(centres).float(),

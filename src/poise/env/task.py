@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from poise.control import HelpSchedule, PDTargets, Residual, Wrench
+from poise.control import Compliance, HelpSchedule, PDTargets, Residual, Stiffness, Wrench
 from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
 from poise.env.plugins import Plugin
 from poise.env.recovery.config import Recovery
@@ -72,6 +72,8 @@ class TaskConfig:
     auto_reset: start a new episode where one ended (off while evaluating).
     recovery: falls and getting up, being far and coming back as part of the episodes, see
         `poise.env.recovery.config`; None for episodes that begin and stay on their clip.
+    compliance: how goals give way where something pushes the characters, see `env.yielding`: by the
+        paper's law, or by a commanded stiffness; None: they do not.
     observables: more of what terms can ask a frame for, by name, see `env.observables`.
     plugins: make more parts of an environment, each of its goal and backend, see `env.plugins`.
     """
@@ -94,6 +96,7 @@ class TaskConfig:
     style: tuple[ObsTerm, ...] = ()
     auto_reset: bool = True
     recovery: Recovery | None = None
+    compliance: Compliance | Stiffness | None = None
     observables: Mapping[str, Observable] = field(default_factory=dict)
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
 

@@ -176,6 +176,7 @@ def make_report(
     error = np.linalg.norm((pos - pos[:, :1]) - (ref - ref[:, :1]), axis=-1).mean(-1) * 1000
     low = lowest_height(table, r.pos[row, :frames], r.quat[row, :frames]).numpy()
     helped = imitation.config.method != "deepmimic"
+    pushed = imitation.task.compliance is not None
     return Report(
         title=f"{source.name}, simulated",
         subtitle=f"{source.seconds:.1f} s on {len(table.rows)} bodies and "
@@ -184,7 +185,7 @@ def make_report(
             Shape(i, g.kind, g.size, g.pos, g.quat) for i, b in enumerate(table.rows) for g in b.geoms
         ),
         bodies=imitation.humanoid.bodies,
-        reference=Track("reference", ref, r.ref_quat[row, :frames].numpy()),
+        reference=Track("goal" if pushed else "reference", ref, r.ref_quat[row, :frames].numpy()),
         simulated=Track("simulation", pos, r.quat[row, :frames].numpy()),
         fps=r.fps,
         force=r.force[row, :frames].sum(1).numpy() if helped else None,
@@ -211,6 +212,7 @@ def make_report(
             _lasting(r, other, imitation.library.names[other.clip], frames)
             for other in (evaluation.recordings[1:] if evaluation.together else ())
         ),
+        pushed=pushed,
         pushes=recording.contacts if len(recording.contacts) == frames else (),
         things=tuple(
             Shape(0, "box", (p.size[0] / 2, p.size[1] / 2, p.size[2] / 2), p.pos, p.quat)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +21,19 @@ from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.plan import LookaheadTeacher, TeacherConfig
-from poise.sim import Backend, Character, NanGuard, Scene, SceneSim, alone, make_backend
+from poise.sim import (
+    Backend,
+    Character,
+    Floor,
+    Link,
+    NanGuard,
+    Plane,
+    Scene,
+    SceneSim,
+    Touch,
+    alone,
+    make_backend,
+)
 from poise.sim.props import Prop
 
 #: What a recipe is built of: a clip, the file of one, or a library.
@@ -50,7 +62,8 @@ class Imitation:
     Attributes:
         config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
         recovery_clips: those of the library, where recovery is learned by them.
-        props: what else stands in every world, such as a chair; fixed to it, or driven by nothing.
+        props: what else stands in every world, such as a chair or a ball.
+        links, touches, floor: of such worlds, see `Scene`; the character's bodies have their own names.
         physics: a model in place of the body's own on a floor, such as a heavier one; without props.
     """
 
@@ -63,6 +76,9 @@ class Imitation:
     recovery_clips: RecoveryClips | None = None
     props: tuple[Prop, ...] = ()
     physics: mujoco.MjModel | None = None
+    links: tuple[Link, ...] = ()
+    touches: tuple[Touch, ...] = ()
+    floor: Floor = field(default_factory=Plane)
 
     def __repr__(self) -> str:
         clips, seconds = len(self.library), self.library.seconds
@@ -112,9 +128,10 @@ class Imitation:
 
     def _worlds(self, count: int, device: str, threads: int) -> Backend:
         """Fresh worlds with a character and the props."""
-        if not self.props:
+        if not (self.props or self.touches) and self.floor == Plane():
             return make_backend(self.model, count, device, threads=threads)
-        scene = Scene((Character(self.humanoid), *self.props), sim=self.config.sim)
+        things = (Character(self.humanoid), *self.props)
+        scene = Scene(things, self.links, self.touches, self.floor, self.config.sim)
         return SceneSim(scene, count, device, threads).characters()
 
     def bare(self, rewards: bool = False, groups: bool = False) -> Imitation:

@@ -27,12 +27,19 @@ class Floor(Protocol):
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane z = 0."""
+    """A level plane.
+
+    Attributes:
+        height: m, where it is.
+    """
+
+    height: float = 0.0
 
     def add(self, spec: mujoco.MjSpec, friction: float) -> None:
         """Adds one geom "floor"."""
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         geom = spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 1], condim=3)
+        geom.pos = [0.0, 0.0, self.height]
         geom.friction = [friction, *FRICTION[1:]]
 
 

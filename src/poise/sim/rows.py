@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: State fields with a row per body; those of degrees of freedom are told by how they begin.
 _BODIES = ("xpos", "xquat", "xmat", "xipos", "ximat", "subtree_com", "cvel", "cfrc_ext", "xfrc_applied")
-_DOFS = ("qvel", "qacc", "qfrc_")
+_DOFS = ("qvel", "qacc", "qfrc_", "cdof")
 _CONTROLS = ("ctrl", "actuator_force")
 _DRIVE = ("ctrl", "qfrc_applied", "xfrc_applied")
 _OWN = ("qpos", "qvel", "qacc_warmstart", *_DRIVE)
@@ -104,6 +104,11 @@ class CharacterRows:
         self._make(_OWN)
         self.state = SimState(self._views)
         self.drive = Drive(*(self._fields[name].out for name in _DRIVE))
+
+    @property
+    def sole(self) -> bool:
+        """Whether each row has a world of its own, with which it is copied and restored."""
+        return self._sole
 
     def write(self, rows: Tensor | None, qpos: Tensor, qvel: Tensor) -> None:
         """Sets characters down, with nothing that drives them; what else is in their worlds stays."""
@@ -236,6 +241,15 @@ class CharacterRows:
             return _Field([whole[:, p.qpos] for p in self.places])
         if name in _CONTROLS:
             return _Field([whole[:, p.controls] for p in self.places])
+        if name == "M":
+            model = self.world.model
+            ends = [
+                model.M_rowadr[p.dofs.stop - 1] + model.M_rownnz[p.dofs.stop - 1] for p in self.places
+            ]
+            begins = [model.M_rowadr[p.dofs.start] for p in self.places]
+            # Trees do not meet in the inertia: what belongs to one lies side by side.
+            spans = zip(begins, ends, strict=True)
+            return _Field([whole[:, int(a) : int(b)] for a, b in spans])
         if name.startswith(_DOFS):
             return _Field([whole[:, p.dofs] for p in self.places])
         raise PoiseError(f"the state field '{name}' is not known per character")

@@ -56,7 +56,8 @@ class Touch:
 
     Attributes:
         name: how the scene calls it.
-        a: a character or prop with all its bodies, a body such as "anna/left_foot", or "floor".
+        a: a character or prop with all its bodies, a body such as "anna/left_foot", or "floor"; the
+            character without a name is "character".
         b: likewise; None for whatever touches `a`.
     """
 
@@ -161,7 +162,7 @@ class Scene:
     def _sense(self, spec: mujoco.MjSpec, touch: Touch, bodies: list[str]) -> None:
         """Adds the sensor of a touch: the net force and torque about its point, in the world's axes."""
         ends: list[tuple[mujoco.mjtObj, str]] = []
-        whole = {t.name: self._first_body(t) for t in self.things if t.name}
+        whole = {t.name or "character": self._first_body(t) for t in self.things}
         for name in (touch.a, touch.b):
             if name is None:
                 continue

@@ -57,6 +57,21 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
+class Mover:
+    """A thing that moves, such as a ball that is thrown.
+
+    Attributes:
+        shape: its form in the thing's own frame; its `body` counts for nothing.
+        pos: `(T, 3)` m, world.
+        quat: `(T, 4)` wxyz.
+    """
+
+    shape: Shape
+    pos: np.ndarray
+    quat: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Report:
     """Everything one report page shows; optional parts may be None or empty.
 
@@ -78,8 +93,11 @@ class Report:
         notes: sentences on what was guessed, repaired or limited.
         facts: name to text.
         things: what stands in the world, such as a chair; their `body` counts for nothing.
+        movers: what moves in the simulation's world beside the character.
         pushes: of each frame `(K, 6)`, points in the world, m, and the forces that touch the character
             there, N; () where none were recorded.
+        pushed: whether `pushes` are a push that is the point of the page, which then opens with them,
+            overlaid on the goal that gives way; else contacts, shown on demand.
         helps: of each frame `(K, 6)`, points and residual forces of several bodies in the same way; they
             are drawn in place of `force`, which is their sum. () where the root alone is helped.
         others: other characters of the same body in the simulation's world.
@@ -103,7 +121,9 @@ class Report:
     notes: tuple[str, ...]
     facts: dict[str, str]
     things: tuple[Shape, ...] = ()
+    movers: tuple[Mover, ...] = ()
     pushes: tuple[np.ndarray, ...] = ()
+    pushed: bool = False
     helps: tuple[np.ndarray, ...] = ()
     others: tuple[Track, ...] = ()
     keys: tuple[int, ...] = ()
@@ -124,11 +144,13 @@ class Report:
         for track in (self.reference, self.simulated, *self.others):
             wanted.append((f"track '{track.name}' pos", track.pos, (frames, bodies, 3)))
             wanted.append((f"track '{track.name}' quat", track.quat, (frames, bodies, 4)))
+        for mover in self.movers:
+            wanted += [("a mover's pos", mover.pos, (frames, 3)), ("its quat", mover.quat, (frames, 4))]
         for name, array, shape in wanted:
             if array is not None and np.shape(array) != shape:
                 raise PoiseError(f"{name} must have shape {shape}, got {np.shape(array)}", self.title)
         where = self.title
-        for k, shape in enumerate(self.shapes):
+        for k, shape in enumerate((*self.shapes, *(m.shape for m in self.movers))):
             if shape.kind not in _KINDS:
                 raise PoiseError(f"shape {k} is a '{shape.kind}'; known: {', '.join(_KINDS)}", where)
             if not 0 <= shape.body < bodies:
@@ -255,7 +277,15 @@ def payload(report: Report) -> dict[str, Any]:
         "things": [
             {"kind": s.kind, "size": s.size, "pos": s.pos, "quat": s.quat} for s in report.things
         ],
+        "movers": [
+            {
+                **{k: getattr(m.shape, k) for k in ("kind", "size", "pos", "quat")},
+                "way": floats(np.concatenate((m.pos, m.quat), 1)),
+            }
+            for m in report.movers
+        ],
         "pushes": _pushes(report.pushes),
+        "pushed": report.pushed,
         "helps": _pushes(report.helps),
         "keys": [k for k in report.keys if 0 <= k < len(report.reference.pos)],
         "others": [encode_track(track) for track in report.others],

@@ -1,7 +1,9 @@
 """Events: what happens to worlds when episodes begin, at intervals and on conditions."""
 
+from poise.env.events.ends import touches_of
 from poise.env.events.event import Condition, Event, Happening
 from poise.env.events.in_scene import InScene, MeteredPart, ScenePart
+from poise.env.events.push import OnePush, Push
 from poise.env.events.pushes import Pushes, Pushing
 from poise.env.events.things import Move, SetDown, Switch, Throw, near
 
@@ -12,6 +14,8 @@ __all__ = [
     "InScene",
     "MeteredPart",
     "Move",
+    "OnePush",
+    "Push",
     "Pushes",
     "Pushing",
     "ScenePart",
@@ -19,4 +23,5 @@ __all__ = [
     "Switch",
     "Throw",
     "near",
+    "touches_of",
 ]

@@ -11,9 +11,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from poise.env.events.ends import ends_on
 from poise.env.events.event import Event
 from poise.env.goals.goal import Goal
-from poise.env.plugins import Plugin, Start
+from poise.env.plugins import Felt, Plugin, Start
 from poise.errors import PoiseError
 from poise.sim import Backend, CharacterRows, Drive, SceneSim
 
@@ -35,6 +36,8 @@ class InScene:
         metered: touches of which the impulse "impulse/hit" `(N, 3)` N s and the greatest force
             "peak/hit" `(N,)` N over the last control step are measured; its physics steps are then made
             one by one.
+        felt: touches and measured links on single bodies of the characters to which compliance gives
+            way, see `touches_of`.
         events: what happens.
         ends: whether episodes end per "character", or for all characters of a "world" at once: where
             one ends, those of the others are cut off like by a time-out.
@@ -43,6 +46,7 @@ class InScene:
     sees: tuple[str, ...] = ()
     touches: tuple[str, ...] = ()
     metered: tuple[str, ...] = ()
+    felt: tuple[str, ...] = ()
     events: tuple[Event, ...] = ()
     ends: Literal["character", "world"] = "character"
 
@@ -71,6 +75,7 @@ class ScenePart(Plugin):
         self._sources: dict[str, Tensor] = {}
         for name in (*given.touches, *given.metered):
             sim.touch(name)
+        self._feels = [end for name in given.felt for end in ends_on(sim, rows, name)]
         self._look()
 
     def sources(self) -> Mapping[str, Tensor]:
@@ -102,6 +107,20 @@ class ScenePart(Plugin):
         """What happens before the control step."""
         for happening in self.happenings:
             happening.before()
+
+    def felt(self) -> Felt | None:
+        """The touches and links on the characters, as the last physics step had them."""
+        if not self._feels:
+            return None
+        n, k, like = self._sim.num_envs, len(self._feels), self._sim.backend.state.xpos
+        body = torch.zeros(n * self._many, k, dtype=torch.long, device=like.device)
+        point, force = (like.new_zeros(n * self._many, k, 3) for _ in range(2))
+        for i, end in enumerate(self._feels):
+            mine = slice(end.character, None, self._many)
+            seen = self._sim.link(end.name) if end.link else self._sim.touch(end.name)
+            body[mine, i], point[mine, i] = end.body, seen.point.to(like)
+            force[mine, i] = end.sign * seen.force.to(like)
+        return Felt(body, point, force, driven=False)
 
     def tick(self) -> None:
         for happening in self.happenings:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from poise.env.goals.goal import Goal
-from poise.env.plugins import Plugin, Start
+from poise.env.plugins import Felt, Plugin, Start
 from poise.errors import PoiseError
 from poise.sim import Backend, Drive
 
@@ -61,6 +61,7 @@ class Pushing(Plugin):
 
     def __init__(self, pushes: Pushes, backend: Backend):
         self.pushes, n, here = pushes, backend.num_envs, backend.device
+        self._backend = backend
         self._rng = torch.Generator().manual_seed(pushes.seed)
         self._lasts = max(1, round(pushes.lasts_s * pushes.control_hz))
         self.left = torch.zeros(n, dtype=torch.long, device=here)
@@ -84,6 +85,12 @@ class Pushing(Plugin):
         """Adds the force of each push."""
         rows = self.acting.nonzero().squeeze(-1)
         drive.xfrc_applied[rows, self.body[rows], :3] += self.force[rows]
+
+    def felt(self) -> Felt:
+        """The pushes that act."""
+        force = self.force * self.acting.unsqueeze(1)
+        point = self._backend.state.xipos.gather(1, self.body.view(-1, 1, 1).expand(-1, 1, 3))
+        return Felt(self.body.unsqueeze(1), point, force.unsqueeze(1))
 
     def tick(self) -> None:
         """Counts down, and draws the next push where one is over."""

@@ -7,6 +7,7 @@ from typing import Literal
 
 from poise.errors import PoiseError
 from poise.jobs.track.direction import Direction
+from poise.jobs.track.pushed import PushConfig
 from poise.jobs.track.simulation import Retake
 from poise.kin.supports import Support
 from poise.motion.noise import Noise
@@ -43,6 +44,8 @@ class TrackConfig:
         direction: what counts more, stays put or is touched; for a single clip.
         retake: a part that is simulated anew, while the rest stays as an earlier result has it; for a
             single clip.
+        push: a push in it, to which the character gives way; for one character and a single clip, which
+            no search looks for.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -59,6 +62,7 @@ class TrackConfig:
     supports: Literal["auto", "none"] | tuple[Support, ...] = "auto"
     direction: Direction = field(default_factory=Direction)
     retake: Retake | None = None
+    push: PushConfig | None = None
 
     def __post_init__(self) -> None:
         validate(self)
@@ -87,6 +91,17 @@ class TrackConfig:
             if any(others.values()):
                 what = next(name for name, asked in others.items() if asked)
                 raise PoiseError(f"a range is for a single character that tracks, not {what}")
+        if self.push is not None:
+            others = {
+                "one that comes or is put back": self.recover or self.reset_on_fail,
+                "several characters": self.count > 1,
+                "a motion with noise": bool(self.noise),
+                "a part that is simulated anew": self.retake is not None,
+                "a search, which would know of it": self.controller == "search",
+            }
+            if any(others.values()):
+                what = next(name for name, asked in others.items() if asked)
+                raise PoiseError(f"a push is for a single character that tracks, not {what}")
         if self.body == "own" and self.recover:
             raise PoiseError("recovery clips are those of the policy's body, so body='own' has none")
 
@@ -102,6 +117,7 @@ class TrackConfig:
             "a search is": self.controller == "search", "a body of its own is": self.body == "own",
             "weights, pins and touches are": bool(self.direction),
             "a range is": self.retake is not None,
+            "a push is": self.push is not None,
             "a support is": isinstance(self.supports, tuple),
         }  # fmt: skip
         if not clips:
@@ -118,5 +134,5 @@ class TrackConfig:
     @property
     def searches(self) -> bool:
         """Whether what is lost is searched."""
-        single = not (self.recover or self.reset_on_fail or self.count > 1)
+        single = not (self.recover or self.reset_on_fail or self.count > 1 or self.push)
         return self.controller == "search" or (self.controller == "auto" and single)

@@ -18,6 +18,7 @@ from poise.eval.rolloutset import Judged, RolloutSet, judge
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import Placed
+from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
 from poise.jobs.track.recovering import Led, Replay, led_along, look_for, replay, sentence
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.tracker import Tracker
@@ -46,6 +47,7 @@ class Done(NamedTuple):
         controller: which did it: "policy", "lookahead" or "search".
         found: what the search came to; None where nothing was searched.
         simulation: the states of the episode, of a single character; None of several.
+        pushed: what came of a push; None without one.
     """
 
     rollouts: RolloutSet
@@ -55,6 +57,7 @@ class Done(NamedTuple):
     controller: str
     found: SamplingResult | None = None
     simulation: Simulation | None = None
+    pushed: Pushed | None = None
 
 
 def done_by(
@@ -85,7 +88,8 @@ def done_by(
             done = episode(imitation, config, ahead, "lookahead", show)
         finally:
             ahead.copies.close()
-        if config.count == 1 and not done.failures and loses(tracker, imitation):
+        alone = config.count == 1 and config.push is None
+        if alone and not done.failures and loses(tracker, imitation):
             notes.append("The policy alone loses the motion.")
     else:
         done = episode(imitation, config, tracker.policy, "policy")
@@ -142,8 +146,10 @@ def look_ahead(
     if tracker.value is None:
         raise PoiseError("the policy was saved without its critic, which lookahead needs")
     # Copies that lose the motion may go bad; they are left behind.
-    copies = imitation.bare(rewards=True).env(
-        config.candidates, auto_reset=False, threads=threads, help_scale=0.0, guard=False
+    copies = (
+        unforeseen(imitation)
+        .bare(rewards=True)
+        .env(config.candidates, auto_reset=False, threads=threads, help_scale=0.0, guard=False)
     )
     return Lookahead(copies, tracker.policy, tracker.value, replace(config, seed=seed), prices)
 
@@ -170,19 +176,23 @@ def episode(
     told = [] if show is None else [Told("looking ahead", int(task.reference.length[0]) - 1, show)]
     # The report shows one character.
     touched, states = ContactForces(), States()
+    push = None if config.push is None else PushSeen()
     observers = [*told, touched, states] if count == 1 else told
+    observers += [] if push is None else [push]
     rollouts, recordings = run_episodes(
         lambda _: env, keeper or acts, every, starts, cycles=1, observers=observers
     )
     if count == 1:
-        recordings[0] = replace(recordings[0], contacts=tuple(touched.frames))
+        seen = touched.frames if push is None else push.arrows
+        recordings[0] = replace(recordings[0], contacts=tuple(seen))
     judged = judge(rollouts, success_rule(RULE))
     failed = [(i, t) for i, t in enumerate(judged.failed_at.tolist()) if t >= 0]
     mended = keeper.fallen if keeper is not None else ()
     frames = sorted({*mended, *failed}, key=lambda x: (x[1], x[0]))
     rate, lost = task.reference.rate_hz, frames[0][1] if frames else None
     kept = states.simulation(task.humanoid, rate, lost) if count == 1 else None
-    return Done(rollouts, recordings, judged, frames, controller, simulation=kept)
+    came = None if push is None else push.pushed(task.humanoid, rate)
+    return Done(rollouts, recordings, judged, frames, controller, simulation=kept, pushed=came)
 
 
 class Told:

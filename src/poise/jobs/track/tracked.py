@@ -16,6 +16,7 @@ from poise.jobs.runs import Evaluation
 from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
+from poise.jobs.track.pushed import Pushed
 from poise.jobs.track.recovering import Losses
 from poise.jobs.track.simulation import FILE, Simulation
 from poise.jobs.track.supports import at_home, write_supports
@@ -62,7 +63,8 @@ class Tracked(Result):
     nothing was searched. controller: which did the motion: "policy", "lookahead" or "search". parts:
     what became of each of several clips; none where it was one. supports: what stands in the world for
     the motion to rest on, in the world of the body. pins: limbs that stay put. simulation: the states of
-    a single character on a single clip, of which a part can be simulated anew (`Retake`).
+    a single character on a single clip, of which a part can be simulated anew (`Retake`). pushed: what
+    came of a push; None without one.
     """
 
     tracker: Tracker
@@ -79,6 +81,7 @@ class Tracked(Result):
     supports: tuple[Support, ...] = ()
     pins: tuple[Pin, ...] = ()
     simulation: Simulation | None = None
+    pushed: Pushed | None = None
 
     @property
     def failed_s(self) -> tuple[float, ...]:

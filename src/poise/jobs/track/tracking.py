@@ -26,6 +26,7 @@ from poise.jobs.track.missing import needs_of
 from poise.jobs.track.parts import Span, cut, parts_of, with_parts
 from poise.jobs.track.placement import Placed, place, place_all
 from poise.jobs.track.points import fitted, follow, points_of
+from poise.jobs.track.pushed import with_push
 from poise.jobs.track.rates import rate_notes
 from poise.jobs.track.retaking import retaken
 from poise.jobs.track.supports import with_supports
@@ -42,6 +43,10 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task
 from poise.settings import changed
 
+#: What the score of a motion with a push is against.
+GOAL_YIELDS = (
+    "The score, and the ghost in the report, are those of the goal, which gives way to the push."
+)
 #: What is tracked.
 Motion = Clip | Keypoints | str | Path
 
@@ -103,6 +108,7 @@ def track(
     if not several and not config.recover and config.count == 1:
         supports, imitation = with_supports(imitation, config.supports, placed)
         notes += [s.sentence() for s in supports]
+    imitation = with_push(imitation, config.push)
     if config.count > 1:
         imitation = side_by_side(imitation, config.count)
     losses, replayed, apart, spans = None, None, imitation.reference, list[Span]()
@@ -117,7 +123,10 @@ def track(
     else:
         done, said = retaken(tracker, imitation, config, config.retake, progress, prices)
     notes += said
-    if not several and config.retake is None:
+    if done.pushed is not None:
+        assert config.push is not None
+        notes += [done.pushed.sentence(), *config.push.yields.notes, GOAL_YIELDS]
+    elif not several and config.retake is None:
         notes += rate_notes(
             tracker, given, placed.report.clips[0].flights,
             lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
@@ -151,7 +160,7 @@ def track(
     return Tracked(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
         done.controller, parts, supports, config.direction.pins,
-        None if several or config.recover else done.simulation,
+        None if several or config.recover else done.simulation, done.pushed,
     )  # fmt: skip
 
 

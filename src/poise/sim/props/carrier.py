@@ -26,11 +26,13 @@ class Carrier:
         name: how the scene calls it.
         size: m, its full extents.
         pos: m, its centre at coordinates 0.
+        touched: whether things touch it; a hand that leads by a link need not be touched.
     """
 
     name: str = "carrier"
     size: Vector = (1.0, 1.0, 0.1)
     pos: Vector = (0.0, 0.0, 0.05)
+    touched: bool = True
 
     def __post_init__(self) -> None:
         above_zero(f"Carrier '{self.name}'", size=self.size)
@@ -43,6 +45,8 @@ class Carrier:
             body.add_joint(name=f"{self.name}/{axis}", type=slide, axis=list(along))
         hinge = mujoco.mjtJoint.mjJNT_HINGE
         body.add_joint(name=f"{self.name}/turn", type=hinge, axis=[0, 0, 1])
-        solid(body, self.name, "box", [s / 2 for s in self.size], mass=MASS)
+        geom = solid(body, self.name, "box", [s / 2 for s in self.size], mass=MASS)
+        if not self.touched:
+            geom.contype = geom.conaffinity = 0
         # The floor would hold it back.
         spec.add_exclude(bodyname1="world", bodyname2=self.name)

@@ -38,6 +38,7 @@ const Poise = {};
       simulated: decodeTrack(data.simulated, data.frames, n),
       force: floats(data.force),
       others: (data.others || []).map((track) => decodeTrack(track, data.frames, n)),
+      movers: (data.movers || []).map((mover) => ({ ...mover, way: floats(mover.way) })),
       pushes: arrows(data.pushes),
       helps: arrows(data.helps),
       torque: floats(data.torque),

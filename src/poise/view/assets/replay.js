@@ -10,7 +10,11 @@ Poise.replay = (data) => {
   const blank = () => ({ pos: new Float32Array(n * 3), quat: new Float32Array(n * 4) });
   const poses = { reference: blank(), simulated: blank(), others: data.others.map(blank) };
   const scale = Poise.arrowScale(data.forceNorm);
-  const pushScale = Math.max(100, Math.round((data.weight || 700) / 100) * 100);
+  // A push is drawn as long as an arm; contacts by the body's weight.
+  let hardest = 0;
+  for (let k = 0; data.pushed && data.pushes && k < data.pushes.rows.length; k += 6)
+    hardest = Math.max(hardest, Math.hypot(...data.pushes.rows.subarray(k + 3, k + 6)));
+  const pushScale = Math.max(1, hardest ? Math.round(hardest / 0.7) : Math.round((data.weight || 700) / 100) * 100);
   const target = [0, 0, 0];
   let fresh = true;
 
@@ -59,9 +63,10 @@ Poise.replay = (data) => {
         Array.from(rows.subarray(k, k + 6), (v, i) => (i < 3 ? v : v / scale)));
     const pushes = data.pushes && state.touch ? rows(data.pushes, pushScale) : [];
     const helps = data.helps && state.force ? rows(data.helps, scale) : [];
+    const movers = data.movers.map(({ way }) => way.subarray(7 * t, 7 * t + 7));
     const lit = [0, 1].map((k) => Boolean(data.contacts && data.contacts[2 * t + k]));
     const shift = [[-half * sx, -half * sy], [half * sx, half * sy]];
-    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, helps, lit };
+    return { ...poses, shift, target, blend: state.blend, follow: state.follow, arrow, pushes, helps, movers, lit };
   }
 
   function tag(id, pose, shift) {
@@ -181,11 +186,11 @@ Poise.replay = (data) => {
   $("push-key").hidden = !state.touch;
   text("push-scale", `${pushScale} N`);
   // `#2d`, `#overlaid`, `#contacts` and `#at=2.5` (s) after the file's name choose how the page opens.
-  if (location.hash.includes("contacts") && data.pushes) $("touch").click();
+  if ((data.pushed || location.hash.includes("contacts")) && data.pushes) $("touch").click();
   const start = /at=([0-9.]+)/.exec(location.hash);
   if (start) seek(Math.round(Number(start[1]) * data.fps), true);
   // Others stand beside the simulation, where its ghost would stand apart.
-  if (location.hash.includes("overlaid") || data.others.length) {
+  if (location.hash.includes("overlaid") || data.others.length || data.pushed) {
     overlay(true);
     state.blend = 0;
   }

@@ -135,6 +135,14 @@ Poise.stage2D = (host, data, extent) => {
     }
   }
 
+  function movers(frame) {
+    data.movers.forEach((shape, k) => {
+      const w = frame.movers[k];
+      const at = corners({ ...shape, body: 0 }, { pos: w.subarray(0, 3), quat: w.subarray(3, 7) }, frame.shift[1]).map(project);
+      if (at.every(Boolean)) paint(g, shape.kind, at, shape.size[0], colors.thing, colors.ink);
+    });
+  }
+
   function character(pose, shift, color, rim, alpha, lit) {
     const items = [];
     wipe();
@@ -195,6 +203,7 @@ Poise.stage2D = (host, data, extent) => {
       things(frame.shift[1]);
       if (Math.hypot(frame.shift[0][0] - frame.shift[1][0], frame.shift[0][1] - frame.shift[1][1]) > 1e-3)
         things(frame.shift[0]);
+      movers(frame);
       for (const key of data.keys || []) {
         const at = { pos: new Float32Array(3 * data.bodies.length), quat: new Float32Array(4 * data.bodies.length) };
         Poise.sample(data.reference, data.bodies.length, data.frames, key, at);

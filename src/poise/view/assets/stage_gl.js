@@ -110,6 +110,15 @@ Poise.stageGL = (host, data, extent) => {
     scene.add(group);
     return group;
   });
+  const movers = data.movers.map((shape) => {
+    const [group, mesh] = [new T.Group(), new T.Mesh(geometry(shape), wood)];
+    mesh.position.set(...shape.pos);
+    mesh.quaternion.set(shape.quat[1], shape.quat[2], shape.quat[3], shape.quat[0]);
+    mesh.castShadow = mesh.receiveShadow = true;
+    group.add(mesh);
+    scene.add(group);
+    return group;
+  });
   const reference = character(true);
   const simulated = character(false);
   const others = data.others.map(() => character(false));
@@ -204,6 +213,11 @@ Poise.stageGL = (host, data, extent) => {
       });
       ghost.visible = true;
       things.forEach((group, k) => group.position.set(frame.shift[k][0], frame.shift[k][1], 0));
+      movers.forEach((group, k) => {
+        const w = frame.movers[k];
+        group.position.set(w[0] + frame.shift[1][0], w[1] + frame.shift[1][1], w[2]);
+        group.quaternion.set(w[4], w[5], w[6], w[3]);
+      });
       things[0].visible = Math.hypot(rx - sx, ry - sy) > 1e-3;
       simulated.mats[0].color.copy(colors.sim);
       for (const side of [0, 1]) simulated.mats[side + 1].color.copy(frame.lit[side] ? colors.lit : colors.sim);

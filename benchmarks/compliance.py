@@ -1,0 +1,206 @@
+"""Compliance measured: how stiff hands are against what is commanded, throws by level (Fig. 4), what it
+costs.
+
+python benchmarks/compliance.py stiffness --json benchmarks/compliance.json --svg docs/stiffness.svg
+python benchmarks/compliance.py throws --json benchmarks/compliance.json
+python benchmarks/compliance.py hands --json benchmarks/compliance.json
+python benchmarks/compliance.py cost --json benchmarks/compliance.json
+
+All by the policy that comes with Poise, alone and without help; no training. Each part writes its
+section of the same file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+
+import poise
+from poise.control import Compliance, Stiffness
+from poise.env.events import Pushes
+from poise.env.scenes import Hands
+from poise.jobs.compliant.play import play
+from poise.jobs.compliant.standing import standing
+from poise.jobs.compliant.stiffness import Measured, measure
+from poise.jobs.compliant.throws import slope, throws
+from poise.jobs.open import open_run
+from poise.jobs.tracker import Tracker
+from poise.motion import read_clip
+from poise.view import line_plot
+
+WALK = Path(poise.__file__).parent / "data/walk.bvh"
+
+COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
+LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
+#: Characters, control steps and interleaved pairs of the cost.
+ROWS, STEPS, REPEATS = 512, 12, 9
+
+
+def stiffness(tracker: Tracker, svg: Path | None, threads: int) -> dict[str, Any]:
+    """Commanded against measured, at both hands and in six directions."""
+    made = measure(tracker, Stiffness(), COMMANDS, threads=threads)
+    alone = measure(tracker, None, newtons=lambda _: 10.0, threads=threads)
+    level = measure(tracker, Compliance(), LEVELS, lambda _: 10.0, threads)
+    harder = measure(tracker, Stiffness(), COMMANDS, lambda k: min(20.0, 0.05 * k), threads)
+    kept = [m for m in made if math.isfinite(m.stiffness)]
+
+    def rank(rows: Sequence[Measured]) -> float:
+        real = [m for m in rows if math.isfinite(m.stiffness)]
+        found = spearmanr([m.commanded for m in real], [m.stiffness for m in real])
+        return round(float(found.statistic), 4)
+
+    by = {k: [m.stiffness for m in kept if m.commanded == k] for k in COMMANDS}
+    middle = [statistics.median(by[k]) for k in COMMANDS]
+    if svg is not None:
+        x = np.log10(COMMANDS)
+        low, high = (np.log10([np.quantile(by[k], q) for k in COMMANDS]) for q in (0.1, 0.9))
+        line_plot(
+            [("measured", x, np.log10(middle), (low, high)), ("commanded", x, x)],
+            "Stiffness of a standing character's hands", "commanded, log10 of N/m",
+            "measured, log10 of N/m", svg,
+        )  # fmt: skip
+    return {
+        "trials": len(made), "measured": len(kept), "fell": sum(m.fell for m in made),
+        "rank_correlation": rank(made), "rank_correlation_up_to_20_n": rank(harder),
+        "range_factor": round(middle[-1] / middle[0], 1),
+        "commanded": {f"{k:g}": _summary([m for m in made if m.commanded == k]) for k in COMMANDS},
+        "without": _summary(alone),
+        "level": {f"{a:g}": _summary([m for m in level if m.commanded == a]) for a in LEVELS},
+    }  # fmt: skip
+
+
+def _summary(rows: Sequence[Measured]) -> dict[str, Any]:
+    values = [m.stiffness for m in rows if math.isfinite(m.stiffness)]
+    low, high = (float(np.quantile(values, q)) for q in (0.1, 0.9))
+    return {
+        "median_n_per_m": round(statistics.median(values), 1), "tenth": round(low, 1),
+        "ninetieth": round(high, 1), "measured": len(values), "fell": sum(m.fell for m in rows),
+    }  # fmt: skip
+
+
+def thrown(tracker: Tracker, counts: dict[float, int], threads: int) -> dict[str, Any]:
+    """The same throws at each level, by both laws and at two physics rates, and by stiffness."""
+    out: dict[str, Any] = {}
+    for rate, count in counts.items():
+        for law in ("eq8", "algorithm1"):
+            # Two tried steps for each force: a fifth of the throws is what the time allows.
+            many = count if law == "eq8" else max(20, count // 5)
+            out[f"{law}, {rate:g} Hz"] = _thrown(
+                tracker, Compliance(law=law), LEVELS, many, rate, threads
+            )  # type: ignore[arg-type]
+    soft = (4000.0, 1000.0, 400.0, 200.0, 100.0, 50.0)
+    out["stiffness, 60 Hz"] = _thrown(tracker, Stiffness(), soft, counts[60.0], 60.0, threads)
+    return out
+
+
+def _thrown(
+    tracker: Tracker, given: Compliance | Stiffness, levels: Sequence[float], count: int, rate: float,
+    threads: int,
+) -> dict[str, Any]:  # fmt: skip
+    begun = time.perf_counter()
+    found = throws(tracker, given, levels, count, rate, threads=threads)
+    out: dict[str, Any] = {"throws": count, "hit": int(np.isfinite(found.impulse[0]).sum())}
+    out |= {"levels": list(levels), "fell": found.fell.sum(1).tolist()}
+    out["goal_moved_mm"] = np.round(1000 * np.nanmean(found.moved, 1), 2).tolist()
+    for name in ("impulse", "peak", "torque"):
+        values = getattr(found, name)
+        ratio = np.nanmean(values / values[:1], 1)
+        out[name] = {
+            "at_first": round(float(np.nanmean(values[0])), 3),
+            "ratio": np.round(ratio, 4).tolist(),
+        }
+        if isinstance(given, Compliance):
+            middle, low, high = slope(levels, values)
+            out[name] |= {"slope": round(middle, 4), "interval_95": [round(low, 4), round(high, 4)]}
+    out["seconds"] = round(time.perf_counter() - begun, 1)
+    return out
+
+
+def cost(tracker: Tracker) -> dict[str, Any]:
+    """Control steps of environments with a force in every world, with compliance against without."""
+    task = standing(tracker, 5.0)
+    push = Pushes((20.0, 20.0), (0.03, 0.03), 100.0, task.humanoid.rows_of("hand"))
+    envs = {}
+    for name, given in (("without", None), ("eq8", Compliance()), ("stiffness", Stiffness())):
+        own = replace(task.task, plugins=(push,), compliance=given, dones=(), help_by="all")
+        envs[name] = replace(task, task=own).env(
+            ROWS, auto_reset=False, threads=1, help_scale=0.0, guard=False
+        )
+    zero, spent = torch.zeros(ROWS, dtype=torch.long), {name: list[float]() for name in envs}
+    still = torch.zeros(ROWS, envs["without"].num_actions)
+    for _ in range(REPEATS + 1):
+        for name, env in envs.items():
+            env.reset_to(zero, zero)
+            for _ in range(2):
+                env.step(still)
+            begun = time.perf_counter()
+            for _ in range(STEPS):
+                env.step(still)
+            spent[name].append((time.perf_counter() - begun) / STEPS)
+    middle = {name: statistics.median(values[1:]) for name, values in spent.items()}
+    out: dict[str, Any] = {"rows": ROWS, "ms_a_step": {k: round(1000 * v, 2) for k, v in middle.items()}}
+    pairs = {
+        k: [a / b for a, b in zip(spent["without"][1:], v[1:], strict=True)] for k, v in spent.items()
+    }
+    out["share_of_without"] = {
+        k: round(statistics.median(v), 3) for k, v in pairs.items() if k != "without"
+    }
+    return out
+
+
+def hands(tracker: Tracker, threads: int) -> dict[str, Any]:
+    """Hand in hand, walking (the embedded walk) and standing: figures by level and by stiffness."""
+    walk = read_clip(WALK)
+    ways = {
+        "level 0.16": Compliance(0.16), "level 0.2": Compliance(0.2),
+        "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5),
+        "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
+    }  # fmt: skip
+    out: dict[str, Any] = {"episodes": 16}
+    for name, clip in (("walking", walk), ("standing", None)):
+        rows: dict[str, Any] = {}
+        for way, given in ways.items():
+            made = play(Hands(), tracker, clip, given, 16, 8.0, threads)
+            rows["without"] = dict(made.stiff)
+            rows[way] = dict(made.figures)
+        out[name] = rows
+    return out
+
+
+def main() -> None:
+    """One part of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=("stiffness", "throws", "hands", "cost"))
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--svg", type=Path)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--throws", type=int, default=200, help="at 60 Hz")
+    parser.add_argument("--fine", type=int, default=200, help="throws at 600 Hz")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    tracker = open_run(None).tracker
+    if args.part == "stiffness":
+        found = stiffness(tracker, args.svg, args.threads)
+    elif args.part == "throws":
+        found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads)
+    elif args.part == "hands":
+        found = hands(tracker, args.threads)
+    else:
+        found = cost(tracker)
+    told = json.loads(args.json.read_text()) if args.json.exists() else {}
+    args.json.write_text(json.dumps({**told, args.part: found}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""`poise play compliant`: a character that gives way in a scene, and its twin that does not."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.answer import Answer
+from poise.cli.console import say, table
+from poise.cli.options import Flag, Reading, check_range
+from poise.cli.output import claimed, may_write
+from poise.cli.progress import working
+from poise.errors import PoiseError, did_you_mean
+
+if TYPE_CHECKING:
+    from poise.control import Compliance, Stiffness
+    from poise.env.scenes import PlayScene
+
+#: What is written into the folder.
+RESULTS = ("simulated.bvh", "score.json", "figures.json", "report.html")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Let a trained policy stand, or do a motion, in a scene in which something pushes it: a ball that
+    is thrown, a sustained pull, a partner hand in hand. It gives way; the same is simulated without
+    compliance, and a table compares both. Writes the motion, figures.json, score.json, report.html."""
+
+    scene: Annotated[Positional[str], arg(metavar="SCENE")]
+    """throws, pull or hands."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+    """The folder of the results."""
+    clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """What the character does; by default it stands."""
+    duration: Annotated[float, arg(metavar="SECONDS")] = 8.0
+    """How long it stands."""
+    level: Annotated[float, arg(metavar="0-1")] = 0.16
+    """Level of compliance."""
+    stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None
+    """Give way as a spring of so many newtons per metre in place of --level."""
+    lag: Annotated[float, arg(metavar="SECONDS")] = 0.5
+    """How fast it gives way with --stiffness: the time constant. Held hands need a slow one."""
+    count: Annotated[int, arg(metavar="N")] = 16
+    """Episodes, side by side, that begin a hair apart; the report shows the first."""
+    newtons: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
+    """pull: how hard (20)."""
+    direction: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
+    """pull: where to, Z up (0,1,0)."""
+    side: Annotated[Literal["left", "right"] | None, arg(help_behavior_hint="")] = None
+    """pull, hands: which hand (left)."""
+    lead: Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")] = None
+    """hands: how much faster than the motion the partner goes (0)."""
+    sway: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """hands: how far the partner's hand swings (0.1)."""
+    mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
+    """throws: of the ball (1)."""
+    seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None
+    """throws: of the draws (0)."""
+    policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
+    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
+    Poise."""
+    threads: Annotated[int, arg(metavar="N")] = 0
+    """Cores; 0 is all."""
+    open: Flag = False
+    """Open the page in the browser."""
+    force: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+def run(options: Options, argv: Sequence[str]) -> Answer:
+    """Plays the scene with and without compliance, and writes what came of it."""
+    o = options
+    check_range("count", o.count, 1, 1024)
+    check_range("duration", o.duration, 0.5, 3600)
+    check_range("threads", o.threads, 0)
+    for name in RESULTS:
+        may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
+    from poise.jobs.compliant.play import WORDS, play
+    from poise.jobs.open import open_run
+
+    scene, given = scene_of(o), given_of(o)
+    clip = None if o.clip is None else o.reading.read(o.clip)
+    with working("opening the policy"):
+        tracker = open_run(o.policy).tracker
+    with claimed(o.out):
+        with working("simulating"):
+            played = play(scene, tracker, clip, given, o.count, o.duration, o.threads, o.scene)
+        with working("writing"):
+            paths = played.write(o.out)
+    rows = [(WORDS[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
+    table(f"{o.scene}, {o.count} episodes", ("", "compliant", "without"), rows, left=1)
+    say(played.sentence())
+    if o.open and not webbrowser.open(paths["report"].absolute().as_uri()):
+        raise PoiseError("no browser could be opened", paths["report"], "Open the page by hand")
+    result = {"scene": o.scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
+    return Answer(result, paths, given.notes)
+
+
+def given_of(options: Options) -> Compliance | Stiffness:
+    """How the character gives way.
+
+    Raises:
+        PoiseError: numbers that make no sense.
+    """
+    from poise.control import Compliance, Stiffness
+
+    if options.stiffness is not None:
+        return Stiffness(options.stiffness, options.lag)
+    return Compliance(options.level)
+
+
+def scene_of(options: Options) -> PlayScene:
+    """The scene with what is stated of it.
+
+    Raises:
+        PoiseError: no such scene, or an option of another one.
+    """
+    from poise.cli.push import direction_of
+    from poise.env.scenes import SCENES
+
+    o = options
+    if o.scene not in SCENES:
+        known = f"{did_you_mean(o.scene, list(SCENES))}"
+        raise PoiseError(f"there is no scene '{o.scene}'", hint=known)
+    kind: Any = SCENES[o.scene]
+    stated: dict[str, Any] = {
+        "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
+        "sway": o.sway, "mass": o.mass, "seed": o.seed,
+    }  # fmt: skip
+    stated = {k: v for k, v in stated.items() if v is not None}
+    own = {f.name for f in fields(kind)}
+    for name in stated:
+        if name not in own:
+            raise PoiseError(f"--{name} says nothing of the scene '{o.scene}'", hint="Leave it out")
+    return kind(**stated)

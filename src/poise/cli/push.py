@@ -1,0 +1,150 @@
+"""`poise push`: a motion in, the same motion with a push in it out."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from poise.cli.answer import LOST, Answer
+from poise.cli.console import print_card, say
+from poise.cli.options import Flag, Reading, check_range
+from poise.cli.output import claimed, may_deliver, places
+from poise.cli.progress import staged, working
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.jobs.track.pushed import PushConfig
+
+
+@dataclass(frozen=True)
+class Options:
+    """Let a trained policy do a motion while something pushes it: write the motion with the push in it
+    on the skeleton that came in, score.json and report.html. The character gives way as far as --level
+    or --stiffness says, keeps its balance if it can, and comes back."""
+
+    clip: Annotated[Positional[Path], arg(metavar="CLIP")]
+    """The motion file."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|FILE")]
+    """The folder of the results; or the file of the motion (.bvh, .glb, .npz, ...), and the rest goes
+    into a folder of its name."""
+    force: Annotated[float, arg(metavar="NEWTONS")] = 150.0
+    """How hard it is pushed."""
+    at: Annotated[str, arg(metavar="PART")] = "hand"
+    """Where: hand, elbow, shoulder, hip, knee or foot, the right one (left_hand is the other); head,
+    chest or pelvis; or a body of the policy by its name."""
+    start: Annotated[float, arg(name="from", metavar="SECONDS")] = 1.0
+    """When the push begins."""
+    seconds: Annotated[float, arg(metavar="SECONDS")] = 0.5
+    """How long it lasts."""
+    direction: Annotated[str | None, arg(metavar="X,Y,Z", help_behavior_hint="")] = None
+    """Where it pushes to, Z up, such as 0,1,0; by default from the front, against where the pelvis looks
+    when it begins."""
+    level: Annotated[float, arg(metavar="0-1")] = 0.12
+    """Level of compliance, 0 does not give way; above 0.2 joints turn implausibly far."""
+    stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None
+    """Give way as a spring of so many newtons per metre in place of --level: 1000 is stiff, 50 limp."""
+    law: Literal["eq8", "algorithm1"] = "eq8"
+    """How the level acts: by the paper's Eq. 8, or by its Algorithm 1 as printed."""
+    policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
+    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
+    Poise."""
+    controller: Literal["lookahead", "policy"] = "lookahead"
+    """lookahead tries in copies of the character before it acts, without knowing of the push before it
+    begins; policy acts alone, at once."""
+    body: Literal["policy", "own"] = "policy"
+    """policy is the body that it was trained on; own has the lengths and masses of the skeleton that
+    came in."""
+    threads: Annotated[int, arg(metavar="N")] = 0
+    """Cores for lookahead; 0 is all."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of what lookahead draws."""
+    hold_feet: Flag = True
+    """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
+    overwrite: Flag = False
+    """Write over files that are there."""
+    json: Flag = False
+    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
+def run(options: Options, argv: Sequence[str]) -> Answer:
+    """Reads, tracks with the push, writes; says what the push did."""
+    o = options
+    push = push_of(o)
+    check_range("seed", o.seed, 0)
+    check_range("threads", o.threads, 0)
+    out, motion = places(o.out)
+    may_deliver(out, motion, o.overwrite, o.clip, flag="--overwrite")
+    from poise.cli.track import is_lost, outcome
+    from poise.jobs.open import open_run
+    from poise.jobs.track import TrackConfig, track, write
+
+    config = TrackConfig(
+        seed=o.seed, controller=o.controller, threads=o.threads, body=o.body, push=push,
+        smooth_hz=o.reading.smooth,
+    )  # fmt: skip
+    clip = o.reading.read(o.clip)
+    with working("opening the policy"):
+        tracker = open_run(o.policy).tracker
+    with claimed(out):
+        with contextlib.ExitStack() as shown:
+            shown.enter_context(working("pushing"))
+            tracked = track(clip, tracker, config, progress=staged(shown))
+        with working("writing"):
+            done = write(tracked, out, motion, o.hold_feet)
+    assert tracked.pushed is not None
+    print_card(done.card)
+    said, lost = outcome(tracked, False, hint=False), is_lost(tracked)
+    say(said)
+    say(tracked.pushed.sentence())
+    if lost:
+        say("A weaker or shorter push, or a lower --level, may be borne.")
+    survived = tracked.card.survived
+    word = "lost" if lost else "not tracked" if survived else "pushed"
+    result = {
+        "outcome": word,
+        "controller": tracked.controller,
+        "sentence": said,
+        "failures": [{"character": k, "seconds": t} for k, t in tracked.failures],
+        "push": asdict(tracked.pushed),
+        "score": done.card.to_dict(),
+    }
+    # The sentence on the push is said already.
+    told = tuple(n for n in (*tracked.notes, *done.notes) if n != tracked.pushed.sentence())
+    code = LOST if lost or survived else 0
+    return Answer(result, done.paths, told, code, word, done.card.mpjpe_mm)
+
+
+def push_of(options: Options) -> PushConfig:
+    """What the words ask for.
+
+    Raises:
+        PoiseError: numbers that make no sense.
+    """
+    from poise.jobs.track.pushed import PushConfig
+
+    o = options
+    return PushConfig(
+        o.force, o.at, o.start, o.seconds, direction_of(o.direction), o.level, o.stiffness, o.law
+    )
+
+
+def direction_of(text: str | None) -> tuple[float, float, float] | None:
+    """The numbers of "0,1,0"; None where nothing is stated.
+
+    Raises:
+        PoiseError: these are not three numbers.
+    """
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(v) for v in text.split(","))
+    except ValueError:
+        hint = "Write for example --direction 0,1,0"
+        raise PoiseError(f"--direction needs three numbers, got '{text}'", hint=hint) from None
+    return x, y, z

@@ -1,0 +1,55 @@
+"""What a scene of compliance puts into each world, and what happens there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from poise.body import Humanoid
+from poise.env.goals.goal import Goal
+from poise.env.plugins import Plugin
+from poise.env.reference import Reference
+from poise.errors import PoiseError
+from poise.sim import Backend, Link, Touch
+from poise.sim.props import Prop
+
+
+class Stage(NamedTuple):
+    """What stands in each world beside one character, and what happens to it.
+
+    Attributes:
+        props, links, touches: see `sim.Scene`; the character's bodies have their own names.
+        plugins: of the task; those that tell forces (`Plugin.felt`) are what the character gives way to.
+    """
+
+    props: tuple[Prop, ...] = ()
+    links: tuple[Link, ...] = ()
+    touches: tuple[Touch, ...] = ()
+    plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
+
+
+class PlayScene(Protocol):
+    """The settings of a scene, one file each."""
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """What it takes for a body and the motion that it follows.
+
+        Raises:
+            PoiseError: the body cannot do it.
+        """
+        ...
+
+
+def hand_of(humanoid: Humanoid, side: str, scene: str) -> int:
+    """The row of a hand.
+
+    Raises:
+        PoiseError: the body has none on that side.
+    """
+    rows = humanoid.table.rows
+    found = next((i for i in humanoid.rows_of("hand") if rows[i].side == side), None)
+    if found is None:
+        names = ", ".join(humanoid.bodies)
+        hint = f"Its bodies are {names}"
+        raise PoiseError(f"the skeleton has no {side} hand, which '{scene}' needs", hint=hint)
+    return found

@@ -1,0 +1,228 @@
+"""Compliance in an environment: what pushes characters displaces their goals, at the physics rate."""
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.control.compliance import (
+    Compliance,
+    Stiffness,
+    check_level,
+    check_stiffness,
+    columns,
+    compliant_rate,
+    printed_velocity,
+    pseudo_inverse,
+    room,
+    settled,
+    softening,
+)
+from poise.env.goals.displaced import DisplacedGoal
+from poise.env.goals.goal import Goal
+from poise.env.plugins import Felt, Plugin
+from poise.errors import PoiseError
+from poise.sim import Backend, CharacterRows, Drive, Mechanics
+from poise.spatial import quat_conj, quat_rotate
+
+#: Forces on one character that count, the strongest ones.
+MOST = 4
+
+
+class Yielding(Plugin):
+    """Displaces the goals of N characters where something pushes them (`TaskConfig.compliance`).
+
+    Before each physics step the forces that other plug-ins tell (`Plugin.felt`) move
+    `DisplacedGoal.offset`, u. A policy sees the displaced goal; where actions add to the goal's joint
+    angles, what u has moved since the control step began is added to the targets, too. Where nothing
+    acts u goes back to 0.
+
+    Attributes:
+        given: the law.
+        goal: the displaced goal.
+        level: `(N,)` float64, the dial: the level of compliance, or N/m of a commanded stiffness; may be
+            changed at any time by `turn`.
+        share: `(N,)` of the last physics step's displacement that the hinges' ranges let through.
+    """
+
+    def __init__(
+        self,
+        given: Compliance | Stiffness,
+        goal: DisplacedGoal,
+        backend: Backend,
+        additive: bool,
+        others: Sequence[Plugin],
+    ):
+        self.given, self.goal, self._backend, self._additive = given, goal, backend, additive
+        table, here = goal.humanoid.table, backend.device
+        self._weights = columns(table, given.weights, given.root).to(here)
+        self._shares = torch.ones_like(self._weights)
+        self._felt = [p for p in others if type(p).felt is not Plugin.felt]
+        self._mechanics = Mechanics(backend)
+        if isinstance(given, Compliance):
+            # The root has no share of its own.
+            self._shares[6:] = columns(table, given.joints, True)[6:].to(here)
+            shared = isinstance(backend, CharacterRows) and not backend.sole
+            if given.law == "algorithm1" and shared:
+                raise PoiseError(
+                    "algorithm1 tries physics steps and takes them back, which worlds of several "
+                    "characters do not",
+                    "Compliance",
+                    "Take law='eq8'",
+                )
+        model = backend.model
+        ranges = np.where(model.jnt_limited[1:, None] == 1, model.jnt_range[1:], [-np.inf, np.inf])
+        self._low, self._high = torch.from_numpy(ranges).to(here).unbind(1)
+        self._kp = torch.from_numpy(model.actuator_gainprm[:, 0].copy()).to(here)
+        self._step_s = float(model.opt.timestep)
+        self._substeps = round(1.0 / (goal.rate_hz * self._step_s))
+        n = backend.num_envs
+        dial = given.level if isinstance(given, Compliance) else given.newtons_per_metre
+        self.level = torch.full((n,), dial, dtype=torch.float64, device=here)
+        self.share = torch.ones_like(self.level)
+        self._before, self._k = goal.offset.clone(), 0
+
+    def turn(self, level: float | Tensor, rows: Tensor | None = None) -> None:
+        """Turns the dial of worlds `rows (n,)`, all for None: a level, or N/m.
+
+        Raises:
+            PoiseError: a level outside of 0 to 1, or a stiffness that is not above 0.
+        """
+        check = check_level if isinstance(self.given, Compliance) else check_stiffness
+        for value in torch.as_tensor(level, dtype=torch.float64).aminmax():
+            check(float(value))
+        self.level[slice(None) if rows is None else rows] = level
+
+    def follow(self, goal: Goal) -> None:
+        """What displaces the former goal does so with the new one, from nothing."""
+        assert isinstance(goal, DisplacedGoal)
+        self.goal = goal
+
+    def rows(self) -> dict[str, Tensor]:
+        return {"compliance/level": self.level}
+
+    def state(self) -> dict[str, Tensor]:
+        return {"compliance/level": self.level.clone()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on at the same levels; from a task without compliance at those it has."""
+        if "compliance/level" in state:
+            self.level.copy_(state["compliance/level"])
+
+    def push(self, drive: Drive) -> None:
+        """A control step begins."""
+        self._before.copy_(self.goal.offset)
+        self._k = 0
+        inner = self.goal.goal
+        self._reference = [inner.layout.unpacked(packed) for packed in (inner.now(), inner.ahead())]
+        table, rows = inner.targets()
+        hinges = table[rows].double()
+        self._least = torch.minimum(self._low, hinges) - hinges
+        self._most = torch.maximum(self._high, hinges) - hinges
+
+    def push_substep(self, drive: Drive) -> None:
+        """Moves u over the physics step that comes, and the targets with it."""
+        felt = [f for f in (p.felt() for p in self._felt) if f is not None]
+        self._move(felt)
+        self._k += 1
+        if self._additive:
+            drive.ctrl.add_((self.goal.offset - self._before)[:, 6:])
+
+    def _move(self, felt: Sequence[Felt]) -> None:
+        u, rate = self.goal.offset, self.goal.rate
+        acts = [f.force.norm(dim=-1) >= self.given.least_n for f in felt]
+        pushed = torch.stack([a.any(1) for a in acts]).any(0) if acts else None
+        back_u, back_rate = u, rate
+        if pushed is None or not bool(pushed.all()):
+            if not bool((u != 0.0).any() or (rate != 0.0).any()) and (
+                pushed is None or not bool(pushed.any())
+            ):
+                return
+            back_u, back_rate = settled(u, rate, self.given.return_hz, self._step_s)
+        if pushed is None or not bool(pushed.any()):
+            u.copy_(back_u)
+            rate.copy_(back_rate)
+        else:
+            moved, speed = self._pushed(felt, acts)
+            on = pushed.unsqueeze(1)
+            u.copy_(torch.where(on, moved, back_u))
+            rate.copy_(torch.where(on, speed, back_rate))
+        # Where the goal has moved on, what it leaves to its hinges' ranges has changed.
+        u[:, 6:] = torch.maximum(torch.minimum(u[:, 6:], self._most), self._least)
+
+    def _pushed(self, felt: Sequence[Felt], acts: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """u and u' after a physics step in which forces act."""
+        u, given, h = self.goal.offset, self.given, self._step_s
+        body, point, force = (
+            torch.cat([f.body for f in felt], 1),
+            torch.cat([f.point for f in felt], 1).double(),
+            torch.cat([f.force for f in felt], 1).double(),
+        )
+        on = torch.cat(list(acts), 1)
+        algorithm = isinstance(given, Compliance) and given.law == "algorithm1"
+        if algorithm:
+            jacobian = self._mechanics.jacobian(body, point)[0]
+            driven = torch.tensor([f.driven for f in felt for _ in range(f.body.shape[1])])
+            change = self._changes(jacobian, force, driven)
+        else:
+            if body.shape[1] > MOST:
+                # The strongest ones are enough, and each has a Jacobian.
+                pick = force.norm(dim=-1).topk(MOST, 1).indices
+                body, on = body.gather(1, pick), on.gather(1, pick)
+                wide = pick.unsqueeze(-1).expand(-1, -1, 3)
+                point, force = point.gather(1, wide), force.gather(1, wide)
+            jacobian, change = self._mechanics.jacobian(body, point)[0], None
+        if isinstance(given, Stiffness):
+            soft = softening(jacobian, force, self.level, self._kp, given.series)
+            way = (force * (soft * on).unsqueeze(-1)).unsqueeze(-1)
+            aim = (pseudo_inverse(jacobian, self._weights) @ way).squeeze(-1).sum(1)
+            self.share = room(aim[:, 6:], self._least, self._most)
+            # u' = (u* - u) / lag, exactly.
+            left = float(np.exp(-h / given.lag_s))
+            moved = torch.lerp(aim * self.share.unsqueeze(1), u, left)
+            return moved, (moved - u) / h
+        if change is not None:
+            velocity = printed_velocity(jacobian, change, h)
+        else:
+            velocity = self._against(body, point, jacobian)
+        velocity = velocity * on.unsqueeze(-1)
+        speed = compliant_rate(jacobian, velocity, self.level, self._weights, given, self._shares)
+        left_low, left_high = self._least - u[:, 6:], self._most - u[:, 6:]
+        self.share = room(h * speed[:, 6:], left_low, left_high)
+        speed = speed * self.share.unsqueeze(1)
+        return u + h * speed, speed
+
+    def _against(self, body: Tensor, point: Tensor, jacobian: Tensor) -> Tensor:
+        """x' `(N, K, 3)`: how fast points of the characters move against those of their references."""
+        state = self._backend.state
+        wide = body.unsqueeze(-1)
+        origin, turn = (
+            getattr(state, name).gather(1, wide.expand(-1, -1, size)).double()
+            for name, size in (("xpos", 3), ("xquat", 4))
+        )
+        local = quat_rotate(quat_conj(turn), point - origin)
+        at = min(1.0, self._k / self._substeps)
+        moves = torch.zeros_like(point)
+        for pose, share in zip(self._reference, (1.0 - at, at), strict=True):
+            quat, linear, spin = (
+                field.gather(1, (wide - 1).clamp_min(0).expand(-1, -1, field.shape[-1])).double()
+                for field in (pose.quat, pose.linvel, pose.angvel)
+            )
+            moves += share * (linear + torch.linalg.cross(spin, quat_rotate(quat, local)))
+        own = (jacobian @ state.qvel.double()[:, None, :, None]).squeeze(-1)
+        return own - moves
+
+    def _changes(self, jacobian: Tensor, force: Tensor, driven: Tensor) -> Tensor:
+        """`(N, K, nv)` by how much each force changes `qvel` in one physics step."""
+        pushes = (jacobian.transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1)
+        out = torch.zeros_like(pushes)
+        for k in range(pushes.shape[1]):
+            # What is in the drive already is taken out; what is not is put in.
+            sign = -1.0 if bool(driven[k]) else 1.0
+            out[:, k] = sign * self._mechanics.step_map(sign * pushes[:, k]).double()
+        return out

@@ -1,0 +1,54 @@
+"""`poise play compliant SCENE`: files, the JSON document, what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from poise.cli.main import main
+
+
+def test_a_scene_from_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    argv = ["play", "compliant", "pull", "--newtons", "15", "--stiffness", "300", "--lag", "0.1"]
+    argv += ["--count", "2", "--duration", "1.0", "--threads", "1", "-o", str(out)]
+    assert main([*argv, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["result"]["scene"] == "pull" and told["result"]["compliant"]["lost"] == 0.0
+    assert {p.name for p in out.iterdir()} == {
+        "simulated.bvh", "score.json", "figures.json", "report.html",
+    }  # fmt: skip
+    assert main(argv) == 2
+    assert "write over it with --force" in capsys.readouterr().err
+    assert main([*argv, "--force"]) == 0
+    assert "Interaction force, mean while it acts" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("door",), "there is no scene 'door'"),
+        (("hand",), "Did you mean 'hands'?"),
+        (("pull", "--mass", "2"), "--mass says nothing of the scene 'pull'"),
+        (("pull", "--level", "1.2"), "level of compliance must lie in 0 to 1"),
+        (("throws", "--mass", "0"), "a ball must weigh above 0"),
+        (("hands", "--count", "0"), "--count must lie in 1 to 1024"),
+    ],
+)
+def test_mistakes(
+    words: tuple[str, ...], what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["play", "compliant", *words, "-o", str(tmp_path / "out")]) == 2
+    assert what in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_that_name_is_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "compliant").mkdir()
+    assert main(["play", "compliant"]) == 2
+    assert "SCENE" not in capsys.readouterr().err

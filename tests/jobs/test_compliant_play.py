@@ -1,0 +1,63 @@
+"""Scenes played with compliance and without, in miniature."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from poise.control import Stiffness
+from poise.env.scenes import Hands, Pull, Throws
+from poise.jobs.compliant.play import WORDS, footfalls, play
+from poise.jobs.open import open_run
+from poise.jobs.tracker import Tracker
+from poise.motion import read_clip
+from toy_policy import WALK
+
+
+@pytest.fixture(scope="module")
+def tracker() -> Tracker:
+    return open_run(None).tracker
+
+
+def test_hand_in_hand_it_gives_way(tracker: Tracker, tmp_path: Path) -> None:
+    made = play(Hands(), tracker, read_clip(WALK), Stiffness(500.0, 0.5), count=4, threads=1)
+    a, b = made.figures, made.stiff
+    assert set(a) == set(b) == set(WORDS)
+    assert a["force_mean_n"] < 0.7 * b["force_mean_n"] and a["lost"] < b["lost"]
+    assert a["goal_moved_m"] > 0.02 and b["goal_moved_m"] == 0.0
+    assert "less than without compliance" in made.sentence()
+    # The partner's hand is drawn where the character's is, since they hold one another.
+    paths = made.write(tmp_path / "out")
+    (mover,) = made.movers
+    row = made.imitation.humanoid.bodies.index("lwrist")
+    rollouts = made.evaluation.rollouts
+    apart = np.linalg.norm(mover.pos[2:] - rollouts.pos[0, 2:, row].numpy(), axis=1)
+    assert apart.max() < 0.15
+    page = paths["report"].read_text()
+    assert '"movers":[{' in page and '"pushed":true' in page and ">goal<" in page
+    told = json.loads(paths["figures"].read_text())
+    assert told["compliant"] == dict(a) and told["episodes"] == 4
+    assert made.clip.frames == read_clip(paths["simulated"]).frames
+
+
+def test_a_pull_and_throws_are_seen(tracker: Tracker) -> None:
+    pulled = play(Pull(15.0, start_s=0.2), tracker, None, Stiffness(200.0), 2, seconds=1.0, threads=1)
+    for figures in (pulled.figures, pulled.stiff):
+        assert figures["force_mean_n"] == pytest.approx(15.0) and figures["lost"] == 0
+    assert pulled.figures["goal_moved_m"] > pulled.stiff["goal_moved_m"] == 0.0
+    assert pulled.clip.name == "standing" and not pulled.movers
+    assert [len(a) for a in pulled.arrows] == [0] * 6 + [1] * 25
+    thrown = play(Throws(every_s=(0.8, 0.8)), tracker, None, None, 3, seconds=1.6, threads=1)
+    assert thrown.figures["force_peak_n"] > 50.0 and len(thrown.movers) == 1
+    assert 1.0 < thrown.figures["impulse_ns"] < 10.0
+
+
+def test_steps_by_hand() -> None:
+    up, down, half = 0.1, 0.0, 0.03
+    feet = [[down, up, half, down, down, up, down], [down, half, down, half, down, down, down]]
+    height = torch.tensor(feet).T[None]
+    assert footfalls(height).tolist() == [2]
