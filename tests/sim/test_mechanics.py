@@ -11,7 +11,11 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.sim import CpuBackend, Mechanics, SimConfig
+from poise.motion import ClipLibrary
+from poise.recipes import ResidualForce, build
+from poise.sim import Character, CpuBackend, Mechanics, Scene, SceneSim, SimConfig
+from poise.sim.props import Ball
+from toy_human import swing
 
 N = 5
 
@@ -125,3 +129,27 @@ def test_mistakes(worlds: tuple[CpuBackend, Mechanics, Tensor]) -> None:
         mechanics.solve(point)
     with pytest.raises(PoiseError, match=r"forces must be \(5, 8\), got \(4, 8\)"):
         mechanics.step_map(force[:4])
+
+
+def test_characters_of_a_scene_have_their_own_mechanics() -> None:
+    """Whatever stands before and beside them, Jacobians and inertia are those of the body alone."""
+    humanoid = build(ClipLibrary.of([swing(1.0)]), ResidualForce(expert=False)).humanoid
+    things = (Ball(pos=(0, 9, 1)), Character(humanoid, "anna"), Character(humanoid, "ben"))
+    world = SceneSim(Scene(things), 2, threads=1)
+    rows = world.characters()
+    model, rng = rows.model, torch.Generator().manual_seed(2)
+    alone = CpuBackend(model, 4, 1)
+    made, beside = Mechanics(rows), Mechanics(alone)
+    qpos = torch.tensor(model.qpos0).repeat(4, 1)
+    qpos[:, 2], qpos[:, 0] = 3.0, 4.0 * torch.arange(4)
+    qpos[:, 7:] += 0.3 * torch.randn(4, model.nq - 7, generator=rng, dtype=torch.float64)
+    still = torch.zeros(4, model.nv, dtype=torch.float64)
+    for backend in (rows, alone):
+        backend.write(None, qpos, still)
+        backend.step(2)
+    point = rows.state.xpos[:, 5]
+    torch.testing.assert_close(made.jacobian(5, point)[0], beside.jacobian(5, point)[0])
+    torch.testing.assert_close(made.inertia(), beside.inertia())
+    force = torch.randn(4, model.nv, generator=rng, dtype=torch.float64)
+    torch.testing.assert_close(made.solve(force), beside.solve(force))
+    world.close()
