@@ -94,6 +94,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             tell(f"Others can reach this machine at {o.host}. The token in the address lets them in.")
         if session.vmc is not None:
             tell(f"Waiting for VMC on UDP port {session.vmc.port}. Stand still for 2 s at first.")
+            if token is not None:
+                tell("VMC knows no token: whatever reaches that port is believed to be an avatar.")
         elif o.stream:
             tell("Waiting for people at the WebSocket /stream.")
         tell("Ctrl-C ends it.", "dim")

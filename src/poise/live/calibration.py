@@ -10,6 +10,7 @@ import numpy as np
 from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.kin import RetargetConfig, place_on_body
+from poise.kin.hinges import wrapped
 from poise.live import quats as q
 from poise.live.packet import Packet
 from poise.live.passage import FramePassage, Hinges
@@ -30,6 +31,8 @@ class OntoBody:
     Attributes:
         yaw: rad, by which the source's world is turned.
         shift: `(3)` m, by which it is then moved.
+        floor: m, by which it is lifted.
+        planted: `(n)` rad that are added to the hinges.
         scale: of the person's path.
     """
 
@@ -40,6 +43,7 @@ class OntoBody:
     yaw: float = 0.0
     shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
     floor: float = 0.0
+    planted: np.ndarray | float = 0.0
     _last: np.ndarray | None = None
 
     @property
@@ -70,10 +74,12 @@ class OntoBody:
         hinges = Hinges(example.skeleton, humanoid.table)
         out = cls(passage, hinges, feet, ease[7:])
         step = max(1, clip.frames // 60)
-        own = [out(clip.root_pos[t], clip.rot[t])[2] for t in range(0, clip.frames, step)]
+        own = np.stack([out(clip.root_pos[t], clip.rot[t]) for t in range(0, clip.frames, step)])
         at = [round(t / clip.fps * RATE) for t in range(0, clip.frames, step)]
-        there = on.qpos[np.minimum(at, len(on.qpos) - 1), 2]
-        out.floor = float(np.median(there - np.array(own)))
+        there = on.qpos[np.minimum(at, len(on.qpos) - 1)]
+        out.floor = float(np.median(there[:, 2] - own[:, 2]))
+        # By how much planted feet turn hips, knees and ankles, which a single frame does not tell.
+        out.planted = np.median(wrapped(there[:, 7:] - own[:, 7:]), 0)
         out._last = None
         return out
 
@@ -84,7 +90,8 @@ class OntoBody:
             world[joint] = q.mul(world[joint], turn)
         last = self.first if self._last is None else self._last
         qpos = self.hinges(root, world, last)
-        self._last = qpos[7:]
+        self._last = qpos[7:].copy()
+        qpos[7:] += self.planted
         turn = q.yaw(self.yaw)
         qpos[:3] = q.rotate(turn, qpos[:3]) + self.shift
         qpos[2] += self.floor

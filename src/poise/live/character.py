@@ -83,6 +83,17 @@ class Character:
         """Says what moves the person's motion, see `move`."""
         self._move = move
 
+    def begin(self, frame: Tensor) -> None:
+        """The character was set down on a frame."""
+        self.last, self.doing = frame.clone(), EASE
+        self._way = self._plan = None
+        self._stand(frame)
+        self.blend()
+
+    def follow(self, frame: Tensor) -> None:
+        """The character is on its person's motion already, `frame` the last that its goal knows."""
+        self.last, self.doing, self._share = frame.clone(), TRACKS, 1.0
+
     def jump(self) -> None:
         """The person is elsewhere of a sudden: the character stays, and then goes on from there."""
         if self.doing == TRACKS:

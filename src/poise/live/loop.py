@@ -31,6 +31,8 @@ from poise.settings import validate
 COMMANDS, STEPS = 256, 1800
 #: s after which a hand that says nothing more has let go.
 HOLDS_S = 1.0
+#: s for which nobody looks ahead after a step that came too late.
+HURRIES_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ class Live:
         self.rate_hz, self.clock = self.world.rate_hz, clock
         self.commands: deque[dict[str, Any]] = deque(maxlen=COMMANDS)
         self.paused, self.behind, self.steps = False, 0, 0
+        self._hurry = 0
         self.recording: Callable[[bool], None] | None = None
         self._rng = np.random.default_rng(c.seed)
         self._latency: deque[float] = deque(maxlen=STEPS)
@@ -129,6 +132,8 @@ class Live:
             if now - due > period:
                 self.behind += int((now - due) / period)
                 due = now
+                # Better in time than far-sighted.
+                self._hurry = self.steps + round(HURRIES_S * self.rate_hz)
             due += period
             self.step(now)
 
@@ -141,6 +146,7 @@ class Live:
         if self.paused:
             return None
         frames = torch.stack([self._frame(k, now_s) for k in range(self.config.characters)])
+        self.world.hurries = self.steps < self._hurry
         seen = self.world.step(frames)
         self.steps += 1
         if self.steps % 30 == 0:
@@ -251,6 +257,7 @@ class Live:
             "buffer": people.delay_s,
             "noise": self.config.noise,
             "lookahead": len(self.world.ahead_of),
+            "looked_ahead": round(self.world.looked / max(1, self.steps), 3),
             "paused": self.paused,
             "resets": self.world.resets,
             "help_n": 0.0,

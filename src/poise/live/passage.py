@@ -63,7 +63,10 @@ class FramePassage:
 
     def __call__(self, root_pos: np.ndarray, rot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The target's root `(3)` m and world rotations `(J, 4)` for a pose of the source."""
-        world = world_of(self.source, rot)
+        return self.turned(root_pos, world_of(self.source, rot))
+
+    def turned(self, root_pos: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for world rotations `(J, 4)` of the source."""
         turned = q.mul(world, q.conj(self._here))
         out = np.empty((len(self.target), 4))
         direct = np.array(list(self._direct), dtype=int)

@@ -14,9 +14,11 @@ from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Inbox
 from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
-from poise.live.show import ShowPage, ShowRecorder, hello_of
+from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
 from poise.live.sinks.record import Recorder
+from poise.live.sinks.vmc import Puppet, VmcSink
 from poise.live.sources.file import FileSource
+from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
 
 
@@ -70,8 +72,14 @@ class Session:
         )
         self.live.shows += [ShowPage(self.server), ShowRecorder(self.recorder)]
         self.files = FileSource(dict(wanted.clips), self.inbox, clock)
-        self.vmc = None
+        self.vmc = None if wanted.vmc is None else VmcSource(wanted.host, wanted.vmc, self.inbox, clock)
+        self.sink = None
+        if wanted.vmc_out is not None:
+            self.sink = VmcSink(wanted.vmc_out, Puppet(world.humanoid.table, tracker.example))
+            self.live.shows.append(ShowVmc(self.sink))
         self.files.start()
+        if self.vmc is not None:
+            self.vmc.start()
         if wanted.records:
             self.recorder.start()
 
@@ -90,6 +98,8 @@ class Session:
         self.files.close()
         if self.vmc is not None:
             self.vmc.close()
+        if self.sink is not None:
+            self.sink.close()
         self.server.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
         self.recorded += self.recorder.stop()

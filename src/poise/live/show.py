@@ -9,6 +9,7 @@ from poise.live.loop import Live
 from poise.live.page.frames import as_json, packed
 from poise.live.page.server import PageServer
 from poise.live.sinks.record import Recorder
+from poise.live.sinks.vmc import VmcSink
 from poise.live.world import Seen, World
 
 #: What characters do, in the order of the numbers in frames.
@@ -62,3 +63,14 @@ class ShowRecorder:
     def show(self, seen: Seen, live: Live) -> None:
         """Takes a control step."""
         self.recorder.write(seen.qpos)
+
+
+class ShowVmc:
+    """Hands steps to a VMC sink."""
+
+    def __init__(self, sink: VmcSink):
+        self.sink = sink
+
+    def show(self, seen: Seen, live: Live) -> None:
+        """Takes a control step."""
+        self.sink.write(seen.bodies, seen.time_s)

@@ -66,6 +66,8 @@ class World:
     Attributes:
         characters: what each is to do.
         resets: how often the simulation went bad and all were set down anew.
+        hurries: whether there is no time to look ahead; all act at once then.
+        looked: control steps in which somebody looked ahead.
 
     Raises:
         PoiseError: a policy that cannot get up, or has no critic though it is to look ahead.
@@ -102,7 +104,7 @@ class World:
         spots = [(APART_M * (k // wide), APART_M * (k % wide)) for k in range(count)]
         self.characters = [Character(planner, spot, executor) for spot in spots]
         self.substeps, self.resets, self.steps = sim.substeps, 0, 0
-        self.lead = [1] * count
+        self.lead, self.hurries, self.looked = [1] * count, False, 0
         self._pulls: dict[int, tuple[int, Tensor, Tensor]] = {}
         self._blows: list[tuple[int, Tensor, int]] = []
         self._act = tracker.policy.act
@@ -133,15 +135,18 @@ class World:
         return self._ahead is not None
 
     def _set_down(self) -> None:
-        every = torch.arange(self.count)
         frames = torch.stack([c.ease for c in self.characters])
-        for c in self.characters:
-            c.last, c.doing = c.ease.clone(), "at ease"
-            c.blend()
+        self.set_on(frames, torch.zeros(self.count, self.humanoid.model.nv, dtype=torch.float64))
+
+    def set_on(self, frames: Tensor, qvel: Tensor) -> None:
+        """Sets all characters down on frames `(K, 7 + n)`, moving with `qvel (K, 6 + n)`."""
+        every = torch.arange(self.count)
+        for c, frame in zip(self.characters, frames, strict=True):
+            c.begin(frame)
         self.goal.clear(every)
         self.goal.push(frames)
         self.goal.draw(every)
-        self.env.backend.write(None, frames, torch.zeros(self.count, self.humanoid.model.nv))
+        self.env.backend.write(None, frames, qvel)
         self.env.age[:] = 0
         self.env.set_goal(self.goal)
         self._off, self._speed = np.zeros(self.count), np.zeros(self.count)
@@ -151,7 +156,8 @@ class World:
 
     def pull(self, character: int, body: int, point: np.ndarray, to: np.ndarray) -> None:
         """A hand holds a body at `point (3)` m in its frame and draws it to `to (3)` m in the world."""
-        self._pulls[character] = body, torch.tensor(point), torch.tensor(to)
+        double = torch.float64
+        self._pulls[character] = body, torch.tensor(point, dtype=double), torch.tensor(to, dtype=double)
 
     def let_go(self, character: int) -> None:
         """The hand lets go."""
@@ -195,7 +201,9 @@ class World:
         goal.aim(None, None)
         goal.notes.clear()
         obs = env.observe()
-        env.drive(self._ahead.act(obs) if self._ahead is not None and self.ahead_of else self._act(obs))
+        ahead = self._ahead if self.ahead_of and not self.hurries else None
+        self.looked += ahead is not None
+        env.drive(self._act(obs) if ahead is None else ahead.act(obs))
         self._push()
         env.controls.step(env.backend, self.substeps)
         env.renew(env.judge())

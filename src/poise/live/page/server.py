@@ -41,6 +41,8 @@ _POLICY = (
 )
 #: s that a handshake may take, and s between figures.
 HANDSHAKE_S, FIGURES_S = 5.0, 0.25
+#: Refusals that a connection is told the reasons of; more are counted alone.
+TOLD = 50
 
 
 class _Connection(ServerConnection):
@@ -164,7 +166,7 @@ class PageServer:
             server: Server = await serve(
                 self._handle, guard.host, guard.port, process_request=self._answer,
                 create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
-                open_timeout=HANDSHAKE_S, ping_interval=20, ping_timeout=20, compression=None,
+                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=20, compression=None,
                 server_header=None, logger=_quiet(),
             )  # fmt: skip
         except OSError as problem:
@@ -244,13 +246,18 @@ class PageServer:
     ) -> None:
         bucket, path = Bucket(), urlsplit(connection.request.path if connection.request else "").path
         self._streams += path == "/stream"
+        said = 0
         stream = JsonStream(self.inbox, f"{self._streams}:") if path == "/stream" else None
         try:
             async for message in connection:
                 if not bucket.takes():
                     self.guard.refused["too many messages"] += 1
                     if stream is None:
-                        await connection.close(1008, "too many messages")
+                        # What still comes is read and left, so that the reason gets through.
+                        closing = asyncio.create_task(connection.close(1008, "too many messages"))
+                        async for _ in connection:
+                            pass
+                        await closing
                         return
                     # Of a burst of poses the newest count; the rest is left out.
                     continue
@@ -262,7 +269,8 @@ class PageServer:
                         self.guard.refused[why] += 1
                 else:
                     why = "nothing is expected here"
-                if why is not None and connection.state.name == "OPEN":
+                said += why is not None
+                if why is not None and said <= TOLD:
                     await connection.send(json.dumps({"v": VERSION, "type": "refused", "why": why}))
         except ConnectionClosed:
             pass
