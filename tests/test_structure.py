@@ -38,11 +38,10 @@ EXPLAINED = {
     "for users of the library": (
         "jobs/imitate.py:imitate", "eval/card.py:read_score", "env/gym.py:GymVectorEnv",
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv", "env/goals/displaced.py:DisplacedGoal",
-        "env/goals/stream.py:StreamGoal",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
         "sim/props/carrier.py:Carrier", "sim/props/door.py:Door", "sim/props/lift.py:Lift",
-        "sim/props/sphere.py:Ball", "sim/mechanics.py:Mechanics", "sim/mechanics.py:Mechanics.step_map",
+        "sim/mechanics.py:Mechanics", "sim/mechanics.py:Mechanics.step_map",
         "env/teams.py:Teams",
     ),
     "motion without end, which becomes a verb when a generator comes with Poise": (

@@ -23,7 +23,13 @@ def say(**fields: object) -> str:
 
 
 def pose(person: str = "a", **changes: object) -> str:
-    told = {"type": "pose", "person": person, "time": 1.0, "root": [0, 0, 1], "rotations": [[1, 0, 0, 0]] * 2}
+    told = {
+        "type": "pose",
+        "person": person,
+        "time": 1.0,
+        "root": [0, 0, 1],
+        "rotations": [[1, 0, 0, 0]] * 2,
+    }
     return say(**{**told, **changes})
 
 
@@ -120,7 +126,10 @@ def test_a_vertical_along_y_is_turned() -> None:
     np.testing.assert_allclose(turned(np.array([1.0, 2.0, 3.0]), "Y"), [3.0, 1.0, 2.0])
     import torch
 
-    a, b = (quat_rotate(torch.tensor(x), torch.tensor(y)).numpy() for x, y in ((q, v), (turned(q, "Y"), turned(v, "Y"))))
+    a, b = (
+        quat_rotate(torch.tensor(x), torch.tensor(y)).numpy()
+        for x, y in ((q, v), (turned(q, "Y"), turned(v, "Y")))
+    )
     np.testing.assert_allclose(turned(a, "Y"), b, atol=1e-12)
 
 

@@ -31,8 +31,14 @@ def walk() -> Clip:
 class Played:
     """A loop with people that walk, 30 packets a second each."""
 
-    def __init__(self, tracker: Tracker, walk: Clip, config: LiveConfig, people: tuple[str, ...] = ("a",)):
-        self.live, self.loop, self.people = Live(tracker, config, clock=lambda: self.now), Loop(walk), people
+    def __init__(
+        self, tracker: Tracker, walk: Clip, config: LiveConfig, people: tuple[str, ...] = ("a",)
+    ):
+        self.live, self.loop, self.people = (
+            Live(tracker, config, clock=lambda: self.now),
+            Loop(walk),
+            people,
+        )
         self.now, self.frame = 0.0, 0
 
     def run(self, seconds: float, sends: bool = True) -> None:
@@ -131,7 +137,9 @@ def test_buffer_noise_and_pause_are_set_while_it_runs(tracker: Tracker, walk: Cl
     assert live.paused and live.steps == steps
     live.commands.append({"type": "pause", "on": False})
     live.commands.append({"type": "ball", "character": 0})
-    live.commands.append({"type": "pull", "character": 0, "body": 3, "point": [0, 0, 0], "to": [0, 0, 1]})
+    live.commands.append(
+        {"type": "pull", "character": 0, "body": 3, "point": [0, 0, 0], "to": [0, 0, 1]}
+    )
     played.run(0.2)
     assert live.steps > steps and 0 in live.world._pulls
     # A hand that says nothing more has let go.
@@ -148,7 +156,7 @@ def test_a_pull_is_a_spring(tracker: Tracker, walk: Clip) -> None:
     for k in range(10):
         live.step(k * STEP)
     before = place[0, chest + 1].clone()
-    live.world.pull(0, chest, np.zeros(3), (before.double().numpy() + [0.25, 0, 0]))
+    live.world.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
     live._pulled[0] = 0.0
     for k in range(15):
         live.step(0.3 + k * STEP)
@@ -167,9 +175,7 @@ def test_settings_that_make_no_sense(wrong: dict) -> None:
 
 def test_a_clip_is_played_on_without_a_jump(walk: Clip) -> None:
     loop = Loop(walk)
-    far = [
-        float(np.linalg.norm(loop(k + 1)[0] - loop(k)[0])) for k in range(3 * walk.frames)
-    ]
+    far = [float(np.linalg.norm(loop(k + 1)[0] - loop(k)[0])) for k in range(3 * walk.frames)]
     assert max(far) < 0.08
     # It walks on; the clip's own way three times.
     assert np.linalg.norm(loop(3 * walk.frames)[0][:2] - loop(0)[0][:2]) > 2.2 * np.linalg.norm(

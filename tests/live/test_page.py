@@ -39,7 +39,12 @@ class Served:
         self.told: list[dict[str, Any]] = []
         self.inbox, self.guard = Inbox(), Guard(host, 0, token)
         self.server = PageServer(
-            self.guard, {"characters": 1}, self.inbox, self.told.append, lambda: {"hz": 30.0}, time.monotonic
+            self.guard,
+            {"characters": 1},
+            self.inbox,
+            self.told.append,
+            lambda: {"hz": 30.0},
+            time.monotonic,
         )
         self.where = f"127.0.0.1:{self.guard.port}"
 
@@ -73,7 +78,13 @@ def test_pages_and_nothing_else_are_there(served: Served) -> None:
         status, body = served.get(path)
         assert status == 200 and len(body) > 200, path
         assert b"http://" not in body.replace(b"http://www.w3.org", b"") or path == "/three.js"
-    for path in ("/nothing", "/../pyproject.toml", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/live.js/.."):
+    for path in (
+        "/nothing",
+        "/../pyproject.toml",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "//etc/passwd",
+        "/live.js/..",
+    ):
         assert served.get(path)[0] == 404, path
     assert served.get("/", Origin="http://evil.example")[0] == 403
     assert served.get("/", Host="evil.example")[0] == 403
@@ -114,10 +125,10 @@ def test_the_newest_step_waits_for_nobody(served: Served) -> None:
 def test_strangers_are_kept_out(served: Served) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"ws://{served.where}/live", origin="http://evil.example")  # type: ignore[arg-type]
-    with connect(f"ws://{served.where}/stream", max_size=None) as page:
-        with pytest.raises(ConnectionClosed) as closed:
-            page.send("x" * (4 * MOST_BYTES))
-            page.recv(5)
+    door = f"ws://{served.where}/stream"
+    with connect(door, max_size=None) as page, pytest.raises(ConnectionClosed) as closed:
+        page.send("x" * (4 * MOST_BYTES))
+        page.recv(5)
     assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
     with connect(f"ws://{served.where}/live") as page, pytest.raises(ConnectionClosed) as closed:
         for _ in range(3000):
@@ -175,7 +186,9 @@ def test_push_fall_recovery_and_record_in_chromium(tmp_path: Path) -> None:
             assert session.live.world._pulls or session.live.commands or session.live.steps
             page.until("true")
             page.mouse("mouseReleased", x + 40, y - 20)
-            page.js("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 'k', bubbles: true}))")
+            page.js(
+                "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 'k', bubbles: true}))"
+            )
             page.until("['falls', 'gets up'].includes(document.body.dataset.doing)")
             page.until("document.body.dataset.doing == 'tracks'", 40)
             assert page.js("Number(document.getElementById('recovered').textContent)") >= 1

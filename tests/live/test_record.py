@@ -80,7 +80,9 @@ def test_kill_9_loses_a_second_at_most(tmp_path: Path) -> None:
     file, nq = tmp_path / "take.bvh", open_run(None).tracker.humanoid.model.nq
     path = [str(Path(__file__).parent)]
     code = _CRASH.format(path=path, file=str(file), nq=nq)
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=dict(os.environ)) as run:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, env=dict(os.environ)
+    ) as run:
         assert run.stdout is not None
         run.stdout.readline()
         time.sleep(0.5)

@@ -59,7 +59,9 @@ def test_unity_is_left_handed_with_y_up() -> None:
 def test_what_goes_out_comes_in_within_a_millimetre() -> None:
     clip, avatar = on_vrm(), Avatar("a")
     for t in range(clip.frames):
-        made = avatar.take(messages(datagram(clip.skeleton, clip.root_pos[t], clip.rot[t], 1 + t / 30)), 0)
+        made = avatar.take(
+            messages(datagram(clip.skeleton, clip.root_pos[t], clip.rot[t], 1 + t / 30)), 0
+        )
         if t == 0:
             # The first frame is known to be whole when the second begins.
             assert made == []
@@ -157,7 +159,8 @@ def test_a_sink_is_heard() -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        b"", b"abc", b"abcd", b"/a\0\0", b"/a\0\0,f\0\0", b"/a\0\0,x\0\0\0\0\0\0", b"/a\0x,f\0\0\0\0\0\0",
+        b"", b"abc", b"abcd", b"/a\0\0", b"/a\0\0,f\0\0", b"/a\0\0,x\0\0\0\0\0\0",
+        b"/a\0x,f\0\0\0\0\0\0",
         b"#bundle\0", b"#bundle\0" + bytes(8) + b"\xff\xff\xff\xff", bytes(70_000),
         bundled([bundled([bundled([bundled([bundled([encoded("/a", (1,))])])])])]),
         bundled([encoded("/a", (1,))] * (MESSAGES + 1)), b"/\xff\0\0,\0\0\0",

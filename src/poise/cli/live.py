@@ -33,8 +33,8 @@ class Options:
     characters: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Characters in one world, 1 to 16; by default one for each file."""
     buffer: Annotated[float, arg(metavar="SECONDS")] = 0.1
-    """How far behind the stream characters are, 0 to 0.4: it evens out how packets come, and what is more
-    than 0.05 s is known ahead. With 0 the motion is extrapolated."""
+    """How far behind the stream characters are, 0 to 0.4; more than 0.05 is known ahead, and 0 extrapolates
+    the motion."""
     lookahead: Annotated[int, arg(metavar="N")] = 0
     """How many characters look ahead before they act; each costs about half a core."""
     noise: Annotated[float, arg(metavar="0-1")] = 0.0
@@ -52,8 +52,8 @@ class Options:
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """End after so many seconds."""
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """The address to listen on. Any other than this machine's own lets others in, who must then know a
-    token, which is printed."""
+    """The address to listen on. Any other than this machine's own lets others in that know a token, which
+    is printed."""
     port: Annotated[int, arg(metavar="PORT")] = 8017
     """The port of the page; 0 takes a free one."""
     open: Flag = False
@@ -87,6 +87,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         wanted = Wanted(
             clips, o.vmc, o.vmc_out, o.out or Path("live.bvh"), o.host, o.port, token, o.record
         )
+        kept = list[Path]()
         session = Session(open_run(o.policy).tracker, config, wanted)
     try:
         say(f"Poise live: {session.server.url}", "bold")
@@ -114,7 +115,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 
 @contextlib.contextmanager
-def _ends_well():  # noqa: ANN202 - a context
+def _ends_well():
     """A polite end of the process is Ctrl-C as well."""
 
     def stop(*_: object) -> None:

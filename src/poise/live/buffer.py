@@ -50,8 +50,7 @@ class JitterBuffer:
     extrapolated, and with one it is between two packets.
 
     Args:
-        delay_s: s, 0 to 0.4; what of it exceeds the margin is `lead_s`, by which a goal may lag behind
-            what is read here.
+        delay_s: s, 0 to 0.4; by what of it exceeds the margin, a goal lags behind what is read here.
     """
 
     def __init__(self, delay_s: float = 0.1):
@@ -62,11 +61,6 @@ class JitterBuffer:
         self._way = 0.0
         self._arrived = -np.inf
         self._jumped = False
-
-    @property
-    def lead_s(self) -> float:
-        """s of the buffer that are known ahead of the goal."""
-        return max(0.0, self.delay_s - MARGIN_S)
 
     def add(self, time_s: float, arrived_s: float, root_pos: np.ndarray, rot: np.ndarray) -> None:
         """One more packet; one that is older than those that came is put in its place."""
@@ -108,7 +102,9 @@ class JitterBuffer:
         if b.leaps:
             return Pose(a.root_pos, a.rot, stale, jumped)
         share = (at - a.time_s) / (b.time_s - a.time_s)
-        return Pose(a.root_pos + share * (b.root_pos - a.root_pos), slerp(a.rot, b.rot, share), stale, jumped)
+        return Pose(
+            a.root_pos + share * (b.root_pos - a.root_pos), slerp(a.rot, b.rot, share), stale, jumped
+        )
 
     def _beyond(self, at: float) -> tuple[np.ndarray, np.ndarray]:
         """q_0 + v_0 tau (1 - e^(-t / tau)): where the motion goes on, and comes to rest."""

@@ -21,7 +21,7 @@ from poise.spatial.directions import facing, heading_angle
 EASE, TRACKS, FALLS, RETURNS = "at ease", "tracks", "falls", "gets up"
 #: s in which one motion passes into another.
 BLEND_S = 0.7
-#: m that a person who stands may be away for the character to walk there; m/s of one who stands.
+#: m that a standing person may be away for the character to walk there; m/s of one that stands.
 WALKS_M, STANDS = 4.0, 0.5
 #: m and rad between where a character has come back and its person, from which the person's motion is
 #: moved there.
@@ -187,9 +187,7 @@ class Character:
             self._plan = self._executor.submit(_planned, self.get_up, start, place, moves)
 
 
-def _planned(
-    get_up: GetUpPlanner, start: Tensor, place: Tensor | None, moves: Tensor | None
-) -> Tensor:
+def _planned(get_up: GetUpPlanner, start: Tensor, place: Tensor | None, moves: Tensor | None) -> Tensor:
     """A recovery motion to standing at `place (7 + n)`, on the spot for None."""
     if place is None:
         low = float(start[2]) < DOWN * float(get_up.recovery_clips.ease[2])

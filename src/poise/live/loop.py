@@ -1,7 +1,7 @@
 """The loop: 30 times a second what came becomes goals, goals become actions, actions become motion.
 
-It waits for nobody. Sources put packets into an `Inbox`, pages put commands into a bounded queue, and
-what a step came to goes to those that show or keep it, each of which takes the newest when it can.
+It never waits. Sources put packets into an `Inbox`, pages put commands into a bounded queue, and what a
+step came to goes to those that show or keep it, each of which takes the newest when it can.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from poise.errors import PoiseError
 from poise.jobs.tracker import Tracker
+from poise.live.buffer import MARGIN_S
 from poise.live.calibration import OntoBody, calibrated
 from poise.live.character import tensor
 from poise.live.packet import Inbox, Packet
@@ -31,7 +32,7 @@ from poise.settings import validate
 COMMANDS, STEPS = 256, 1800
 #: s after which a hand that says nothing more has let go.
 HOLDS_S = 1.0
-#: s for which nobody looks ahead after a step that came too late.
+#: s for which no character looks ahead after a step that came too late.
 HURRIES_S = 2.0
 
 
@@ -192,7 +193,7 @@ class Live:
             person.onto.move(seen.numpy(), to.numpy())
 
     def _set_lead(self) -> None:
-        lead = 1 + int(max(0.0, self.people.delay_s - 0.05) * self.rate_hz + 1e-6)
+        lead = 1 + int(max(0.0, self.people.delay_s - MARGIN_S) * self.rate_hz + 1e-6)
         self.world.lead = [lead] * self.config.characters
 
     # --- commands -----------------------------------------------------------------------------

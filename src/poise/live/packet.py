@@ -63,9 +63,7 @@ def checked(packet: Packet) -> Packet:
     if not 0 < len(packet.person) <= NAME:
         raise PoiseError("name", packet.person[:NAME])
     rot = normalized(packet.rot)
-    return Packet(
-        packet.person, packet.time_s, packet.skeleton, packet.root_pos, rot, packet.whole
-    )
+    return Packet(packet.person, packet.time_s, packet.skeleton, packet.root_pos, rot, packet.whole)
 
 
 class Inbox:

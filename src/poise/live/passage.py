@@ -6,6 +6,7 @@ tests hold the two together.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -120,7 +121,7 @@ def place_of(
 ) -> np.ndarray:
     """m, where the last joint of a path from the root is."""
     out = root
-    for a, b in zip(path, path[1:], strict=False):
+    for a, b in pairwise(path):
         out = out + q.rotate(world[a], skeleton.offsets[b])
     return out
 
@@ -144,7 +145,7 @@ def _chains(p: Passage) -> list[_Chain]:
 
 
 def _between(joint: int, knots: list[tuple[float, int]], at: float) -> _Chain:
-    for (a, low), (b, high) in zip(knots, knots[1:], strict=False):
+    for (a, low), (b, high) in pairwise(knots):
         if at <= b + 1e-9:
             share = 1.0 if b - a < 1e-9 else min(max((at - a) / (b - a), 0.0), 1.0)
             return _Chain(joint, low, high, share)
@@ -212,4 +213,3 @@ class Hinges:
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
     return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
-

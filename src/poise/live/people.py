@@ -8,7 +8,7 @@ from concurrent.futures import Executor, Future
 import numpy as np
 
 from poise.live.buffer import JitterBuffer, Pose
-from poise.live.calibration import OntoBody, Standing, calibrated
+from poise.live.calibration import OntoBody, Standing
 from poise.live.packet import PEOPLE, Packet
 
 #: s without a packet after which a person is away, and after which it is forgotten.
@@ -40,12 +40,12 @@ class Person:
         """0 to 1, how far the calibration is."""
         return 1.0 if self.onto is not None else self._standing.share
 
-    def add(self, packet: Packet, arrived_s: float, calibrate: Callable[[Packet], object]) -> None:
+    def add(self, packet: Packet, arrived_s: float, calibrate: Callable[..., object]) -> None:
         """One more packet. calibrate: is called with a packet that has a clip to be calibrated by."""
         first = self._first
-        if first is not None and packet.skeleton is not first.skeleton:
-            if not packet.skeleton.same_bones(first.skeleton, 0.005):
-                self.forget()
+        other = first is not None and packet.skeleton is not first.skeleton
+        if other and first is not None and not packet.skeleton.same_bones(first.skeleton, 0.005):
+            self.forget()
         if self._first is None:
             self._first = packet
         self.arrived_s = arrived_s
@@ -90,7 +90,7 @@ def calibrate_with(
 
 
 class People:
-    """All people that are there, and which character follows whom.
+    """All people that are there, and which of them each character follows.
 
     Args:
         count: characters.
@@ -98,7 +98,7 @@ class People:
 
     Attributes:
         follows: name of the person that each character follows, None for none.
-        turned_away: people for whom there was no place.
+        turned_away: people that found no place.
     """
 
     def __init__(
@@ -129,21 +129,21 @@ class People:
         return self._executor.submit(self._calibrate, packet, whole)
 
     def tidy(self, now_s: float) -> None:
-        """Forgets people who have been away for long; a character takes the next one."""
+        """Forgets people that have been away for long; a character takes the next one."""
         gone = [n for n, p in self.known.items() if now_s - p.arrived_s > FORGET_S]
         for name in gone:
             del self.known[name]
             self.follows = [None if f == name else f for f in self.follows]
 
     def switch(self, character: int, name: str | None) -> None:
-        """A character follows somebody else from now on, None for nobody; who is followed already
-        changes places."""
+        """A character follows another person from now on, None for none; one that is followed
+        already changes places."""
         if name is not None and name in self.follows:
             self.follows[self.follows.index(name)] = self.follows[character]
         self.follows[character] = name
 
     def of(self, character: int) -> Person | None:
-        """Whom a character follows."""
+        """The person that a character follows."""
         name = self.follows[character]
         return None if name is None else self.known.get(name)
 

@@ -29,14 +29,17 @@ PARENTS: dict[str, str | None] = {
 }  # fmt: skip
 #: Bones that every VRM model has.
 NEEDED = tuple(
-    b for b in PARENTS if b not in ("Chest", "UpperChest", "Neck") and not b.endswith(("Shoulder", "Toes"))
+    b
+    for b in PARENTS
+    if b not in ("Chest", "UpperChest", "Neck") and not b.endswith(("Shoulder", "Toes"))
 )
 #: m, T-pose of a person of 1.6 m: x ahead, y left, z up; right sides mirror left ones.
 _OFFSETS = {
     "Hips": (0.0, 0.0, 0.0), "Spine": (0.0, 0.0, 0.07), "Chest": (0.0, 0.0, 0.12),
     "UpperChest": (0.0, 0.0, 0.12), "Neck": (0.0, 0.0, 0.13), "Head": (0.01, 0.0, 0.08),
-    "LeftShoulder": (0.0, 0.03, 0.10), "LeftUpperArm": (0.0, 0.10, 0.0), "LeftLowerArm": (0.0, 0.25, 0.0),
-    "LeftHand": (0.0, 0.23, 0.0), "LeftUpperLeg": (0.0, 0.09, -0.05), "LeftLowerLeg": (0.0, 0.0, -0.38),
+    "LeftShoulder": (0.0, 0.03, 0.10), "LeftUpperArm": (0.0, 0.10, 0.0),
+    "LeftLowerArm": (0.0, 0.25, 0.0), "LeftHand": (0.0, 0.23, 0.0),
+    "LeftUpperLeg": (0.0, 0.09, -0.05), "LeftLowerLeg": (0.0, 0.0, -0.38),
     "LeftFoot": (0.0, 0.0, -0.39), "LeftToes": (0.12, 0.0, -0.07),
 }  # fmt: skip
 
@@ -80,7 +83,9 @@ def standard() -> Skeleton:
     mirror = np.array([1.0, -1.0, 1.0])
     left = {bone: np.array(at) for bone, at in _OFFSETS.items()}
     right = {
-        bone.replace("Left", "Right"): at * mirror for bone, at in left.items() if bone.startswith("Left")
+        bone.replace("Left", "Right"): at * mirror
+        for bone, at in left.items()
+        if bone.startswith("Left")
     }
     return skeleton_of({**left, **right})
 

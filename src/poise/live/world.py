@@ -123,9 +123,9 @@ class World:
         self._set_down()
         self.look_ahead(lookahead)
 
-    def look_ahead(self, who: tuple[int, ...]) -> None:
+    def look_ahead(self, characters: tuple[int, ...]) -> None:
         """Which characters look ahead; the others act at once."""
-        self.ahead_of = tuple(k for k in who if 0 <= k < self.count)
+        self.ahead_of = tuple(k for k in characters if 0 <= k < self.count)
         if self._ahead is not None:
             self._ahead.watch(self.env, self.ahead_of)
 
@@ -247,9 +247,7 @@ class World:
         self._speed = pose.linvel.norm(dim=-1).mean(-1).double().numpy()
         self._moves = pose.linvel[:, 0, :2].double()
         at = self.scene.scene.place("ball").qpos
-        bodies, goals = (
-            torch.cat((p.pos, p.quat), -1).float().numpy().copy() for p in (pose, goal)
-        )
+        bodies, goals = (torch.cat((p.pos, p.quat), -1).float().numpy().copy() for p in (pose, goal))
         ball = state.qpos[0, at].float().numpy().copy()
         qpos = self.rows.state.qpos.double().numpy().copy()
         return Seen(self.steps / self.rate_hz, bodies, goals, ball, qpos, self._off)

@@ -15,10 +15,15 @@ HEAD = struct.Struct("<IIdHH")
 
 
 def packed(
-    step: int, time_s: float, doing: Sequence[int], bodies: np.ndarray, goals: np.ndarray, ball: np.ndarray
+    step: int,
+    time_s: float,
+    doing: Sequence[int],
+    bodies: np.ndarray,
+    goals: np.ndarray,
+    ball: np.ndarray,
 ) -> bytes:
-    """Little-endian: version u32, step u32, time f64, K u16, B u16; K u8 what each character does, filled
-    up to a multiple of 4; f32 `(K, B, 7)` of the bodies, as many of the goals, 7 of the ball."""
+    """Little-endian: version u32, step u32, time f64, K u16, B u16; K u8 what each character does,
+    filled up to a multiple of 4; f32 `(K, B, 7)` of the bodies, as many of the goals, 7 of the ball."""
     k, b = bodies.shape[:2]
     head = HEAD.pack(VERSION, step, time_s, k, b) + bytes(doing) + bytes(-k % 4)
     return head + b"".join(np.ascontiguousarray(x, "<f4").tobytes() for x in (bodies, goals, ball))

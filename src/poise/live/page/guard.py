@@ -1,4 +1,4 @@
-"""Who may come in: tokens, origins, caps of connections and of messages."""
+"""What is let in: tokens, origins, caps of connections and of messages."""
 
 from __future__ import annotations
 
@@ -67,9 +67,7 @@ class Guard:
         said = parse_qs(urlsplit(path).query).get("token", [""])[0]
         bearer = headers.get("Authorization", "").removeprefix("Bearer ")
         wanted = (self.token or "").encode()
-        return any(
-            [hmac.compare_digest(x.encode("utf-8", "replace"), wanted) for x in (said, bearer)]
-        )
+        return any([hmac.compare_digest(x.encode("utf-8", "replace"), wanted) for x in (said, bearer)])
 
     def _no(self, reason: str) -> str:
         self.refused[reason] += 1

@@ -61,8 +61,8 @@ class _Connection(ServerConnection):
             return
         assert isinstance(transport, asyncio.Transport)
         body = (why + "\n").encode()
-        head = f"HTTP/1.1 503 Service Unavailable\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
-        transport.write(head.encode() + body)
+        head = f"HTTP/1.1 503 Service Unavailable\r\nContent-Length: {len(body)}\r\n"
+        transport.write((head + "Connection: close\r\n\r\n").encode() + body)
         transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -91,7 +91,7 @@ class PageServer:
     """Serves until `close`.
 
     Args:
-        guard: who may come in; its port 0 takes a free one.
+        guard: what is let in; its port 0 takes a free one.
         hello: what a page is told first, see docs/live.md.
         inbox: where streams go.
         command: takes a checked command.
@@ -137,7 +137,7 @@ class PageServer:
         return f"http://{host}:{self.guard.port}/{more}"
 
     def publish(self, frame: bytes, text: Callable[[], str] | str) -> None:
-        """The newest control step; whoever is slow misses some. Returns at once."""
+        """The newest control step; a slow page misses some. Returns at once."""
         words = text if isinstance(text, str) else (text() if self._programs else "")
         self._newest = (frame, words)
         if self._loop is not None and self._loop.is_running():
@@ -159,15 +159,19 @@ class PageServer:
             fresh.set()
 
     async def _serve(self) -> None:
-        self._loop, self._stop, self._fresh = asyncio.get_running_loop(), asyncio.Event(), asyncio.Event()
+        self._loop, self._stop, self._fresh = (
+            asyncio.get_running_loop(),
+            asyncio.Event(),
+            asyncio.Event(),
+        )
         guard = self.guard
         kind = type("Connection", (_Connection,), {"guard": guard})
         try:
             server: Server = await serve(
                 self._handle, guard.host, guard.port, process_request=self._answer,
                 create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
-                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=20, compression=None,
-                server_header=None, logger=_quiet(),
+                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=20,
+                compression=None, server_header=None, logger=_quiet(),
             )  # fmt: skip
         except OSError as problem:
             self._problem = problem.strerror or str(problem)

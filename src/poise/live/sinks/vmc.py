@@ -6,6 +6,7 @@ import contextlib
 import queue
 import socket
 import threading
+from itertools import pairwise
 
 import numpy as np
 
@@ -29,7 +30,11 @@ class Puppet:
     """
 
     def __init__(
-        self, table: BodyTable, example: Clip, skeleton: Skeleton | None = None, scale: float | None = None
+        self,
+        table: BodyTable,
+        example: Clip,
+        skeleton: Skeleton | None = None,
+        scale: float | None = None,
     ):
         self.skeleton = skeleton or standard()
         self._own, self._rot = example.skeleton, example.rot[0]
@@ -53,7 +58,7 @@ class Puppet:
         root = bodies[0, :3].astype(float)
         # The root is where the pelvis is, less what lies between them.
         path = [*own.ancestors(pelvis)[::-1], pelvis]
-        for a, b in zip(path, path[1:], strict=False):
+        for a, b in pairwise(path):
             root = root - q.rotate(world[a], own.offsets[b])
         hips, there = self._passage.turned(root, q.normalized(world))
         return hips, local_of(self.skeleton, there)

@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 from poise.errors import PoiseError
 
-#: Bytes of a datagram, bundles in one another, messages of a datagram, arguments of a message.
+#: Bytes of a datagram, bundles in one another, messages of a datagram, arguments of one.
 MOST, DEPTH, MESSAGES, ARGUMENTS = 65_507, 4, 1024, 32
 _BUNDLE = b"#bundle\0"
 
 
 class Message(NamedTuple):
-    """An address such as "/VMC/Ext/Bone/Pos", and its arguments: whole numbers, numbers, words, flags."""
+    """An address such as "/VMC/Ext/Bone/Pos", and its arguments: numbers, words, flags."""
 
     address: str
     arguments: tuple[int | float | str | bool, ...]

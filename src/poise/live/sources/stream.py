@@ -47,7 +47,5 @@ class JsonStream:
         time_s = number(message["time"]) if "time" in message else arrived_s
         root = numbers([message.get("root")], 3, 1)[0]
         rot = numbers(message.get("rotations"), 4, JOINTS)
-        packet = Packet(
-            (self._own + person)[:64], time_s, skeleton, turned(root, up), turned(rot, up)
-        )
+        packet = Packet((self._own + person)[:64], time_s, skeleton, turned(root, up), turned(rot, up))
         self.inbox.offer(packet, arrived_s)

@@ -84,11 +84,7 @@ class Avatar:
         if not (norms > 0.5).all() or not (norms < 2.0).all():
             raise PoiseError("no rotation", "VMC")
         old = self.skeleton
-        if (
-            old is None
-            or list(old.names) != names
-            or np.abs(old.offsets[1:] - pos[1:]).max() > GROWS_M
-        ):
+        if old is None or list(old.names) != names or np.abs(old.offsets[1:] - pos[1:]).max() > GROWS_M:
             self.skeleton = skeleton_of(dict(zip(names, pos, strict=True)))
         assert self.skeleton is not None
         return self.skeleton, pos, rot / norms
