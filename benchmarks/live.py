@@ -284,20 +284,19 @@ def strangers() -> dict[str, Any]:
     }  # fmt: skip
 
     async def flood() -> dict[str, Any]:
-        from websockets.asyncio.client import connect
-        from websockets.exceptions import ConnectionClosed
-
         task = asyncio.create_task(watch(f"ws://{host}/live", 25))
         await asyncio.sleep(5)
         found: dict[str, Any] = {}
-        async with connect(f"ws://{host}/stream", max_size=None) as s:
-            try:
-                for _ in range(16):
-                    await s.send("x" * 2**26)
-                await s.recv()
-                found["a message of 1 GB"] = "taken"
-            except ConnectionClosed as end:
-                found["a message of 1 GB"] = f"closed, {end.rcvd.code if end.rcvd else 'reset'}"
+        with socket.create_connection((name, int(port)), 5) as s:
+            s.sendall(f"GET /stream HTTP/1.1\r\nHost: {host}\r\n{upgrade}\r\n".encode())
+            await asyncio.sleep(0.3)
+            s.recv(4096)
+            # The head of a frame of 1 GB; what follows is never read.
+            s.sendall(b"\x81\xff" + (2**30).to_bytes(8, "big") + bytes(4) + b"x" * 10_000)
+            await asyncio.sleep(0.5)
+            end = s.recv(4096)
+            code = int.from_bytes(end[2:4], "big") if end[:1] == b"\x88" else 0
+            found["a message of 1 GB"] = f"closed with {code}" if code else "taken"
         made, refused = list[socket.socket](), 0
         for _ in range(10_000):
             s = socket.socket()
@@ -312,7 +311,7 @@ def strangers() -> dict[str, Any]:
                         refused += bool(old.recv(200).startswith(b"HTTP/1.1 503"))
                     old.close()
                 made.clear()
-        found["10,000 connections"] = f"{refused} refused with a reason"
+        found["10,000 connections, refusals that the client waited for"] = refused
         seen = [f for f in await task if "characters" in f]
         found["meanwhile"] = {
             "hz before": seen[8]["hz"], "hz after": seen[-1]["hz"],

@@ -165,6 +165,22 @@ def test_a_pull_is_a_spring(tracker: Tracker, walk: Clip) -> None:
     live.close()
 
 
+def test_a_slow_machine_makes_slow_motion_and_no_falls(tracker: Tracker, walk: Clip) -> None:
+    played = Played(tracker, walk, LiveConfig())
+    played.run(1.5)
+    for _ in range(40):
+        # Each step takes as long as two.
+        for _ in range(2):
+            played.live.inbox.offer(packet_of("a", played.loop, played.frame), played.now)
+            played.frame += 1
+            played.now += STEP
+        played.live.step(played.now)
+    played.run(3.0)
+    assert played.live.world.characters[0].lost == 0
+    assert played.live._read is not None and played.now - played.live._read < 1.3
+    played.live.close()
+
+
 @pytest.mark.parametrize(
     "wrong", [{"characters": 0}, {"buffer_s": 0.5}, {"lookahead": 2}, {"noise": float("nan")}]
 )

@@ -88,6 +88,10 @@ def test_pages_and_nothing_else_are_there(served: Served) -> None:
         assert served.get(path)[0] == 404, path
     assert served.get("/", Origin="http://evil.example")[0] == 403
     assert served.get("/", Host="evil.example")[0] == 403
+    with socket.create_connection(("127.0.0.1", served.guard.port), 5) as one:
+        one.settimeout(5)
+        one.sendall(f"POST / HTTP/1.1\r\nHost: {served.where}\r\n\r\n".encode())
+        assert one.recv(100).startswith(b"HTTP/1.1 405")
 
 
 def test_commands_frames_and_figures_go_through(served: Served) -> None:

@@ -33,8 +33,8 @@ class Options:
     characters: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Characters in one world, 1 to 16; by default one for each file."""
     buffer: Annotated[float, arg(metavar="SECONDS")] = 0.1
-    """How far behind the stream characters are, 0 to 0.4; more than 0.05 is known ahead, and 0 extrapolates
-    the motion."""
+    """How far behind the stream characters are, 0 to 0.4; more than 0.05 is known ahead, and 0
+    extrapolates the motion."""
     lookahead: Annotated[int, arg(metavar="N")] = 0
     """How many characters look ahead before they act; each costs about half a core."""
     noise: Annotated[float, arg(metavar="0-1")] = 0.0
@@ -52,8 +52,8 @@ class Options:
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """End after so many seconds."""
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """The address to listen on. Any other than this machine's own lets others in that know a token, which
-    is printed."""
+    """The address to listen on. Any other than this machine's own lets others in that know a token,
+    which is printed."""
     port: Annotated[int, arg(metavar="PORT")] = 8017
     """The port of the page; 0 takes a free one."""
     open: Flag = False

@@ -16,7 +16,7 @@ FADE_S = 0.1
 #: m/s and m beyond which a person did not move but is elsewhere, or is another one.
 JUMP, LEAP_M = 12.0, 0.4
 #: Packets by which the way's shortest time is known, and those that are kept.
-SEEN, KEPT = 240, 128
+SEEN, KEPT = 240, 320
 
 
 class Pose(NamedTuple):

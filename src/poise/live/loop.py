@@ -32,6 +32,11 @@ from poise.settings import validate
 COMMANDS, STEPS = 256, 1800
 #: s after which a hand that says nothing more has let go.
 HOLDS_S = 1.0
+#: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
+#: nothing is caught up with.
+CATCHES_UP, GIVES_UP_S = 0.15, 1.5
+#: s in which errors wander.
+WANDERS_S = 0.3
 #: s for which no character looks ahead after a step that came too late.
 HURRIES_S = 2.0
 
@@ -45,7 +50,8 @@ class LiveConfig:
         buffer_s: s, 0 to 0.4: evens out how packets come; what of it exceeds 0.05 s is known ahead. With
             0 the goal is extrapolated.
         lookahead: how many characters look ahead before they act, the first ones.
-        noise: 0 to 1, what is added to goals as a video estimator errs: 0.1 rad and 30 mm for 1.
+        noise: 0 to 1, what is added to goals as a video estimator errs: 0.1 rad and 30 mm for 1,
+            which wander within 0.3 s.
         seed: of the noise and of lookahead.
     """
 
@@ -109,7 +115,8 @@ class Live:
         self.rate_hz, self.clock = self.world.rate_hz, clock
         self.commands: deque[dict[str, Any]] = deque(maxlen=COMMANDS)
         self.paused, self.behind, self.steps = False, 0, 0
-        self._hurry = 0
+        self._read: float | None = None
+        self._hurry, self._errors = 0, dict[int, np.ndarray]()
         self.recording: Callable[[bool], None] | None = None
         self._rng = np.random.default_rng(c.seed)
         self._latency: deque[float] = deque(maxlen=STEPS)
@@ -146,7 +153,8 @@ class Live:
         self._obey(now_s)
         if self.paused:
             return None
-        frames = torch.stack([self._frame(k, now_s) for k in range(self.config.characters)])
+        reads = self._reads(now_s)
+        frames = torch.stack([self._frame(k, reads) for k in range(self.config.characters)])
         self.world.hurries = self.steps < self._hurry
         seen = self.world.step(frames)
         self.steps += 1
@@ -160,6 +168,17 @@ class Live:
         self._latency += [done - arrived for line in packets.values() for arrived, _ in line[-1:]]
         return seen
 
+    def _reads(self, now_s: float) -> float:
+        """When people are read: a step later than the last time, whenever the step comes, so that a slow
+        machine makes slow motion and no leaps; what is behind is caught up with gently."""
+        period = 1.0 / self.rate_hz
+        if self._read is None or abs(now_s - self._read) > GIVES_UP_S:
+            self._read = now_s
+        else:
+            behind = now_s - self._read - period
+            self._read += period * (1.0 + min(max(0.1 * behind / period, -CATCHES_UP), CATCHES_UP))
+        return self._read
+
     def _frame(self, k: int, now_s: float) -> Tensor:
         """The newest frame that character k's goal knows."""
         character, person = self.world.characters[k], self.people.of(k)
@@ -172,14 +191,18 @@ class Live:
             if pose is not None:
                 if pose.jumped:
                     character.jump()
-                qpos = tensor(self._noisy(person.onto(pose.root_pos, pose.rot)))
+                qpos = tensor(self._noisy(k, person.onto(pose.root_pos, pose.rot)))
         return character.next(qpos, self.world.body(k), self.world.lead[k])
 
-    def _noisy(self, qpos: np.ndarray) -> np.ndarray:
+    def _noisy(self, k: int, qpos: np.ndarray) -> np.ndarray:
         size = self.config.noise
         if size:
-            qpos[7:] += self._rng.normal(0.0, 0.1 * size, len(qpos) - 7)
-            qpos[:3] += self._rng.normal(0.0, 0.03 * size, 3)
+            # x' = a x + sqrt(1 - a^2) e: errors that wander, as those of estimators do.
+            a = np.exp(-1.0 / (WANDERS_S * self.rate_hz))
+            drawn = self._rng.normal(0.0, 1.0, len(qpos))
+            self._errors[k] = a * self._errors.get(k, drawn) + np.sqrt(1.0 - a * a) * drawn
+            qpos[7:] += 0.1 * size * self._errors[k][7:]
+            qpos[:3] += 0.03 * size * self._errors[k][:3]
         return qpos
 
     def _calibration(self, packet: Packet, clip: Clip) -> OntoBody | str:

@@ -200,6 +200,8 @@ class PageServer:
         no = self.guard.admits(request.path, headers)
         if no is not None:
             return _response(no[0], no[1].encode() + b"\n", "text/plain")
+        if request.method != "GET":
+            return _response(405, b"Only GET is known here.\n", "text/plain")
         path = urlsplit(request.path).path
         if path in DOORS:
             return None
