@@ -171,13 +171,14 @@ class Live:
     def _reads(self, now_s: float) -> float:
         """When people are read: a step later than the last time, whenever the step comes, so that a slow
         machine makes slow motion and no leaps; what is behind is caught up with gently."""
-        period = 1.0 / self.rate_hz
-        if self._read is None or abs(now_s - self._read) > GIVES_UP_S:
-            self._read = now_s
+        period, read = 1.0 / self.rate_hz, self._read
+        if read is None or abs(now_s - read) > GIVES_UP_S:
+            read = now_s
         else:
-            behind = now_s - self._read - period
-            self._read += period * (1.0 + min(max(0.1 * behind / period, -CATCHES_UP), CATCHES_UP))
-        return self._read
+            share = 0.1 * (now_s - read - period) / period
+            read += period * (1.0 + min(max(share, -CATCHES_UP), CATCHES_UP))
+        self._read = read
+        return read
 
     def _frame(self, k: int, now_s: float) -> Tensor:
         """The newest frame that character k's goal knows."""
