@@ -9,10 +9,11 @@ MINUTES ?= 1.2
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
 
 .DEFAULT_GOAL := help
-.PHONY: help install dev demo test check format bench docs clean
+.PHONY: help install dev demo live test check format bench docs clean
 
 help:
 	@echo "make demo    install into $(VENV), train on a walk for $(MINUTES) minutes, write demo/"
+	@echo "make live    install into $(VENV), show a character in the browser that can be pushed"
 	@echo "make test    run the tests"
 	@echo "make check   lint, formatting, types, order of imports"
 	@echo "make format  mend formatting and simple lint"
@@ -43,6 +44,9 @@ demo: $(VENV)/.installed
 	@echo "The report:               demo/report.html (open it in a browser)"
 	@echo "The simulated motion:     demo/simulated.bvh"
 	@echo "The score card:           demo/score.json"
+
+live: $(VENV)/.installed
+	$(BIN)/poise live --open
 
 # Two at once: fixtures of a file are made once.
 test: $(VENV)/.dev

@@ -62,6 +62,11 @@ def _shortened(line: str) -> list[str]:
         argv += ["--adapt", "0", "--budget", "40", "--threads", "1"]
     if argv[:2] == ["train", "inbetween"]:
         argv += ["--iterations", "1", "--threads", "1"]
+    if argv[0] == "live":
+        if "--seconds" in argv:
+            at = argv.index("--seconds")
+            del argv[at : at + 2]
+        argv += ["--seconds", "3", "--port", "0"]
     if "--preset" in argv:
         argv += ["--ppo.horizon", "8"]
     if argv[0] == "fleet":

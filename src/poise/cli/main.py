@@ -31,6 +31,7 @@ VERBS = {
     "complete": "from keyframes to a body: fill the frames, and let a character do them",
     "track": "let a trained policy do any motion, without training",
     "push": "a motion with a push in it: the character gives way and comes back",
+    "live": "streams of motion in, characters in a browser out: push them, they get up",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",

@@ -18,7 +18,7 @@ than it tells: a clip its frames, a stream or a generator what it knows.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -194,12 +194,13 @@ class Lookahead:
         self._shape = 1.0 - left.clamp_min(0) / max(1, c.horizon - c.hold_steps)
         self._rng = torch.Generator().manual_seed(c.seed)
         self._env: ImitationEnv | None = None
+        self._only: frozenset[int] | None = None
         self._worlds: list[_World] = []
         self.seconds: list[float] = []
 
-    def watch(self, env: ImitationEnv) -> None:
-        """Acts in the worlds of `env` from now on."""
-        self._env = env
+    def watch(self, env: ImitationEnv, worlds: Collection[int] | None = None) -> None:
+        """Acts in the worlds of `env` from now on, and looks ahead in some of them, all for None."""
+        self._env, self._only = env, None if worlds is None else frozenset(worlds)
         self._worlds = [_World() for _ in range(env.num_envs)]
         self._rng.manual_seed(self.config.seed)
 
@@ -235,6 +236,8 @@ class Lookahead:
         offsets = torch.zeros(len(obs), env.num_actions)
         keep, much = torch.zeros(len(obs), 1), torch.ones(len(obs), 1)
         for i, world in enumerate(self._worlds):
+            if self._only is not None and i not in self._only:
+                continue
             if fresh[i]:
                 world.choice, world.past = None, []
             if world.choice is None or world.step == self.config.hold_steps:

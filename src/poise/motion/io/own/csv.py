@@ -47,6 +47,12 @@ def write_csv(clip: Clip, path: str | Path) -> None:
     Raises:
         PoiseError: the folder is missing or cannot be written to.
     """
+    write_whole(Path(path), csv_text(clip))
+
+
+def csv_text(clip: Clip, first: int = 0, header: bool = True) -> str:
+    """What `write_csv` writes; a recording is written in parts, from frame `first` on and without the
+    header, each of them a clip."""
     skeleton = clip.skeleton
     record = {
         "names": skeleton.names,
@@ -63,11 +69,12 @@ def write_csv(clip: Clip, path: str | Path) -> None:
         f"# source: {source_to_json(skeleton.source)}",
         ",".join(_quoted(name) for name in columns(skeleton)),
     ]
-    time = np.arange(clip.frames)[:, None] / clip.fps
+    lines = lines if header else []
+    time = (first + np.arange(clip.frames))[:, None] / clip.fps
     table = np.concatenate((time, clip.root_pos, clip.rot.reshape(clip.frames, -1)), 1)
     # The text of a list of floats holds each in the shortest form that reads back to the same bits.
     lines += [repr(row)[1:-1].replace(" ", "") for row in table.tolist()]
-    write_whole(Path(path), "\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
 
 
 def columns(skeleton: Skeleton) -> list[str]:

@@ -1,0 +1,120 @@
+"""A jitter buffer: poses that come at any rate, late, twice or never, read at even times."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from poise.live.quats import slerp
+
+#: s of the buffer that evens out how packets come; what is more of it may be looked ahead at.
+MARGIN_S = 0.05
+#: s in which motion that has stopped coming comes to rest: its velocity falls by e in each.
+FADE_S = 0.1
+#: m/s and m beyond which a person did not move but is elsewhere, or is another one.
+JUMP, LEAP_M = 12.0, 0.4
+#: Packets by which the way's shortest time is known, and those that are kept.
+SEEN, KEPT = 240, 320
+
+
+class Pose(NamedTuple):
+    """A pose that was read.
+
+    Attributes:
+        root_pos: `(3)` m.
+        rot: `(J, 4)` wxyz, local.
+        stale_s: for how long nothing has come.
+        jumped: whether the person is elsewhere since the pose that was read before.
+    """
+
+    root_pos: np.ndarray
+    rot: np.ndarray
+    stale_s: float
+    jumped: bool
+
+
+class _Frame(NamedTuple):
+    time_s: float
+    root_pos: np.ndarray
+    rot: np.ndarray
+    leaps: bool
+
+
+class JitterBuffer:
+    """The poses of one person.
+
+    A source's clock is its own; the shortest way that a packet took is when it was made. What is read at
+    `now` is as it was `min(delay_s, MARGIN_S)` before, so that with no delay at all motion is
+    extrapolated, and with one it is between two packets.
+
+    Args:
+        delay_s: s, 0 to 0.4; by what of it exceeds the margin, a goal lags behind what is read here.
+    """
+
+    def __init__(self, delay_s: float = 0.1):
+        self.delay_s = delay_s
+        self.late = self.jumps = 0
+        self._frames: deque[_Frame] = deque(maxlen=KEPT)
+        self._ways: deque[float] = deque(maxlen=SEEN)
+        self._way = 0.0
+        self._arrived = -np.inf
+        self._jumped = False
+
+    def add(self, time_s: float, arrived_s: float, root_pos: np.ndarray, rot: np.ndarray) -> None:
+        """One more packet; one that is older than those that came is put in its place."""
+        self._ways.append(arrived_s - time_s)
+        self._way = min(self._ways)
+        self._arrived = max(self._arrived, arrived_s)
+        frames = self._frames
+        if frames and time_s < frames[-1].time_s - 2.0:
+            # A source that began anew.
+            frames.clear()
+            self._ways.clear()
+            self._ways.append(arrived_s - time_s)
+            self._way = arrived_s - time_s
+        if frames and time_s <= frames[-1].time_s:
+            self.late += 1
+            return
+        leaps = False
+        if frames:
+            far = float(np.linalg.norm(root_pos - frames[-1].root_pos))
+            leaps = far > LEAP_M and far > JUMP * (time_s - frames[-1].time_s)
+            self.jumps += leaps
+            self._jumped |= leaps
+        frames.append(_Frame(time_s, root_pos, rot, leaps))
+
+    def read(self, now_s: float) -> Pose | None:
+        """The pose at `now_s` by the loop's clock; None before anything has come."""
+        frames = self._frames
+        if not frames:
+            return None
+        at = now_s - self._way - min(self.delay_s, MARGIN_S)
+        jumped, self._jumped = self._jumped, False
+        stale = max(0.0, now_s - self._arrived)
+        after = next((k for k in range(len(frames) - 1, -1, -1) if frames[k].time_s <= at), -1)
+        if after == len(frames) - 1:
+            return Pose(*self._beyond(at), stale, jumped)
+        if after < 0:
+            return Pose(frames[0].root_pos, frames[0].rot, stale, jumped)
+        a, b = frames[after], frames[after + 1]
+        if b.leaps:
+            return Pose(a.root_pos, a.rot, stale, jumped)
+        share = (at - a.time_s) / (b.time_s - a.time_s)
+        return Pose(
+            a.root_pos + share * (b.root_pos - a.root_pos), slerp(a.rot, b.rot, share), stale, jumped
+        )
+
+    def _beyond(self, at: float) -> tuple[np.ndarray, np.ndarray]:
+        """q_0 + v_0 tau (1 - e^(-t / tau)): where the motion goes on, and comes to rest."""
+        last = self._frames[-1]
+        if len(self._frames) < 2 or last.leaps:
+            return last.root_pos, last.rot
+        before = self._frames[-2]
+        dt = max(last.time_s - before.time_s, 1e-3)
+        if dt > 0.25:
+            return last.root_pos, last.rot
+        share = FADE_S * (1.0 - np.exp(-(at - last.time_s) / FADE_S)) / dt
+        root = last.root_pos + share * (last.root_pos - before.root_pos)
+        return root, slerp(before.rot, last.rot, 1.0 + share)

@@ -1,0 +1,200 @@
+"""What pages and programs may send, checked before anything else sees it: one JSON document a message,
+small, flat, of the kinds below and no others. The protocol is described in docs/live.md."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.live.packet import NAME
+from poise.motion import Skeleton
+
+#: Version of the protocol; bytes and depth of a message; joints of a skeleton.
+VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
+_MOST = 1e6
+
+
+def parse(text: str | bytes) -> dict[str, Any]:
+    """A message as a dictionary.
+
+    Raises:
+        PoiseError: too long, too deep, no JSON, no object, or of another version.
+    """
+    if len(text) > MOST_BYTES:
+        raise PoiseError("too long", "message")
+    try:
+        words = text.decode("utf-8") if isinstance(text, bytes) else text
+    except UnicodeDecodeError:
+        raise PoiseError("no UTF-8", "message") from None
+    _shallow(words)
+    try:
+        out = json.loads(words, parse_constant=_none)
+    except (ValueError, RecursionError):
+        raise PoiseError("no JSON", "message") from None
+    if not isinstance(out, dict):
+        raise PoiseError("no object", "message")
+    if out.get("v") != VERSION:
+        raise PoiseError("other version", "message", f'Say "v": {VERSION}')
+    return out
+
+
+def _none(word: str) -> float:
+    """NaN and infinity are no JSON; where they are sent all the same they are seen as what they are."""
+    return float(word)
+
+
+def _shallow(text: str) -> None:
+    depth, quoted, skip = 0, False, False
+    for c in text:
+        if skip:
+            skip = False
+        elif quoted:
+            skip, quoted = c == "\\", c != '"'
+        elif c == '"':
+            quoted = True
+        elif c in "[{":
+            depth += 1
+            if depth > DEPTH:
+                raise PoiseError("too deep", "message")
+        elif c in "]}":
+            depth -= 1
+
+
+def number(value: Any, low: float = -_MOST, high: float = _MOST) -> float:
+    """A finite number within bounds."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise PoiseError("no number", "message")
+    try:
+        out = float(value)
+    except OverflowError:
+        raise PoiseError("not finite", "message") from None
+    if not math.isfinite(out):
+        raise PoiseError("not finite", "message")
+    if not low <= out <= high:
+        raise PoiseError("out of range", "message")
+    return out
+
+
+def whole(value: Any, high: int = 1024) -> int:
+    """A whole number from 0 to `high`."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= high:
+        raise PoiseError("no index", "message")
+    return value
+
+
+def triple(value: Any) -> list[float]:
+    """Three numbers."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise PoiseError("no point", "message")
+    return [number(v) for v in value]
+
+
+def name(value: Any) -> str:
+    """A short word."""
+    if not isinstance(value, str) or not 0 < len(value) <= NAME or not value.isprintable():
+        raise PoiseError("no name", "message")
+    return value
+
+
+def flag(value: Any) -> bool:
+    """True or false."""
+    if not isinstance(value, bool):
+        raise PoiseError("no flag", "message")
+    return value
+
+
+def _maybe(value: Any) -> str | None:
+    return None if value is None else name(value)
+
+
+_CHARACTER: dict[str, Callable[[Any], Any]] = {"character": lambda v: whole(v, 15)}
+#: Fields of each kind of command, all of them needed but for those of "set".
+COMMANDS: dict[str, Mapping[str, Callable[[Any], Any]]] = {
+    "pull": {**_CHARACTER, "body": lambda v: whole(v, 255), "point": triple, "to": triple},
+    "release": _CHARACTER,
+    "knock": _CHARACTER,
+    "ball": _CHARACTER,
+    "pause": {"on": flag},
+    "record": {"on": flag},
+    "follow": {**_CHARACTER, "person": _maybe},
+    "set": {
+        "buffer": lambda v: number(v, 0.0, 0.4),
+        "noise": lambda v: number(v, 0.0, 1.0),
+        "lookahead": lambda v: whole(v, 16),
+    },
+}
+
+
+def command(message: Mapping[str, Any]) -> dict[str, Any]:
+    """A command with its fields alone.
+
+    Raises:
+        PoiseError: an unknown kind, or a field that is missing, unknown or wrong.
+    """
+    kind = message.get("type")
+    if not isinstance(kind, str) or kind not in COMMANDS:
+        raise PoiseError("unknown type", "message")
+    fields = COMMANDS[kind]
+    given = {k: v for k, v in message.items() if k not in ("v", "type")}
+    if given.keys() - fields.keys() or (kind != "set" and fields.keys() - given.keys()):
+        raise PoiseError("other fields", "message")
+    return {"type": kind, **{k: fields[k](v) for k, v in given.items()}}
+
+
+def numbers(value: Any, width: int, most: int) -> np.ndarray:
+    """Rows of `width` numbers, `(n, width)`; NaN and infinity pass, and are refused as a packet."""
+    if not isinstance(value, list) or not 0 < len(value) <= most:
+        raise PoiseError("no rows", "message")
+    for row in value:
+        if not isinstance(row, list) or len(row) != width:
+            raise PoiseError("no rows", "message")
+        if any(isinstance(x, bool) or not isinstance(x, int | float) for x in row):
+            raise PoiseError("no number", "message")
+    try:
+        return np.array(value, dtype=float)
+    except OverflowError:
+        raise PoiseError("not finite", "message") from None
+
+
+def skeleton_of(message: Mapping[str, Any]) -> Skeleton:
+    """The skeleton in a message, Z up.
+
+    Raises:
+        PoiseError: no such skeleton.
+    """
+    names, parents = message.get("names"), message.get("parents")
+    if not isinstance(names, list) or not 0 < len(names) <= JOINTS:
+        raise PoiseError("no names", "message")
+    words = tuple(name(n) for n in names)
+    if not isinstance(parents, list) or len(parents) != len(words):
+        raise PoiseError("no parents", "message")
+    up = [-1 if p == -1 and not isinstance(p, bool) else whole(p, len(words)) for p in parents]
+    offsets = numbers(message.get("offsets"), 3, JOINTS)
+    if len(offsets) != len(words) or not np.abs(offsets).max() < 100.0:
+        raise PoiseError("no offsets", "message")
+    try:
+        return Skeleton(words, tuple(up), turned(offsets, vertical(message)))
+    except PoiseError:
+        raise PoiseError("no skeleton", "message") from None
+
+
+def vertical(message: Mapping[str, Any]) -> str:
+    """The message's vertical."""
+    up = message.get("up", "Z")
+    if up not in ("Y", "Z"):
+        raise PoiseError("no vertical", "message")
+    return str(up)
+
+
+def turned(values: np.ndarray, up: str) -> np.ndarray:
+    """Points `(..., 3)` or rotations `(..., 4)` of a right-handed world, Z up: (x, y, z) of Y up is
+    (z, x, y) of Z up."""
+    if up == "Z":
+        return values
+    head, tail = values[..., :-3], values[..., -3:]
+    return np.concatenate((head, tail[..., [2, 0, 1]]), -1)

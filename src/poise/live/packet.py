@@ -1,0 +1,113 @@
+"""What a source sends: one pose of one person at one time, and the box in which the loop finds them."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.live.quats import normalized
+from poise.motion import Clip, Skeleton
+
+#: Packets of one person that wait at most; the newest win.
+WAIT = 64
+#: People of all sources together.
+PEOPLE = 32
+#: m from the origin beyond which nothing is believed.
+FAR_M = 1000.0
+#: Letters of a person's name.
+NAME = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Packet:
+    """One pose; metres, Z up, right-handed.
+
+    Attributes:
+        person: a name that stays the same as long as it is the same person.
+        time_s: when the pose was, by the source's own clock.
+        skeleton: its joints; the same object as long as it does not change.
+        root_pos: `(3)` m, the root joint in the world.
+        rot: `(J, 4)` wxyz, each joint's rotation in its parent's frame, the root's in the world.
+        whole: a clip that shows how the skeleton stands, where there is one; else the first seconds do.
+    """
+
+    person: str
+    time_s: float
+    skeleton: Skeleton
+    root_pos: np.ndarray
+    rot: np.ndarray
+    whole: Clip | None = None
+
+
+def checked(packet: Packet) -> Packet:
+    """The packet with unit rotations.
+
+    Raises:
+        PoiseError: numbers that are not finite, rotations that are none, or a place beyond `FAR_M`.
+    """
+    if packet.root_pos.shape != (3,) or packet.rot.shape != (len(packet.skeleton), 4):
+        raise PoiseError("shape", packet.person)
+    if not np.isfinite(packet.time_s) or not np.isfinite(packet.root_pos).all():
+        raise PoiseError("not finite", packet.person)
+    norms = np.linalg.norm(packet.rot, axis=-1)
+    if not np.isfinite(norms).all():
+        raise PoiseError("not finite", packet.person)
+    if norms.min() < 0.5 or norms.max() > 2.0:
+        raise PoiseError("no rotation", packet.person)
+    if np.abs(packet.root_pos).max() > FAR_M:
+        raise PoiseError("too far away", packet.person)
+    if not 0 < len(packet.person) <= NAME:
+        raise PoiseError("name", packet.person[:NAME])
+    rot = normalized(packet.rot)
+    return Packet(packet.person, packet.time_s, packet.skeleton, packet.root_pos, rot, packet.whole)
+
+
+class Inbox:
+    """Packets on their way from the sources' threads to the loop; neither waits for the other.
+
+    Attributes:
+        received: packets that were taken.
+        refused: how many were not, by the reason.
+        crowded: packets that a newer one pushed out before the loop came.
+    """
+
+    def __init__(self) -> None:
+        self.received, self.crowded = 0, 0
+        self.refused: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._waiting: dict[str, deque[tuple[float, Packet]]] = {}
+
+    def refuse(self, reason: str) -> None:
+        """Counts something that is no packet."""
+        with self._lock:
+            self.refused[reason] += 1
+
+    def offer(self, packet: Packet, arrived_s: float) -> bool:
+        """Takes a packet that came at `arrived_s` by the loop's clock; False: it was refused."""
+        try:
+            good = checked(packet)
+        except PoiseError as problem:
+            self.refuse(problem.what)
+            return False
+        with self._lock:
+            line = self._waiting.get(good.person)
+            if line is None:
+                if len(self._waiting) >= PEOPLE:
+                    self.refused["too many people"] += 1
+                    return False
+                line = self._waiting[good.person] = deque(maxlen=WAIT)
+            self.crowded += len(line) == WAIT
+            line.append((arrived_s, good))
+            self.received += 1
+        return True
+
+    def take(self) -> dict[str, list[tuple[float, Packet]]]:
+        """All that wait, by person, each with the time at which it came."""
+        with self._lock:
+            out = {name: list(line) for name, line in self._waiting.items() if line}
+            self._waiting.clear()
+        return out

@@ -1,0 +1,215 @@
+"""Frame by frame from one skeleton onto another, in a fraction of a millisecond.
+
+It is `kin.retarget.Passage.transfer` without the planting of feet, which needs what comes later; the
+tests hold the two together.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from poise.body import BodyTable
+from poise.kin.retarget.passage import Passage, _places
+from poise.live import quats as q
+from poise.motion import Clip, Skeleton
+from poise.motion.joint_map import SHARED
+from poise.motion.roles import SIDES
+
+
+class _Chain(NamedTuple):
+    """Turns of a target's chain: between two of the source's turns, by their rows, -1 for none."""
+
+    joint: int
+    low: int
+    high: int
+    share: float
+
+
+class FramePassage:
+    """A clip's skeleton onto another one.
+
+    Args:
+        clip: shows how the source stands.
+        onto: a clip on the target's skeleton, which shows how that stands.
+        scale: of the path, by default the ratio of the heights of the hips.
+    """
+
+    def __init__(self, clip: Clip, onto: Clip, scale: float | None = None):
+        p = Passage.between(clip, onto, None, None, scale)
+        self.source, self.target = clip.skeleton, onto.skeleton
+        self.factor, self.centre = p.scale.factor, np.array(p.scale.centre)
+        self._here, self._there = np.array(p.here.rot), np.array(p.there.rot)
+        self._direct = {b: a for a, b in p.joints.direct}
+        hips = p.joints.target.joint("hips")
+        self._above = set(self.target.ancestors(hips if hips is not None else 0))
+        self._above_rot = np.array(p.there.above)
+        self._chains = {c.joint: c for c in _chains(p)}
+        self._rest = {
+            j: q.between(self._there[parent], self._there[j])
+            for j, parent in enumerate(self.target.parents)
+            if parent >= 0
+        }
+        pairs = [p.joints.limb_pair(f"{s}_thigh") for s in SIDES]
+        self._thighs = [x for x in pairs if x is not None]
+        self._paths = [
+            [(*skeleton.ancestors(j)[::-1], j) for j in joints]
+            for skeleton, joints in (
+                (self.source, [a for a, _ in self._thighs]),
+                (self.target, [b for _, b in self._thighs]),
+            )
+        ]
+
+    def __call__(self, root_pos: np.ndarray, rot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The target's root `(3)` m and world rotations `(J, 4)` for a pose of the source."""
+        return self.turned(root_pos, world_of(self.source, rot))
+
+    def turned(self, root_pos: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for world rotations `(J, 4)` of the source."""
+        turned = q.mul(world, q.conj(self._here))
+        out = np.empty((len(self.target), 4))
+        direct = np.array(list(self._direct), dtype=int)
+        out[direct] = q.mul(turned[list(self._direct.values())], self._there[direct])
+        chains = list(self._chains.values())
+        if chains:
+            low = np.stack([turned[c.low] for c in chains])
+            high = np.stack([turned[c.high] for c in chains])
+            at = np.array([c.joint for c in chains])
+            shares = np.array([c.share for c in chains])
+            out[at] = q.mul(q.slerp(low, high, shares), self._there[at])
+        for j, parent in enumerate(self.target.parents):
+            if j in self._direct or j in self._chains:
+                continue
+            if j in self._above:
+                own = self._above_rot[j]
+                out[j] = own if parent < 0 else q.mul(out[parent], own)
+            else:
+                out[j] = q.mul(out[parent], self._rest[j])
+        out = q.normalized(out)
+        middle = self._middle(0, root_pos, world)
+        root = middle + (self.factor - 1.0) * (middle - self.centre) - self._middle(1, np.zeros(3), out)
+        return root, out
+
+    def _middle(self, side: int, root: np.ndarray, world: np.ndarray) -> np.ndarray:
+        """The middle between the hip joints of the source (0) or target (1)."""
+        skeleton = (self.source, self.target)[side]
+        ends = [place_of(skeleton, path, root, world) for path in self._paths[side]]
+        return sum(ends) / 2  # type: ignore[return-value]
+
+
+def world_of(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
+    """World rotations `(J, 4)` of local ones."""
+    out = rot.copy()
+    for j, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            out[j] = q.mul(out[parent], rot[j])
+    return out
+
+
+def local_of(skeleton: Skeleton, world: np.ndarray) -> np.ndarray:
+    """Local rotations `(J, 4)` of those in the world."""
+    parents = np.array(skeleton.parents)
+    out = q.between(world[np.maximum(parents, 0)], world)
+    out[0] = world[0]
+    return out
+
+
+def place_of(
+    skeleton: Skeleton, path: tuple[int, ...], root: np.ndarray, world: np.ndarray
+) -> np.ndarray:
+    """m, where the last joint of a path from the root is."""
+    out = root
+    for a, b in pairwise(path):
+        out = out + q.rotate(world[a], skeleton.offsets[b])
+    return out
+
+
+def _chains(p: Passage) -> list[_Chain]:
+    """Spine, neck and head, as `kin.retarget.passage` shares their bend out."""
+    joints, out = p.joints, list[_Chain]()
+    hips = joints.source.joint("hips")
+    carrier = chest = hips if hips is not None else 0
+    for kinds in (SHARED[:1], SHARED[1:]):
+        source = tuple(x for k in kinds for x in joints.source.chain(k))
+        target = tuple(x for k in kinds for x in joints.target.chain(k))
+        if not source and kinds != SHARED[:1]:
+            continue
+        knots = [(0.0, carrier), *zip(_places(p.here, source), source, strict=True)]
+        for j, at in zip(target, _places(p.there, target), strict=True):
+            out.append(_between(j, knots, at))
+        chest = knots[-1][1]
+        carrier = chest
+    return out
+
+
+def _between(joint: int, knots: list[tuple[float, int]], at: float) -> _Chain:
+    for (a, low), (b, high) in pairwise(knots):
+        if at <= b + 1e-9:
+            share = 1.0 if b - a < 1e-9 else min(max((at - a) / (b - a), 0.0), 1.0)
+            return _Chain(joint, low, high, share)
+    return _Chain(joint, knots[-1][1], knots[-1][1], 1.0)
+
+
+class Hinges:
+    """A body's coordinates of one frame, its hinges continuous from one frame to the next.
+
+    The naive twin is `kin.clip_to_qpos`, which knows all frames.
+    """
+
+    def __init__(self, skeleton: Skeleton, table: BodyTable):
+        self.skeleton, self.rows = skeleton, table.rows
+        pelvis = self.rows[0].joint
+        self._pelvis = (*skeleton.ancestors(pelvis)[::-1], pelvis)
+        driven = [r for r in self.rows[1:] if r.order]
+        self._joints = np.array([r.joint for r in driven])
+        self._anchors = np.array([self.rows[r.parent].joint for r in driven])
+        self._rest = np.array([r.quat for r in driven])
+        self._frame = np.array([r.frame for r in driven])
+        self._euler, self._single, column = list[tuple[int, ...]](), list[tuple[int, int, int]](), 0
+        for k, row in enumerate(driven):
+            n = len(row.order)
+            if n == 1:
+                self._single.append((k, "XYZ".index(row.order), column))
+            else:
+                order = row.order
+                if n == 2:
+                    order = order[0] + next(c for c in "XYZ" if c not in order) + order[1]
+                i, j, l_ = ("XYZ".index(c) for c in order)
+                self._euler.append((k, i, j, l_, column, n))
+            column += n
+        self.count = column
+
+    def __call__(self, root: np.ndarray, world: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+        """`(7 + n)` for the root `(3)` m and the world rotations of all joints.
+
+        before: `(n)` rad, the hinges of the frame before; None takes those nearest to 0.
+        """
+        out = np.empty(7 + self.count)
+        out[:3] = place_of(self.skeleton, self._pelvis, root, world)
+        out[3:7] = world[self._pelvis[-1]]
+        rel = q.between(world[self._anchors], world[self._joints])
+        local = q.mul(q.between(self._frame, q.between(self._rest, rel)), self._frame)
+        m, angles = q.matrix(local), np.zeros(self.count)
+        last = np.zeros(self.count) if before is None else before
+        for k, axis, at in self._single:
+            angles[at] = 2.0 * np.arctan2(local[k, 1 + axis], local[k, 0])
+        for k, i, j, l_, at, n in self._euler:
+            e = 1.0 if (j - i) % 3 == 1 else -1.0
+            b = np.arcsin(np.clip(e * m[k, i, l_], -1.0, 1.0))
+            a = np.arctan2(-e * m[k, j, l_], m[k, l_, l_])
+            c = np.arctan2(-e * m[k, i, j], m[k, i, i])
+            if n == 2:
+                angles[at : at + 2] = a, c
+                continue
+            first, second = np.array([a, b, c]), np.array([a + np.pi, np.pi - b, c + np.pi])
+            here = last[at : at + 3]
+            near = [np.square(_wrapped(x - here)).sum() for x in (first, second)]
+            angles[at : at + 3] = first if near[0] <= near[1] else second
+        out[7:] = last + _wrapped(angles - last)
+        return out
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi

@@ -1,0 +1,114 @@
+"""A live session: sources, loop, page and sinks joined, and ended together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from poise.jobs.tracker import Tracker
+from poise.live.loop import Live, LiveConfig
+from poise.live.packet import Inbox
+from poise.live.page.guard import Guard
+from poise.live.page.server import PageServer
+from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
+from poise.live.sinks.record import Recorder
+from poise.live.sinks.vmc import Puppet, VmcSink
+from poise.live.sources.file import FileSource
+from poise.live.sources.vmc import VmcSource
+from poise.motion import Clip
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a session is made of.
+
+    Attributes:
+        clips: played as people, by their names.
+        vmc: UDP port on which VMC is listened for, None for none.
+        vmc_out: HOST:PORT to which the first character is sent as VMC.
+        record: where recordings go.
+        host: address of the page.
+        port: of the page, 0 for a free one.
+        token: that strangers must know.
+        records: whether it records from the start.
+    """
+
+    clips: Mapping[str, Clip] = field(default_factory=dict)
+    vmc: int | None = None
+    vmc_out: str | None = None
+    record: Path = Path("live.bvh")
+    host: str = "127.0.0.1"
+    port: int = 0
+    token: str | None = None
+    records: bool = False
+
+
+class Session:
+    """Runs until it is closed.
+
+    Raises:
+        PoiseError: a port that is taken, a policy that cannot get up, a format that cannot be written.
+    """
+
+    def __init__(self, tracker: Tracker, config: LiveConfig, wanted: Wanted):
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="poise-live")
+        self.inbox, clock = Inbox(), time.perf_counter
+        self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock)
+        world = self.live.world
+        self.recorder = Recorder(
+            wanted.record, world.humanoid.table, tracker.example, world.count, world.rate_hz
+        )
+        self.recorded: list[Path] = []
+        self.last: dict[str, Any] = {}
+        self.live.recording = self._record
+        hello = hello_of(world, {"records": True})
+        guard = Guard(wanted.host, wanted.port, wanted.token)
+        self.server = PageServer(
+            guard, hello, self.inbox, self.live.commands.append, self.figures, clock
+        )
+        self.live.shows += [ShowPage(self.server), ShowRecorder(self.recorder)]
+        self.files = FileSource(dict(wanted.clips), self.inbox, clock)
+        self.vmc = None if wanted.vmc is None else VmcSource(wanted.host, wanted.vmc, self.inbox, clock)
+        self.sink = None
+        if wanted.vmc_out is not None:
+            self.sink = VmcSink(wanted.vmc_out, Puppet(world.humanoid.table, tracker.example))
+            self.live.shows.append(ShowVmc(self.sink))
+        self.files.start()
+        if self.vmc is not None:
+            self.vmc.start()
+        if wanted.records:
+            self.recorder.start()
+
+    def figures(self) -> dict[str, Any]:
+        """Those of the loop, and what is recorded."""
+        more = {"recording": self.recorder.on, "recorded": [p.name for p in self.recorded[-4:]]}
+        return {**self.live.figures(), **more}
+
+    def run(self, until_s: float | None = None) -> None:
+        """Steps in real time, until a moment of `time.perf_counter` where one is given."""
+        self.live.run(lambda: until_s is not None and time.perf_counter() >= until_s)
+
+    def close(self) -> list[Path]:
+        """Ends everything; the files of the recordings."""
+        self.last = self.figures()
+        self.files.close()
+        if self.vmc is not None:
+            self.vmc.close()
+        if self.sink is not None:
+            self.sink.close()
+        self.server.close()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self.recorded += self.recorder.stop()
+        self.live.close()
+        return self.recorded
+
+    def _record(self, on: bool) -> None:
+        if on:
+            self.recorder.start()
+        else:
+            # Files are written beside the loop.
+            self._pool.submit(lambda: self.recorded.extend(self.recorder.stop()))

@@ -1,0 +1,51 @@
+"""JSON messages of one connection as packets: a skeleton once, then poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from poise.errors import PoiseError
+from poise.live.commands import JOINTS, name, number, numbers, parse, skeleton_of, turned, vertical
+from poise.live.packet import PEOPLE, Inbox, Packet
+from poise.motion import Skeleton
+
+
+class JsonStream:
+    """What one connection sends, see docs/live.md.
+
+    Args:
+        inbox: where packets go; what is refused is counted there.
+        own: what is put before the names of people, so that connections keep apart.
+    """
+
+    def __init__(self, inbox: Inbox, own: str = ""):
+        self.inbox, self._own = inbox, own
+        self._skeletons: dict[str, tuple[Skeleton, str]] = {}
+
+    def receive(self, text: str | bytes, arrived_s: float) -> str | None:
+        """Takes a message; the reason, if it was refused."""
+        try:
+            self._take(parse(text), arrived_s)
+        except PoiseError as problem:
+            self.inbox.refuse(problem.what)
+            return problem.what
+        return None
+
+    def _take(self, message: Mapping[str, Any], arrived_s: float) -> None:
+        kind, person = message.get("type"), name(message.get("person", "person"))
+        if kind == "skeleton":
+            if person not in self._skeletons and len(self._skeletons) >= PEOPLE:
+                raise PoiseError("too many people", "message")
+            self._skeletons[person] = skeleton_of(message), vertical(message)
+            return
+        if kind != "pose":
+            raise PoiseError("unknown type", "message")
+        if person not in self._skeletons:
+            raise PoiseError("no skeleton yet", "message")
+        skeleton, up = self._skeletons[person]
+        time_s = number(message["time"]) if "time" in message else arrived_s
+        root = numbers([message.get("root")], 3, 1)[0]
+        rot = numbers(message.get("rotations"), 4, JOINTS)
+        packet = Packet((self._own + person)[:64], time_s, skeleton, turned(root, up), turned(rot, up))
+        self.inbox.offer(packet, arrived_s)

@@ -1,0 +1,182 @@
+"""VMC over UDP: what avatar tools send of their avatars' bones."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from poise.errors import PoiseError
+from poise.live import quats as q
+from poise.live.packet import Inbox, Packet
+from poise.live.sources.osc import MOST, Message, messages
+from poise.live.vrm import PARENTS, from_unity, skeleton_of
+from poise.motion import Skeleton
+
+#: Senders at once; datagrams a second of all, beyond which they are left out.
+SENDERS, RATE = 16, 4000
+#: m by which a bone's place may change before it is another avatar.
+GROWS_M = 0.005
+
+
+class Avatar:
+    """The bones of one sender, as they come in datagrams of any size.
+
+    A frame is whole when all bones of the frame before are there, or when a bone comes again.
+    """
+
+    def __init__(self, person: str):
+        self.person = person
+        self.skeleton: Skeleton | None = None
+        self._bones: dict[str, np.ndarray] = {}
+        self._known: frozenset[str] = frozenset()
+        self._root = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        # The time that was told last, and that of the frame that is coming in.
+        self._told: float | None = None
+        self._time: float | None = None
+
+    def take(self, parts: list[Message], now_s: float) -> list[Packet]:
+        """The poses that a datagram makes whole.
+
+        Raises:
+            PoiseError: a message of VMC with other arguments, numbers that are none, or bones missing.
+        """
+        out = list[Packet]()
+        for address, arguments in parts:
+            if address == "/VMC/Ext/Bone/Pos":
+                bone, values = _transform(arguments)
+                if bone not in PARENTS:
+                    continue
+                if bone in self._bones:
+                    out += self._whole(now_s)
+                if not self._bones:
+                    self._time, self._told = self._told, None
+                self._bones[bone] = values
+            elif address == "/VMC/Ext/Root/Pos":
+                self._root = _transform(arguments)[1]
+            elif address == "/VMC/Ext/T" and len(arguments) == 1 and isinstance(arguments[0], float):
+                self._told = arguments[0]
+        if self._known and self._known <= self._bones.keys():
+            out += self._whole(now_s)
+        return out
+
+    def _whole(self, now_s: float) -> list[Packet]:
+        bones, self._bones = self._bones, {}
+        time_s = self._time
+        skeleton, pos, rot = self._body(bones)
+        self._known = frozenset(bones)
+        root_pos, root_rot = from_unity(self._root[:3], self._root[3:])
+        root_rot = q.normalized(root_rot)
+        rot[0] = q.mul(root_rot, rot[0])
+        place = root_pos + q.rotate(root_rot, pos[0])
+        # A clock that stands still is none.
+        at = now_s if time_s is None or not np.isfinite(time_s) or time_s <= 0 else time_s
+        return [Packet(self.person, at, skeleton, place, rot)]
+
+    def _body(self, bones: Mapping[str, np.ndarray]) -> tuple[Skeleton, np.ndarray, np.ndarray]:
+        names = [bone for bone in PARENTS if bone in bones]
+        values = np.array([bones[bone] for bone in names])
+        pos, rot = from_unity(values[:, :3], values[:, 3:])
+        norms = np.linalg.norm(rot, axis=-1, keepdims=True)
+        if not (norms > 0.5).all() or not (norms < 2.0).all():
+            raise PoiseError("no rotation", "VMC")
+        old = self.skeleton
+        if old is None or list(old.names) != names or np.abs(old.offsets[1:] - pos[1:]).max() > GROWS_M:
+            self.skeleton = skeleton_of(dict(zip(names, pos, strict=True)))
+        assert self.skeleton is not None
+        return self.skeleton, pos, rot / norms
+
+
+def _transform(arguments: tuple[object, ...]) -> tuple[str, np.ndarray]:
+    """Name, and place and rotation as `(7)`."""
+    if len(arguments) < 8 or not isinstance(arguments[0], str):
+        raise PoiseError("other arguments", "VMC")
+    numbers = arguments[1:8]
+    if not all(isinstance(x, float) for x in numbers):
+        raise PoiseError("no number", "VMC")
+    out = np.array(numbers, dtype=float)
+    if not np.isfinite(out).all():
+        raise PoiseError("not finite", "VMC")
+    if np.abs(out).max() > 1000.0:
+        raise PoiseError("too far away", "VMC")
+    return arguments[0], out
+
+
+class VmcSource:
+    """Listens for VMC and puts poses into an inbox; each sender is a person.
+
+    Raises:
+        PoiseError: the port is taken.
+    """
+
+    def __init__(self, host: str, port: int, inbox: Inbox, clock: Callable[[], float]):
+        self.inbox, self.clock = inbox, clock
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((host, port))
+        except OSError as problem:
+            self._socket.close()
+            what = f"cannot listen for VMC on {host}:{port}: {problem.strerror}"
+            raise PoiseError(what, hint="Give another --vmc port") from problem
+        self._socket.settimeout(0.2)
+        self.port: int = self._socket.getsockname()[1]
+        self._avatars: dict[tuple[str, int], tuple[Avatar, float]] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+
+    def start(self) -> None:
+        """Begins to listen."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stops."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
+        self._socket.close()
+
+    def _listen(self) -> None:
+        second, count = time.monotonic(), 0
+        while not self._stop.is_set():
+            try:
+                data, sender = self._socket.recvfrom(MOST)
+            except TimeoutError:
+                continue
+            except OSError:
+                if self._stop.is_set():
+                    return
+                continue
+            now = time.monotonic()
+            if now - second > 1.0:
+                second, count = now, 0
+            count += 1
+            if count > RATE:
+                self.inbox.refuse("too many datagrams")
+                continue
+            self.receive(data, (sender[0], sender[1]))
+
+    def receive(self, data: bytes, sender: tuple[str, int]) -> None:
+        """Takes a datagram."""
+        now = self.clock()
+        try:
+            parts = messages(data)
+            avatar = self._avatar(sender, now)
+            for packet in avatar.take(parts, now):
+                self.inbox.offer(packet, now)
+        except PoiseError as problem:
+            self.inbox.refuse(problem.what)
+
+    def _avatar(self, sender: tuple[str, int], now: float) -> Avatar:
+        known = self._avatars.get(sender)
+        if known is None:
+            for old in [s for s, (_, at) in self._avatars.items() if now - at > 30.0]:
+                del self._avatars[old]
+            if len(self._avatars) >= SENDERS:
+                raise PoiseError("too many senders", "VMC")
+            known = (Avatar(f"vmc {sender[0]}:{sender[1]}"), now)
+        self._avatars[sender] = (known[0], now)
+        return known[0]

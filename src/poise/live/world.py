@@ -1,0 +1,259 @@
+"""Characters of one policy in one world, each with a stream for a goal; they can be pushed, and a ball
+falls on them."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.env.goals import StreamGoal
+from poise.env.recovery.get_up import GetUpPlanner
+from poise.errors import PoiseError
+from poise.jobs.track.controllers import look_ahead
+from poise.jobs.track.placement import place
+from poise.jobs.track.tracking import imitation_of
+from poise.jobs.tracker import Tracker
+from poise.live.character import Body, Character
+from poise.plan import LookaheadConfig
+from poise.sim import Character as Actor
+from poise.sim import CharacterRows, Scene, SceneSim, alone
+from poise.sim.props import Ball
+
+#: m between characters at first, and where the ball waits.
+APART_M, AWAY = 2.0, (0.0, 400.0, 0.15)
+#: N/m and N s/m of the hand that drags a body, and N that it exerts at most.
+PULL, DAMP, MOST_N = 400.0, 40.0, 500.0
+#: N s and s of a blow, m/s of the ball when it comes.
+BLOW_NS, BLOW_S, BALL_MPS = 90.0, 0.1, 4.0
+#: Simulated at once where a character looks ahead in real time: candidates, horizon, hold.
+QUICK = LookaheadConfig(candidates=8, horizon=6, hold_steps=3, smoothing=(0.0, 0.7), corrections=(1.0,))
+
+
+class Seen(NamedTuple):
+    """What a control step came to, for those that show it.
+
+    Attributes:
+        time_s: simulated time.
+        bodies: `(K, B, 7)` m and wxyz of each character.
+        goals: `(K, B, 7)` of what each was to do.
+        ball: `(7)`.
+        qpos: `(K, 7 + n)`.
+        off_m: `(K)` m, between the two on average.
+    """
+
+    time_s: float
+    bodies: np.ndarray
+    goals: np.ndarray
+    ball: np.ndarray
+    qpos: np.ndarray
+    off_m: np.ndarray
+
+
+class World:
+    """K characters that follow streams, without help.
+
+    Args:
+        tracker: the policy, which must have learned to get up.
+        count: K.
+        executor: plans recovery motions beside the loop; None plans at once.
+        lookahead: characters that look ahead.
+
+    Attributes:
+        characters: what each is to do.
+        resets: how often the simulation went bad and all were set down anew.
+        hurries: whether there is no time to look ahead; all act at once then.
+        looked: control steps in which somebody looked ahead.
+
+    Raises:
+        PoiseError: a policy that cannot get up, or has no critic though it is to look ahead.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        count: int = 1,
+        executor: Executor | None = None,
+        lookahead: tuple[int, ...] = (),
+        seed: int = 0,
+    ):
+        if tracker.recovery_clips is None:
+            raise PoiseError(
+                "the policy has not learned to get up, which live motion needs",
+                hint="Train one on a library with a clip that gets up",
+            )
+        self.tracker, self.count = tracker, count
+        task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
+        task = replace(task, task=replace(task.task, help_by="all"))
+        body, sim = task.humanoid, task.config.sim
+        self.humanoid, self.rate_hz = body, sim.control_hz
+        names = ("", *(str(k + 1) for k in range(1, count)))
+        things = (*(Actor(body, name) for name in names), Ball(mass=4.0, pos=AWAY))
+        self.scene = SceneSim(Scene(things, sim=sim), 1, threads=1)
+        places = [self.scene.scene.place(n) for n in names]
+        # Snapshots are of a character alone, so that lookahead can try with it.
+        self.rows = CharacterRows(self.scene.backend, places, alone(body, sim), self.scene)
+        self.env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=self.rows)
+        self.goal = StreamGoal(body, self.rate_hz, count, seed=seed)
+        planner = GetUpPlanner(tracker.recovery_clips, body.table, self.rate_hz)
+        wide = int(np.ceil(np.sqrt(count)))
+        spots = [(APART_M * (k // wide), APART_M * (k % wide)) for k in range(count)]
+        self.characters = [Character(planner, spot, executor) for spot in spots]
+        self.substeps, self.resets, self.steps = sim.substeps, 0, 0
+        self.lead, self.hurries, self.looked = [1] * count, False, 0
+        self._pulls: dict[int, tuple[int, Tensor, Tensor]] = {}
+        self._blows: list[tuple[int, Tensor, int]] = []
+        self._act = tracker.policy.act
+        self._ahead = None
+        if tracker.value is not None:
+            full = imitation_of(tracker, [place(tracker.example, tracker)])
+            full = replace(full, task=replace(full.task, help_by="all"))
+            self._ahead = look_ahead(tracker, full, QUICK, 1, seed)
+            copies = self._ahead.copies
+            goal = StreamGoal(body, self.rate_hz, copies.num_envs)
+            goal.push(tracker.recovery_clips.ease)
+            goal.draw(torch.arange(copies.num_envs))
+            copies.set_goal(goal)
+        elif lookahead:
+            raise PoiseError("the policy was saved without its critic, which lookahead needs")
+        self._set_down()
+        self.look_ahead(lookahead)
+
+    def look_ahead(self, characters: tuple[int, ...]) -> None:
+        """Which characters look ahead; the others act at once."""
+        self.ahead_of = tuple(k for k in characters if 0 <= k < self.count)
+        if self._ahead is not None:
+            self._ahead.watch(self.env, self.ahead_of)
+
+    @property
+    def can_look_ahead(self) -> bool:
+        """Whether the policy has a critic."""
+        return self._ahead is not None
+
+    def _set_down(self) -> None:
+        frames = torch.stack([c.ease for c in self.characters])
+        self.set_on(frames, torch.zeros(self.count, self.humanoid.model.nv, dtype=torch.float64))
+
+    def set_on(self, frames: Tensor, qvel: Tensor) -> None:
+        """Sets all characters down on frames `(K, 7 + n)`, moving with `qvel (K, 6 + n)`."""
+        every = torch.arange(self.count)
+        for c, frame in zip(self.characters, frames, strict=True):
+            c.begin(frame)
+        self.goal.clear(every)
+        self.goal.push(frames)
+        self.goal.draw(every)
+        self.env.backend.write(None, frames, qvel)
+        self.env.age[:] = 0
+        self.env.set_goal(self.goal)
+        self._off, self._speed = np.zeros(self.count), np.zeros(self.count)
+        self._moves = torch.zeros(self.count, 2, dtype=torch.float64)
+
+    # --- what is done to them -----------------------------------------------------------------
+
+    def pull(self, character: int, body: int, point: np.ndarray, to: np.ndarray) -> None:
+        """A hand holds a body at `point (3)` m in its frame and draws it to `to (3)` m in the world."""
+        double = torch.float64
+        self._pulls[character] = body, torch.tensor(point, dtype=double), torch.tensor(to, dtype=double)
+
+    def let_go(self, character: int) -> None:
+        """The hand lets go."""
+        self._pulls.pop(character, None)
+
+    def blow(self, character: int, direction: np.ndarray) -> None:
+        """A blow on the chest along `direction (3)`, `BLOW_NS` N s."""
+        force = torch.tensor(direction / max(float(np.linalg.norm(direction)), 1e-9)) * BLOW_NS / BLOW_S
+        self._blows.append((character, force, max(1, round(BLOW_S * self.rate_hz))))
+
+    def drop_ball(self, character: int) -> None:
+        """The ball flies at a character's chest from 2 m before it."""
+        q = self.rows.state.qpos[character]
+        w, x, y, z = q[3:7].tolist()
+        angle = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+        ahead = torch.tensor([np.cos(angle), np.sin(angle), 0.0], dtype=torch.float64)
+        pos = q[:3].double() + 2.0 * ahead + torch.tensor([0.0, 0.0, 0.45], dtype=torch.float64)
+        qpos = torch.cat((pos, torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)))
+        qvel = torch.cat((-BALL_MPS * ahead, torch.zeros(3, dtype=torch.float64)))
+        qvel[2] = 1.5
+        self.scene.place("ball", qpos[None], qvel[None])
+        self.rows.pull()
+
+    # --- stepping -----------------------------------------------------------------------------
+
+    def body(self, character: int) -> Body:
+        """Where a character is."""
+        return Body(
+            self.rows.state.qpos[character].double(),
+            float(self._off[character]),
+            float(self._speed[character]),
+            self._moves[character],
+        )
+
+    def step(self, frames: Tensor) -> Seen:
+        """One control step toward the frames `(K, 7 + n)`, the newest that the goals know."""
+        env, goal = self.env, self.goal
+        goal.push(frames)
+        lead = torch.tensor(self.lead)
+        goal.at.copy_((goal.count - 1 - lead).clamp_min(0))
+        goal.aim(None, None)
+        goal.notes.clear()
+        obs = env.observe()
+        ahead = self._ahead if self.ahead_of and not self.hurries else None
+        self.looked += ahead is not None
+        env.drive(self._act(obs) if ahead is None else ahead.act(obs))
+        self._push()
+        env.controls.step(env.backend, self.substeps)
+        env.renew(env.judge())
+        self.steps += 1
+        if bool(self.rows.unstable().any()) or not bool(self.rows.state.qpos.isfinite().all()):
+            self.resets += 1
+            self._set_down()
+        return self._seen()
+
+    def _push(self) -> None:
+        """What pulls and strikes adds to the drive; the row of the world comes first."""
+        drive, state = self.rows.drive, self.rows.state
+        for k, (body, point, to) in self._pulls.items():
+            pos, quat = state.xpos[k, body + 1].double(), state.xquat[k, body + 1].double()
+            vec, w = quat[1:], quat[0]
+            t = 2.0 * torch.linalg.cross(vec, point)
+            held = pos + point + w * t + torch.linalg.cross(vec, t)
+            force = PULL * (to - held) - DAMP * self._root_velocity(k)
+            size = float(force.norm())
+            force = force * min(1.0, MOST_N / max(size, 1e-9))
+            arm = held - state["xipos"][k, body + 1].double()
+            wrench = torch.cat((force, torch.linalg.cross(arm, force)))
+            drive.xfrc_applied[k, body + 1] += wrench.to(drive.xfrc_applied)
+        left = list[tuple[int, Tensor, int]]()
+        for k, force, steps in self._blows:
+            drive.xfrc_applied[k, self._chest + 1, :3] += force.to(drive.xfrc_applied)
+            if steps > 1:
+                left.append((k, force, steps - 1))
+        self._blows = left
+
+    def _root_velocity(self, k: int) -> Tensor:
+        return self.rows.state.qvel[k, :3].double()
+
+    @property
+    def _chest(self) -> int:
+        return self.humanoid.rows_of("spine")[-1]
+
+    def _seen(self) -> Seen:
+        pose, goal, state = self.env.pose(), self.env.goal_pose(), self.scene.backend.state
+        self._off = (pose.pos - goal.pos).norm(dim=-1).mean(-1).double().numpy()
+        self._speed = pose.linvel.norm(dim=-1).mean(-1).double().numpy()
+        self._moves = pose.linvel[:, 0, :2].double()
+        at = self.scene.scene.place("ball").qpos
+        bodies, goals = (torch.cat((p.pos, p.quat), -1).float().numpy().copy() for p in (pose, goal))
+        ball = state.qpos[0, at].float().numpy().copy()
+        qpos = self.rows.state.qpos.double().numpy().copy()
+        return Seen(self.steps / self.rate_hz, bodies, goals, ball, qpos, self._off)
+
+    def close(self) -> None:
+        """Frees the simulations."""
+        self.env.close()
+        if self._ahead is not None:
+            self._ahead.copies.close()

@@ -1,0 +1,199 @@
+"""The loop by a clock of its own: people come, err, go; characters follow, fall and get up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from poise.errors import PoiseError
+from poise.jobs.open import open_run
+from poise.jobs.tracker import Tracker
+from poise.live.character import EASE, FALLS, RETURNS, TRACKS
+from poise.live.loop import Live, LiveConfig
+from poise.live.packet import Packet
+from poise.live.sources.file import Loop, packet_of
+from poise.motion import Clip, read_clip
+from test_docs import WALK
+
+STEP = 1 / 30
+
+
+@pytest.fixture(scope="module")
+def tracker() -> Tracker:
+    return open_run(None).tracker
+
+
+@pytest.fixture(scope="module")
+def walk() -> Clip:
+    return read_clip(WALK)
+
+
+class Played:
+    """A loop with people that walk, 30 packets a second each."""
+
+    def __init__(
+        self, tracker: Tracker, walk: Clip, config: LiveConfig, people: tuple[str, ...] = ("a",)
+    ):
+        self.live, self.loop, self.people = (
+            Live(tracker, config, clock=lambda: self.now),
+            Loop(walk),
+            people,
+        )
+        self.now, self.frame = 0.0, 0
+
+    def run(self, seconds: float, sends: bool = True) -> None:
+        for _ in range(round(seconds / STEP)):
+            for name in self.people if sends else ():
+                self.live.inbox.offer(packet_of(name, self.loop, self.frame), self.now)
+            self.live.step(self.now)
+            self.frame += 1
+            self.now += STEP
+
+
+def test_a_character_follows_is_knocked_over_and_gets_up(tracker: Tracker, walk: Clip) -> None:
+    played = Played(tracker, walk, LiveConfig(seed=1))
+    character = played.live.world.characters[0]
+    played.run(2.0)
+    assert character.doing == TRACKS and played.live.world.body(0).off_m < 0.3
+    before = played.live.world.rows.state.qpos[0, :3].clone()
+    played.live.commands.append({"type": "knock", "character": 0})
+    played.run(1.0)
+    assert character.doing in (FALLS, RETURNS) and character.lost == 1
+    for _ in range(20):
+        played.run(0.5)
+        if character.doing == TRACKS and played.live.world.body(0).off_m < 0.3:
+            break
+    assert character.doing == TRACKS and character.recovered >= 1
+    # It goes on from where it got up.
+    assert float((played.live.world.rows.state.qpos[0, :2] - before[:2]).norm()) < 6.0
+    told = played.live.figures()
+    assert told["help_n"] == 0.0 and told["characters"][0]["falls"] >= 1
+    played.live.close()
+
+
+def test_who_goes_away_is_waited_for_at_ease(tracker: Tracker, walk: Clip) -> None:
+    played = Played(tracker, walk, LiveConfig(buffer_s=0.2))
+    character = played.live.world.characters[0]
+    played.run(1.5)
+    played.run(3.0, sends=False)
+    assert character.doing == EASE and character.falls == 0
+    assert played.live.world.body(0).off_m < 0.2
+    played.run(1.5)
+    assert character.doing == TRACKS
+    played.live.close()
+
+
+def test_people_take_characters_change_them_and_are_forgotten(tracker: Tracker, walk: Clip) -> None:
+    played = Played(tracker, walk, LiveConfig(characters=2), ("a", "b", "c"))
+    played.run(0.2)
+    live = played.live
+    assert live.people.follows == ["a", "b"] and set(live.people.known) == {"a", "b", "c"}
+    live.commands.append({"type": "follow", "character": 0, "person": "b"})
+    played.run(0.1)
+    assert live.people.follows == ["b", "a"]
+    live.commands.append({"type": "follow", "character": 1, "person": "c"})
+    live.commands.append({"type": "knock", "character": 9})
+    played.run(0.1)
+    assert live.people.follows == ["b", "c"]
+    played.now += 30.0
+    played.people = ("c",)
+    for _ in range(31):
+        played.run(STEP)
+    assert live.people.follows == [None, "c"]
+    live.close()
+
+
+def test_nobody_who_moves_is_calibrated_and_who_stands_is(tracker: Tracker, walk: Clip) -> None:
+    live, now = Live(tracker, clock=lambda: 0.0), 0.0
+    for k in range(150):
+        # Walks for 2 s, then stands for 2.5 s; other proportions are another size.
+        t = min(k, 60) % walk.frames
+        root = walk.root_pos[t]
+        packet = Packet("a", now, walk.skeleton, root, walk.rot[t])
+        live.inbox.offer(packet, now)
+        if k % 3 == 0 or k > 55:
+            live.step(now)
+        person = live.people.of(0)
+        if k == 58:
+            assert person is not None and person.onto is None and person.share < 1
+        now += STEP
+    assert person is not None and person.onto is not None
+    # It stands where the character does.
+    assert float(np.abs(live.world.body(0).qpos[:2].numpy()).max()) < 0.5
+    live.close()
+
+
+def test_buffer_noise_and_pause_are_set_while_it_runs(tracker: Tracker, walk: Clip) -> None:
+    played = Played(tracker, walk, LiveConfig(buffer_s=0.0))
+    played.run(0.5)
+    live = played.live
+    assert live.world.lead == [1]
+    live.commands.append({"type": "set", "buffer": 0.4, "noise": 0.5, "lookahead": 1})
+    played.run(0.5)
+    assert live.world.lead == [11] and live.config.noise == 0.5 and live.world.ahead_of == (0,)
+    steps = live.steps
+    live.commands.append({"type": "pause", "on": True})
+    played.run(0.3)
+    assert live.paused and live.steps == steps
+    live.commands.append({"type": "pause", "on": False})
+    live.commands.append({"type": "ball", "character": 0})
+    live.commands.append(
+        {"type": "pull", "character": 0, "body": 3, "point": [0, 0, 0], "to": [0, 0, 1]}
+    )
+    played.run(0.2)
+    assert live.steps > steps and 0 in live.world._pulls
+    # A hand that says nothing more has let go.
+    played.run(1.2)
+    assert live.world._pulls == {}
+    live.close()
+
+
+def test_a_pull_is_a_spring(tracker: Tracker, walk: Clip) -> None:
+    """The chest of a character at ease goes where it is drawn, and comes back."""
+    live = Live(tracker, clock=lambda: 0.0)
+    chest = live.world._chest
+    place = live.world.rows.state.xpos
+    for k in range(10):
+        live.step(k * STEP)
+    before = place[0, chest + 1].clone()
+    live.world.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
+    live._pulled[0] = 0.0
+    for k in range(15):
+        live.step(0.3 + k * STEP)
+    moved = float(place[0, chest + 1, 0] - before[0])
+    assert 0.03 < moved < 0.3
+    live.close()
+
+
+def test_a_slow_machine_makes_slow_motion_and_no_falls(tracker: Tracker, walk: Clip) -> None:
+    played = Played(tracker, walk, LiveConfig())
+    played.run(1.5)
+    for _ in range(40):
+        # Each step takes as long as two.
+        for _ in range(2):
+            played.live.inbox.offer(packet_of("a", played.loop, played.frame), played.now)
+            played.frame += 1
+            played.now += STEP
+        played.live.step(played.now)
+    played.run(3.0)
+    assert played.live.world.characters[0].lost == 0
+    assert played.live._read is not None and played.now - played.live._read < 1.3
+    played.live.close()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"characters": 0}, {"buffer_s": 0.5}, {"lookahead": 2}, {"noise": float("nan")}]
+)
+def test_settings_that_make_no_sense(wrong: dict) -> None:
+    with pytest.raises(PoiseError):
+        LiveConfig(**wrong)
+
+
+def test_a_clip_is_played_on_without_a_jump(walk: Clip) -> None:
+    loop = Loop(walk)
+    far = [float(np.linalg.norm(loop(k + 1)[0] - loop(k)[0])) for k in range(3 * walk.frames)]
+    assert max(far) < 0.08
+    # It walks on; the clip's own way three times.
+    assert np.linalg.norm(loop(3 * walk.frames)[0][:2] - loop(0)[0][:2]) > 2.2 * np.linalg.norm(
+        walk.root_pos[-1, :2] - walk.root_pos[0, :2]
+    )

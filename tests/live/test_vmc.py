@@ -1,0 +1,195 @@
+"""VMC: an independent client's datagrams, and there and back again."""
+
+from __future__ import annotations
+
+import socket
+import time
+
+import numpy as np
+import pytest
+
+from poise.errors import PoiseError
+from poise.live import quats as q
+from poise.live.calibration import OntoBody
+from poise.live.packet import Inbox
+from poise.live.passage import world_of
+from poise.live.sinks.vmc import Puppet, VmcSink, datagram
+from poise.live.sources.osc import MESSAGES, bundled, encoded, messages
+from poise.live.sources.vmc import Avatar, VmcSource
+from poise.live.vrm import NEEDED, from_unity, skeleton_of, standard, t_pose, to_unity
+from poise.motion import Clip, Skeleton, read_clip
+from test_docs import WALK
+
+
+def joints(skeleton: Skeleton, root: np.ndarray, rot: np.ndarray) -> np.ndarray:
+    """`(J, 3)` m."""
+    world, out = world_of(skeleton, rot), [root]
+    for j, parent in enumerate(skeleton.parents[1:], 1):
+        out.append(out[parent] + q.rotate(world[parent], skeleton.offsets[j]))
+    return np.stack(out)
+
+
+def on_vrm() -> Clip:
+    """The embedded walk on a VRM model."""
+    from poise.kin import retarget
+
+    return retarget(read_clip(WALK), t_pose(standard()))[0]
+
+
+def test_unity_is_left_handed_with_y_up() -> None:
+    # Ahead, left and up of Poise are +Z, -X and +Y of Unity.
+    pos, _ = to_unity(np.eye(3), np.tile([1.0, 0, 0, 0], (3, 1)))
+    np.testing.assert_allclose(pos, [[0, 0, 1], [-1, 0, 0], [0, 1, 0]])
+    # A quarter turn to the left about Poise's +Z takes ahead to left; in Unity +Z to -X, which is a
+    # turn by -90 degrees about +Y.
+    _, turn = to_unity(np.zeros(3), q.yaw(np.pi / 2))
+    np.testing.assert_allclose(turn, [0, -np.sqrt(0.5), 0, np.sqrt(0.5)])
+    rng = np.random.default_rng(0)
+    p, r = rng.normal(size=(9, 3)), q.normalized(rng.normal(size=(9, 4)))
+    back = from_unity(*to_unity(p, r))
+    np.testing.assert_allclose(back[0], p)
+    np.testing.assert_allclose(back[1], r)
+    # Rotations and reflections commute: turned, then converted, is converted, then turned.
+    v = rng.normal(size=(9, 3))
+    there, turns = to_unity(v, r)
+    unity = np.concatenate((turns[:, 3:], turns[:, :3]), 1)
+    np.testing.assert_allclose(q.rotate(unity, there), to_unity(q.rotate(r, v), r)[0], atol=1e-12)
+
+
+def test_what_goes_out_comes_in_within_a_millimetre() -> None:
+    clip, avatar = on_vrm(), Avatar("a")
+    for t in range(clip.frames):
+        made = avatar.take(
+            messages(datagram(clip.skeleton, clip.root_pos[t], clip.rot[t], 1 + t / 30)), 0
+        )
+        if t == 0:
+            # The first frame is known to be whole when the second begins.
+            assert made == []
+            continue
+        packet = made[-1]
+        off = joints(packet.skeleton, packet.root_pos, packet.rot) - joints(
+            clip.skeleton, clip.root_pos[t], clip.rot[t]
+        )
+        assert np.abs(off).max() < 1e-3
+        assert packet.time_s == pytest.approx(1 + t / 30, abs=1e-4)
+
+
+def test_an_independent_client_drives_it() -> None:
+    client = pytest.importorskip("pythonosc.udp_client")
+    builder = pytest.importorskip("pythonosc.osc_message_builder")
+    clip, box = on_vrm(), Inbox()
+    source = VmcSource("127.0.0.1", 0, box, time.perf_counter)
+    source.start()
+    try:
+        sender = client.SimpleUDPClient("127.0.0.1", source.port)
+        seen = []
+        for t in range(20):
+            pos = clip.skeleton.offsets.copy()
+            pos[0] = clip.root_pos[t]
+            places, turns = to_unity(pos, clip.rot[t])
+            sender.send_message("/VMC/Ext/OK", 1)
+            sender.send_message("/VMC/Ext/Root/Pos", ["root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+            for name, place, turn in zip(clip.skeleton.names, places, turns, strict=True):
+                made = builder.OscMessageBuilder("/VMC/Ext/Bone/Pos")
+                for value in (name, *place, *turn):
+                    made.add_arg(value if isinstance(value, str) else float(value))
+                sender.send(made.build())
+            sender.send_message("/VMC/Ext/Unknown", [1, "x"])
+            time.sleep(0.005)
+        end = time.monotonic() + 5
+        while len(seen) < 18 and time.monotonic() < end:
+            seen += [p for line in box.take().values() for _, p in line]
+            time.sleep(0.01)
+    finally:
+        source.close()
+    assert len(seen) >= 18 and not box.refused
+    last = seen[-1]
+    off = joints(last.skeleton, last.root_pos, last.rot)
+    near = min(
+        np.abs(off - joints(clip.skeleton, clip.root_pos[t], clip.rot[t])).max() for t in range(20)
+    )
+    assert near < 1e-3
+
+
+def test_through_the_body_and_out_again() -> None:
+    """Without physics: what a body's hinges cannot do is lost, and nothing else."""
+    import mujoco
+
+    from poise.jobs.open import open_run
+
+    tracker, clip = open_run(None).tracker, on_vrm()
+    assert tracker.recovery_clips is not None
+    ease = tracker.recovery_clips.ease.numpy()
+    onto = OntoBody.by(clip, tracker.humanoid, tracker.example, ease, tracker.onto)
+    onto.feet, onto.floor, onto.planted = {}, 0.0, 0.0
+    factor = onto.scale
+    puppet = Puppet(tracker.humanoid.table, tracker.example, clip.skeleton, 1.0 / factor)
+    model = tracker.humanoid.model
+    data, worst = mujoco.MjData(model), []
+    for t in range(0, clip.frames, 7):
+        data.qpos[:] = onto(clip.root_pos[t], clip.rot[t])
+        mujoco.mj_kinematics(model, data)
+        bodies = np.concatenate((data.xpos[1:], data.xquat[1:]), 1)
+        hips, rot = puppet(bodies)
+        a, b = joints(clip.skeleton, hips, rot), joints(clip.skeleton, clip.root_pos[t], clip.rot[t])
+        worst.append(np.linalg.norm((a - a[0]) - (b - b[0]), axis=-1).max())
+    assert max(worst) < 0.06
+
+
+def test_a_sink_is_heard() -> None:
+    from poise.jobs.open import open_run
+
+    tracker = open_run(None).tracker
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        ear.settimeout(5)
+        puppet = Puppet(tracker.humanoid.table, tracker.example)
+        sink = VmcSink(f"127.0.0.1:{ear.getsockname()[1]}", puppet)
+        bodies = np.zeros((1, len(tracker.humanoid.bodies), 7))
+        bodies[..., 3] = 1.0
+        sink.write(bodies, 2.5)
+        told = messages(ear.recv(65_507))
+        sink.close()
+    assert [m.arguments for m in told if m.address == "/VMC/Ext/T"] == [(2.5,)]
+    assert {m.arguments[0] for m in told if "Bone" in m.address} == set(puppet.skeleton.names)
+    with pytest.raises(PoiseError, match="HOST:PORT"):
+        VmcSink("nowhere", puppet)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", b"abc", b"abcd", b"/a\0\0", b"/a\0\0,f\0\0", b"/a\0\0,x\0\0\0\0\0\0",
+        b"/a\0x,f\0\0\0\0\0\0",
+        b"#bundle\0", b"#bundle\0" + bytes(8) + b"\xff\xff\xff\xff", bytes(70_000),
+        bundled([bundled([bundled([bundled([bundled([encoded("/a", (1,))])])])])]),
+        bundled([encoded("/a", (1,))] * (MESSAGES + 1)), b"/\xff\0\0,\0\0\0",
+    ],
+)  # fmt: skip
+def test_what_is_no_osc_is_refused(data: bytes) -> None:
+    with pytest.raises(PoiseError):
+        messages(data)
+
+
+def test_ten_thousand_torn_datagrams_are_counted() -> None:
+    rng, box, clip = np.random.default_rng(5), Inbox(), on_vrm()
+    source = VmcSource("127.0.0.1", 0, box, lambda: 0.0)
+    whole = datagram(clip.skeleton, clip.root_pos[0], clip.rot[0], 1.0)
+    for k in range(3000):
+        data = bytearray(whole[: rng.integers(1, len(whole) + 1)])
+        for at in rng.integers(0, len(data), rng.integers(0, 6)):
+            data[at] = rng.integers(256)
+        source.receive(bytes(data), ("x", k % 3))
+    source.close()
+    assert sum(box.refused.values()) > 1500
+    for line in box.take().values():
+        for _, packet in line:
+            assert np.isfinite(packet.root_pos).all() and np.isfinite(packet.rot).all()
+
+
+def test_models_without_optional_bones_are_known() -> None:
+    whole = standard()
+    few = skeleton_of({n: whole.offsets[whole.index(n)] for n in NEEDED})
+    assert len(few) == len(NEEDED) and few.parents[few.index("LeftUpperArm")] == few.index("Spine")
+    with pytest.raises(PoiseError, match="missing"):
+        skeleton_of({"Hips": np.zeros(3)})
