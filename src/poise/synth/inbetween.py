@@ -22,7 +22,17 @@ from poise.nets.transition import Known
 from poise.spatial import slerp
 from poise.synth.footlock import lock_feet
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
-from poise.synth.limits import ALOFT_M, Calmed, Motion, calmed, excess, fastest, flown, off_floor
+from poise.synth.limits import (
+    ALOFT_M,
+    Calmed,
+    Motion,
+    calmed,
+    excess,
+    fastest,
+    flown,
+    off_floor,
+    under_floor,
+)
 from poise.synth.other_rig import OtherRig
 from poise.synth.planted import planted
 from poise.synth.seams import meet, sampled, spread
@@ -106,6 +116,12 @@ def fill_keyframes(
         warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
     kept = [k for k in range(clip.frames) if k in keys or not keys[0] < k < keys[-1]]
     heights = off_floor(own.skeleton, (root[kept], rot[kept]))
+    deep = under_floor(own.skeleton, (root[list(keys)], rot[list(keys)]))
+    warnings += [
+        f"keyframe {k} lies {d:.2f} m under the floor, where no body can be"
+        for k, d in zip(keys, deep.tolist(), strict=True)
+        if d > 0.0
+    ]
     aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
     filler = _Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft)
     clips: list[Clip] = []
