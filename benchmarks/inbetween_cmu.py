@@ -88,7 +88,7 @@ def names(task: Task, part: str) -> list[str]:
     return [c for c in task.bank.clips if task.config.protocol.part_of(c) == part]
 
 
-def figures(model: InbetweenModel, task: Task) -> dict:
+def figures(model: InbetweenModel, task: Task, ways: dict[str, Adaptation]) -> dict:
     """Figures of all methods on the subjects held out, and of each of them."""
     protocol, choices = task.config.protocol, task.validation
     assert choices is not None
@@ -101,7 +101,7 @@ def figures(model: InbetweenModel, task: Task) -> dict:
         "network": evaluate(model.net, final, LENGTHS),
     }
     told: dict[str, dict] = {}
-    for name, way in WAYS.items():
+    for name, way in ways.items():
         rows[f"network + {name}"], told[name] = adapted(model, choices, final, way)
     chosen_on = {"interpolation": evaluate(line, choices, LENGTHS),
                  "network": evaluate(model.net, choices, LENGTHS)}  # fmt: skip
@@ -156,6 +156,10 @@ def main() -> None:
     parser.add_argument("--skeleton", nargs="*", default=[], help="REGEX=FILE.asf of AMC files")
     parser.add_argument("--never", nargs="*", default=[], help="REGEX of clips to leave out")
     parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument(
+        "--minutes", type=float, help="of this call; the model is what was learned so far"
+    )
+    parser.add_argument("--adaptation", action="store_true", help="figures after it, too")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--work", type=Path, default=Path("runs/inbetween-cmu"))
@@ -165,14 +169,15 @@ def main() -> None:
     task, steps = begin(args.work, args.library, config_of(args), 0.0, args.steps, print)
     print(f"{len(task.bank.clips)} clips, {task.data.frames} frames with mirrored ones", flush=True)
     model, _, stopped = train(
-        task, args.work, steps, on_block=shown, tensorboard=False, validate_every=1000
+        task, args.work, steps, args.minutes, shown, tensorboard=False, validate_every=1000
     )
     if stopped:
         return
     args.out.parent.mkdir(parents=True, exist_ok=True)
     save_model(args.out, model, half=True)
+    ways = WAYS if args.adaptation else {}
     found = {
-        **model.meta, "frames_with_mirrored": task.data.frames, **figures(model, task),
+        **model.meta, "frames_with_mirrored": task.data.frames, **figures(model, task, ways),
         "learned_from": names(task, "train"), "held_out": names(task, "final"),
         "choices": names(task, "validation"), "machine": f"{args.threads} threads, no GPU",
     }  # fmt: skip
