@@ -30,7 +30,7 @@ from poise.jobs.library.clips import LibraryConfig
 from poise.learn.adapt import Adaptation, adapt
 from poise.learn.between import BetweenTraining
 from poise.learn.inbetween import BlockStats
-from poise.learn.model import InbetweenModel, save_model
+from poise.learn.model import InbetweenModel, load_model, save_model
 from poise.nets.between import BetweenConfig
 from poise.nets.transition import Filled
 
@@ -159,6 +159,7 @@ def main() -> None:
     parser.add_argument(
         "--minutes", type=float, help="of this call; the model is what was learned so far"
     )
+    parser.add_argument("--score", action="store_true", help="no training: only figures of --out")
     parser.add_argument("--adaptation", action="store_true", help="figures after it, too")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
@@ -168,13 +169,16 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     task, steps = begin(args.work, args.library, config_of(args), 0.0, args.steps, print)
     print(f"{len(task.bank.clips)} clips, {task.data.frames} frames with mirrored ones", flush=True)
-    model, _, stopped = train(
-        task, args.work, steps, args.minutes, shown, tensorboard=False, validate_every=1000
-    )
-    if stopped:
-        return
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    save_model(args.out, model, half=True)
+    if args.score:
+        model = load_model(args.out)
+    else:
+        model, _, stopped = train(
+            task, args.work, steps, args.minutes, shown, tensorboard=False, validate_every=1000
+        )
+        if stopped:
+            return
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        save_model(args.out, model, half=True)
     ways = WAYS if args.adaptation else {}
     found = {
         **model.meta, "frames_with_mirrored": task.data.frames, **figures(model, task, ways),
