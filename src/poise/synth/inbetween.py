@@ -118,9 +118,9 @@ def fill_keyframes(
     heights = off_floor(own.skeleton, (root[kept], rot[kept]))
     deep = under_floor(own.skeleton, (root[list(keys)], rot[list(keys)]))
     warnings += [
-        f"keyframe {k} lies {d:.2f} m under the floor, where no body can be"
-        for k, d in zip(keys, deep.tolist(), strict=True)
-        if d > 0.0
+        f"keyframe {k} lies {float(d):.2f} m under the floor, where no body can be"
+        for k, d in zip(keys, deep, strict=True)
+        if float(d) > 0.0
     ]
     aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
     filler = _Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft)
