@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from poise.learn.frames import FrameData
@@ -45,7 +47,7 @@ def moved(k: Known, yaw: float, xy: tuple[float, float]) -> tuple[Known, torch.T
     """The same elsewhere and turned; the turn and the way."""
     from poise.spatial import quat_mul, quat_rotate
 
-    turn = torch.tensor([torch.cos(torch.tensor(yaw / 2)), 0, 0, torch.sin(torch.tensor(yaw / 2))])
+    turn = torch.tensor([math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)], dtype=torch.float64)
     turn, way = turn.to(k.past_root), torch.tensor([*xy, 0.0]).to(k.past_root)
 
     def rooted(rot: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.learn.between import BetweenObjective, BetweenTraining, schedule
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.frames import Sampler
 from poise.learn.inbetween import InbetweenTrainer, train_inbetween
 from poise.learn.model import InbetweenModel, load_model, make_net, save_model
@@ -212,3 +214,16 @@ def test_windows_are_drawn_faster_and_slower_within_their_clip() -> None:
     assert drawn.root.shape == (16, 30, 3) and bool(drawn.rot.norm(dim=-1).sub(1).abs().max() < 1e-5)
     with pytest.raises(PoiseError, match="stretch"):
         Sampler(frames, 0.5)
+
+
+def test_a_network_of_before_speeds_were_seen_opens_as_it_was(tmp_path: Path) -> None:
+    of = bank()
+    net = make_net("transformer", data(of).layout, replace(SMALL, speeds=False), 0)
+    path = tmp_path / "old.safetensors"
+    save_model(path, InbetweenModel("transformer", net, of.names, of.offsets[0], 30.0, 20))
+    tensors, meta = load_checkpoint(path)
+    del meta["config"]["speeds"]
+    save_checkpoint(path, tensors, meta)
+    opened = load_model(path).net
+    assert opened.config == net.config
+    assert all(torch.equal(a, b) for a, b in zip(opened.parameters(), net.parameters(), strict=True))

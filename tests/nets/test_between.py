@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -10,6 +13,7 @@ from poise.nets.between import (
     Between,
     BetweenConfig,
     Dropout,
+    carried,
     last_before_gap,
     neighbours,
 )
@@ -32,9 +36,10 @@ def network(config: BetweenConfig = SMALL, seed: int = 0, awake: bool = True) ->
     return net
 
 
-def test_before_training_it_interpolates() -> None:
-    k = known(bank())
-    filled = network(awake=False).fill(k, 12)
+@pytest.mark.parametrize("past", [1, 10])
+def test_before_training_it_interpolates(past: int) -> None:
+    k = known(bank(), past)
+    filled = network(replace(SMALL, speeds=False), awake=False).fill(k, 12)
     t = torch.arange(1, 13, dtype=torch.float64)[:, None] / 13
     line = k.past_root[:, -1:] + t * (k.target_root[:, None] - k.past_root[:, -1:])
     arcs = slerp(k.past_rot[:, -1:], k.target_rot[:, None], t)
@@ -43,6 +48,25 @@ def test_before_training_it_interpolates() -> None:
     assert torch.allclose(
         filled.pos, joint_positions(network().layout, k.offsets, line, arcs), atol=1e-7
     )
+    quick = network(awake=False).fill(k, 12)
+    # A frame alone has no speed to go on in.
+    assert torch.allclose(quick.rot, arcs, atol=1e-7) == (past == 1)
+
+
+def test_interpolation_goes_on_in_the_speed_around_it() -> None:
+    seen = torch.tensor([1, 1, 0, 0, 0, 1, 1], dtype=torch.bool)
+    near = neighbours(seen)
+    # 1 m a frame before the gap, -2 after it; a straight line of 0.5 a frame between.
+    x = torch.tensor([0.0, 1.0, 1.5, 2.0, 2.5, 3.0, 1.0], dtype=torch.float64)[None, :, None]
+    more = carried(x, seen, near)[0, :, 0]
+    assert more[[0, 1, 5, 6]].tolist() == [0.0] * 4
+    for frame in (2, 3, 4):
+        t, s = frame - 1, (frame - 1) / 4
+        here = 0.5 * t * math.exp(-t / 8) * (1 - s) + 2.5 * (4 - t) * math.exp((t - 4) / 8) * s
+        assert float(more[frame]) == pytest.approx(here, abs=1e-12)
+    # Frames beyond the last known one, and a side with one known frame, gain nothing.
+    alone = torch.tensor([0, 1, 0, 0, 0, 1, 0], dtype=torch.bool)
+    assert not bool(carried(x, alone, neighbours(alone)).any())
 
 
 @pytest.mark.parametrize("past, length", [(1, 1), (1, 60), (10, 5), (4, 17), (23, 30)])

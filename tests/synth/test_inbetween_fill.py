@@ -28,7 +28,7 @@ def model(kind: str = "transformer", longest: int = 60) -> InbetweenModel:
     net.calibrate(of.root[None, :60].float(), of.rot[None, :60].float(), of.offsets[:1].float())
     if isinstance(net, Between):
         with torch.no_grad():
-            net.encoder.leave.weight.normal_(0, 0.01, generator=torch.Generator().manual_seed(1))
+            net.encoder.leave.weight.normal_(0, 0.005, generator=torch.Generator().manual_seed(1))
     return InbetweenModel(kind, net.eval(), of.names, of.offsets[0].float(), 30.0, longest)
 
 

@@ -114,3 +114,19 @@ def test_keyframes_that_ask_for_too_much_are_named() -> None:
     made = inbetween(far, (0, 30, 33, 59), adapt=0)
     assert any("more than people reach" in w and "30 to 33" in w for w in made.warnings)
     assert human().names == clip.skeleton.names
+
+
+def test_keyframes_under_the_floor_are_named() -> None:
+    clip = swing(2.0)
+    root = clip.root_pos.copy()
+    root[28:33, 2] -= 0.6
+    made = inbetween(clip.replaced(root_pos=root), (0, 30, 59), adapt=0)
+    (said,) = [w for w in made.warnings if "under the floor" in w]
+    assert said.startswith("keyframe 30 lies 0.") and "no body can be" in said
+    # A file with a floor of its own, and a jump, are no mistake.
+    low = clip.replaced(root_pos=clip.root_pos - (0.0, 0.0, 2.0))
+    assert not any("under" in w for w in inbetween(low, (0, 30, 59), adapt=0).warnings)
+    up = clip.root_pos.copy()
+    up[30, 2] += 0.5
+    raised = clip.replaced(root_pos=up)
+    assert not any("under" in w for w in inbetween(raised, (0, 30, 59), adapt=0).warnings)

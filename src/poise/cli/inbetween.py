@@ -35,7 +35,7 @@ class Options:
     """A trained network: a run folder of poise train inbetween, or a model file; by default the one that
     comes with Poise."""
     samples: Annotated[int, arg(metavar="N")] = 1
-    """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others are variants."""
+    """Clips to make, as OUT-0, OUT-1 ...: the first is the best guess, the others take another way."""
     foot_lock: Flag = True
     """Leave feet as the network made them; by default standing feet are held, and step clear of the
     floor."""

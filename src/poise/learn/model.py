@@ -106,7 +106,11 @@ def load_model(path: Path) -> InbetweenModel:
         said = meta["layout"]
         layout = Layout(tuple(said["parents"]), tuple(said["feet"]), tuple(said["facing"]))
         kind = BetweenConfig if meta["net"] == "transformer" else RTNConfig
-        sizes = from_data(kind, meta["config"], path)
+        said = dict(meta["config"])
+        if kind is BetweenConfig:
+            # Networks of earlier versions see no speeds and do not say so.
+            said.setdefault("speeds", False)
+        sizes = from_data(kind, said, path)
         _check_sizes(sizes, tensors, path)
         net = make_net(meta["net"], layout, sizes, 0)
         load_module(net, {k: v.float() for k, v in tensors.items()}, "net")

@@ -22,10 +22,21 @@ from poise.nets.transition import Known
 from poise.spatial import slerp
 from poise.synth.footlock import lock_feet
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
-from poise.synth.limits import ALOFT_M, Calmed, Motion, calmed, excess, fastest, flown, off_floor
+from poise.synth.limits import (
+    ALOFT_M,
+    Calmed,
+    Motion,
+    calmed,
+    excess,
+    fastest,
+    flown,
+    off_floor,
+    under_floor,
+)
 from poise.synth.other_rig import OtherRig
 from poise.synth.planted import planted
 from poise.synth.seams import meet, sampled, spread
+from poise.synth.variants import drawn, through
 
 #: Test-time adaptation of one gap, so that its feet slide less: of 10, 20 and 40 iterations at 3e-5 and
 #: 1e-4 the one with the least slide, against the recorded, in its worst of four CMU clips (03_01, 03_03,
@@ -105,6 +116,12 @@ def fill_keyframes(
         warnings = [f"{other}: gaps are made on the model's skeleton and brought back", *warnings]
     kept = [k for k in range(clip.frames) if k in keys or not keys[0] < k < keys[-1]]
     heights = off_floor(own.skeleton, (root[kept], rot[kept]))
+    deep = under_floor(own.skeleton, (root[list(keys)], rot[list(keys)]))
+    warnings += [
+        f"keyframe {k} lies {float(d):.2f} m under the floor, where no body can be"
+        for k, d in zip(keys, deep, strict=True)
+        if float(d) > 0.0
+    ]
     aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
     filler = _Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft)
     clips: list[Clip] = []
@@ -287,8 +304,8 @@ class _Filler:
         known, net = Known(*seen), model.net
         if self.filling.adaptation is not None:
             net = adapt(net, known, length, self.filling.adaptation)
-        if isinstance(net, Between) and after is not None:
-            filled = _with_after(net, known, length, after, noise)
+        if isinstance(net, Between):
+            filled = _by_transformer(net, known, length, after, noise, model.fps)
         else:
             filled = net.fill(known, length, noise)
         grid_root = torch.cat((before[0], filled.root[0].double(), ahead[0]))
@@ -308,19 +325,29 @@ class _Filler:
         return sampled(root[b:], rot[b:], step * torch.arange(1, count + 1).double())
 
 
-def _with_after(
-    net: Between, known: Known, length: int, after: tuple[Tensor, Tensor], noise: torch.Generator | None
-) -> Transition:
-    """A transition that also sees what comes after the keyframe it leads to."""
-    past, more = known.past_root.shape[1], len(after[0])
+def _by_transformer(
+    net: Between, known: Known, length: int, after: tuple[Tensor, Tensor] | None,
+    noise: torch.Generator | None, fps: float,
+) -> Transition:  # fmt: skip
+    """A transition that also sees what comes `after` the keyframe it leads to, or a variant of it."""
+    past = known.past_root.shape[1]
     target = known.target_rot[:, None]
-    hole = (known.target_root.new_zeros(1, length, 3), target.expand(1, length, -1, -1))
-    later = [x.unsqueeze(0).float() for x in after]
-    root = torch.cat((known.past_root, hole[0], known.target_root[:, None], later[0]), 1)
-    rot = torch.cat((known.past_rot, hole[1], target, later[1]), 1)
-    seen = torch.ones(past + length + 1 + more, dtype=torch.bool)
+    parts = [
+        (known.past_root, known.past_rot),
+        (known.target_root.new_zeros(1, length, 3), target.expand(1, length, -1, -1)),
+        (known.target_root[:, None], target),
+    ]
+    if after is not None:
+        parts.append((after[0].unsqueeze(0).float(), after[1].unsqueeze(0).float()))
+    root, rot = (torch.cat(x, 1) for x in zip(*parts, strict=True))
+    seen = torch.ones(root.shape[1], dtype=torch.bool)
     seen[past : past + length] = False
-    filled = net.complete(root, rot, seen, known.offsets, noise)
+    detour = None if noise is None else drawn(length, fps, noise)
+    if detour is None or noise is None:
+        filled = net.complete(root, rot, seen, known.offsets, noise)
+    else:
+        guess = net.complete(root, rot, seen, known.offsets)
+        filled = through(net, root, rot, seen, known.offsets, guess, detour, noise)
     return Transition(*(v[:, past : past + length] for v in filled))
 
 

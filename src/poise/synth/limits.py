@@ -23,6 +23,8 @@ FASTEST = {
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: m above its height on the floor from which on a body is in the air.
 ALOFT_M = 0.12
+#: m under the floor from which on a keyframe is no longer a foot that sank in.
+UNDER_M = 0.1
 
 #: Depth of the crouch before and after a jump, as a share of its height, and between which it lies, m; s
 #: that it takes to go down.
@@ -175,8 +177,21 @@ def _crouch(since: Tensor, depth: float, push: float, room_s: float) -> Tensor:
     return torch.where((since > 0.0) & (since < push + CROUCH_S), down, 0.0)
 
 
+def lowest(skeleton: Skeleton, motion: Motion) -> Tensor:
+    """`(T,)` m, the height of the lowest joint."""
+    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
+    return forward_kinematics(skeleton.parents, offsets, *motion)[0][..., 2].amin(-1)
+
+
 def off_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
     """`(T,)` m, how much higher the lowest joint is than in the frames that stand, of all given."""
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
-    low = forward_kinematics(skeleton.parents, offsets, *motion)[0][..., 2].amin(-1)
+    low = lowest(skeleton, motion)
     return low - low.quantile(0.1)
+
+
+def under_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
+    """`(T,)` m that the lowest joint lies under the floor at 0; 0 where it does not, or where most
+    frames lie as low, since their floor then is elsewhere."""
+    low = lowest(skeleton, motion)
+    deep = (low < -UNDER_M) & (low < low.median() - UNDER_M)
+    return torch.where(deep, -low, torch.zeros_like(low))
