@@ -30,6 +30,7 @@ VERBS = {
     "inbetween": "fill the frames between keyframes of a clip with a trained network",
     "complete": "from keyframes to a body: fill the frames, and let a character do them",
     "track": "let a trained policy do any motion, without training",
+    "dream": "let a character go about, without task, clip or end",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",
