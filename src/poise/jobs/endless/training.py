@@ -29,6 +29,8 @@ from poise.synth.place_free import ROOT, coordinates, features_of
 
 #: Pasts that are kept, from which motions begin.
 SEEDS = 256
+#: Windows below which a library is too small.
+LEAST_WINDOWS = 50
 #: Share of the mean weight that every number has, and how long velocities are thought to last, s.
 LEAST, LASTS = 0.3, 0.5
 
@@ -38,12 +40,13 @@ class Endless:
     """Settings of a kinematic policy's training.
 
     Attributes:
-        net, training: see `nets.cvae` and `learn.cvae`.
-        steps: of the whole training.
+        net: sizes and kind of the network, see `nets.cvae`.
+        training: see `learn.cvae`.
+        steps: steps of the whole training.
         ema: how much of the averaged weights stays at each step.
-        codes: how many windows of the library are kept as codes, see `synth.generator.Codes`; 0 draws
-            codes from N(0, I), as the paper does.
-        seed: of the first weights and all draws.
+        codes: windows of the library that are kept as codes, from which z is drawn; 0 draws z from
+            N(0, I), as the paper does.
+        seed: seed of everything random.
     """
 
     net: CVAEConfig = field(
@@ -99,17 +102,18 @@ def motions_of(
     """The clips on a policy's body.
 
     Raises:
-        PoiseError: too few frames in a row.
+        PoiseError: too few windows.
     """
     rate = tracker.config.sim.control_hz
     qpos = [torch.tensor(place(c, tracker).qpos) for c in library]
     window = config.past + config.future
     usable = sum(max(0, len(q) - window + 1) for q in qpos)
-    if not usable:
+    if usable < LEAST_WINDOWS:
         longest = max((len(q) for q in qpos), default=0)
         raise PoiseError(
-            f"no clip has {window} frames in a row at {rate:g} Hz; the longest has {longest}",
-            hint="Give longer clips, or a shorter past and future",
+            f"the library has {usable} windows of {window} frames in a row at {rate:g} Hz, and at least "
+            f"{LEAST_WINDOWS} are needed; its longest clip has {longest} frames",
+            hint=f"Give more clips that last longer than {window / rate:.1f} s",
         )
     tell(f"{len(qpos)} clips, {usable:,} windows of {window} frames")
     parts = [features_of(q, rate).float() for q in qpos]
@@ -162,25 +166,22 @@ def train_generator(
     config: Endless | None = None,
     minutes: float | None = None,
     on_block: Callable[[BlockStats], bool | None] | None = None,
-) -> tuple[GeneratorModel, bool]:
+) -> tuple[GeneratorModel, BlockStats | None, bool]:
     """Trains, or goes on training, in `folder`, and writes the model there.
 
     Returns:
-        the model, and whether Ctrl-C ended the training early.
+        the model, the last block (None where nothing was left to do), and whether Ctrl-C ended the
+        training early.
 
     Raises:
         PoiseError: the folder holds a training with other settings or of another library.
     """
     c = config or Endless()
-    features = ROOT + len(motions.hinges)
-    net = make_cvae(features, c.net, torch.Generator().manual_seed(c.seed))
-    net.calibrate(motions.frames.frames)
-    learner = CVAEObjective(net, c.training, c.steps, motions.weights)
     trainer = InbetweenTrainer(
-        learner, motions.frames, c.seed, c.steps, c.training.batch, ema=c.ema,
+        learner_of(motions, c), motions.frames, c.seed, c.steps, c.training.batch, ema=c.ema,
         metadata={"config": to_data(c), "clips": list(motions.clips)},
     )  # fmt: skip
-    _, stopped = train_inbetween(trainer, folder, minutes, on_block, tensorboard=False)
+    stats, stopped = train_inbetween(trainer, folder, minutes, on_block, tensorboard=False)
     made = copy.deepcopy(trainer.averaged).eval()
     assert isinstance(made, CVAE | CosineCVAE)
     about = {
@@ -192,7 +193,15 @@ def train_generator(
         made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about, codes
     )
     model.save(folder / GENERATOR)
-    return model, stopped
+    return model, stats, stopped
+
+
+def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
+    """A fresh network, calibrated to the motions, with how it learns."""
+    features = ROOT + len(motions.hinges)
+    net = make_cvae(features, config.net, torch.Generator().manual_seed(config.seed))
+    net.calibrate(motions.frames.frames)
+    return CVAEObjective(net, config.training, config.steps, motions.weights)
 
 
 @torch.no_grad()
