@@ -151,7 +151,7 @@ def test_what_makes_no_sense_is_refused(
         model.generator(tracker.humanoid, -1.0)
     with pytest.raises(PoiseError, match="pasts of 10 frames"):
         Kinematic(model.net, motions.seeds[:, :5], 30.0)
-    with pytest.raises(PoiseError, match="has 0 windows of 90 frames.*longest clip has 86"):
+    with pytest.raises(PoiseError, match=r"has 0 windows of 90 frames.*longest clip has 86"):
         motions_of(ClipLibrary.of([walk()]), tracker, CVAEConfig(), lambda _: None)
     tensors, meta = load_checkpoint(folder / "generator.safetensors")
     file = tmp_path / "bad.safetensors"
@@ -199,10 +199,12 @@ def test_codes_are_those_of_similar_pasts() -> None:
     torch.testing.assert_close(codes.keys[2], (past[2, [-1, -5, -12]] * weights).flatten())
     rng = torch.Generator().manual_seed(1)
     # The very past of a window: its code, at any temperature.
-    assert codes.draw(past, 3, rng, 1.0).round().flatten().tolist() == [k for k in range(6) for _ in "abc"]
+    assert codes.draw(past, 3, rng, 1.0).round().flatten().tolist() == [
+        k for k in range(6) for _ in "abc"
+    ]
     between = torch.lerp(past[:1], past[1:2], 0.49)
     drawn = codes.draw(between, 200, rng, 1.0).round().flatten().tolist()
-    assert set(drawn) >= {0.0, 1.0} and drawn.count(0.0) > 40
+    assert set(drawn) >= {0.0, 1.0} and min(drawn.count(0.0), drawn.count(1.0)) > 20
 
 
 def test_several_futures_bend_where_the_character_walks(

@@ -36,7 +36,8 @@ class Options:
     seconds: Annotated[float, arg(metavar="S")] = 60.0
     """How long it goes about. Ctrl-C keeps what was done."""
     seed_clip: Annotated[Path | None, arg(metavar="CLIP", help_behavior_hint="")] = None
-    """Go on from the end of this clip, of any human skeleton; by default from a second of the library."""
+    """Go on from the end of this clip, of any human skeleton; by default from some second of the
+    library."""
     temperature: Annotated[float, arg(metavar="T")] = 1.0
     """Below 1 the motion is more usual, above it less."""
     count: Annotated[int, arg(metavar="K")] = 1

@@ -56,7 +56,8 @@ def run(
             () if library.hold_out is None else (library.hold_out,),
             () if library.never is None else (library.never,), library.reading(), library.source(), tell,
         )  # fmt: skip
-    say(f"{len(motions.clips)} clips, {len(motions.frames.frames):,} frames to learn from; {config.steps:,} steps")  # fmt: skip
+    frames = len(motions.frames.frames)
+    say(f"{len(motions.clips)} clips, {frames:,} frames to learn from; {config.steps:,} steps")
     with showing("training") as show:
         _, stats, stopped = train_generator(
             motions, out, config, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}")

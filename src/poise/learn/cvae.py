@@ -9,8 +9,8 @@ frame, which would jerk; it dies down as a critically damped spring does,
 
     x'(t) = x(t) + (o + (v + o / s) t) exp(-t / s)
 
-with o the last frame's offset from the truth, v its change in a frame, and s frames. A past that is partly
-of another window teaches the same: the way back to motion that there is.
+with o the last frame's offset from the truth, v its change in a frame, and s frames. A past that is
+partly of another window teaches the same: the way back to motion that there is.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from poise.nets.cosine_cvae import CosineCVAE
 from poise.nets.cvae import CVAE, Code
 from poise.nets.mlp import bfloat16_is_fast
 from poise.settings import validate
-
 
 #: Deviations beyond which numbers of its own past are no motion.
 FAR = 8.0
@@ -80,8 +79,8 @@ class CVAETraining:
     def paper(cls) -> CVAETraining:
         """200 epochs at a constant step size and 800 in which it falls; minibatches of 256. An epoch's
         batch is 10,000 windows, so that the whole is 40,000 steps."""
-        return cls(batch=256, lr=1e-3, held=0.2, tolerance=10.0, smooth=0.0, own_past=0.0, segments=1, noise=0.0, mix=0.0,
-                   grad_norm=1e9, products="float32")  # fmt: skip
+        return cls(batch=256, lr=1e-3, held=0.2, tolerance=10.0, smooth=0.0, own_past=0.0,
+                   segments=1, noise=0.0, mix=0.0, grad_norm=1e9, products="float32")  # fmt: skip
 
 
 class Frames:
@@ -175,7 +174,9 @@ class CVAEObjective:
         """Pasts `(N, p, D)` that are off, by another one's share and by noise."""
         c, n = self.config, len(past)
         if c.mix:
-            share = c.mix * torch.rand(n, 1, 1, generator=rng) * (torch.rand(n, 1, 1, generator=rng) < 0.5)
+            share = (
+                c.mix * torch.rand(n, 1, 1, generator=rng) * (torch.rand(n, 1, 1, generator=rng) < 0.5)
+            )
             past = torch.lerp(past, past.roll(1, 0), share)
         if c.noise:
             past = past + c.noise * torch.randn(n, 1, past.shape[-1], generator=rng)

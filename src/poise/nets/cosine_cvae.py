@@ -55,9 +55,7 @@ class CosineCVAE(nn.Module):
         self.register_buffer("told", ramp * cosines(c.future, made) * c.future**0.5, persistent=False)
         self.register_buffer("going", _FADE * (1 - torch.exp(-t / _FADE)), persistent=False)
         wide = (known + 2) * features
-        self.encoder = Residual(
-            wide + made * features, c.hidden, c.blocks, 2 * c.latent, 0.1, generator
-        )
+        self.encoder = Residual(wide + made * features, c.hidden, c.blocks, 2 * c.latent, 0.1, generator)
         self.decoder = Residual(wide + c.latent, c.hidden, c.blocks, made * features, 0.1, generator)
 
     @torch.no_grad()

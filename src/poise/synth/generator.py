@@ -26,7 +26,7 @@ class Codes:
     """What followed in the library, as codes: a prior that knows the past.
 
     With N(0, I), the paper's, half of what is drawn is between what people do, so that motion dies down.
-    Here z is that of what once followed one of the pasts that are most similar, with its encoder's noise,
+    Here z is that of what once followed one of the most similar pasts, with its encoder's noise,
 
         p(z | past) = sum_i w_i q_i(z),  w_i ~ exp(-(d_i^2 - d_1^2) / (2 T^2 d_1^2)),
 

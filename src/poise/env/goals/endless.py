@@ -10,8 +10,8 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.goals.generator import GeneratorGoal, MotionGenerator
-from poise.env.goals.steering import PROPOSALS, REACHED, Steering, cost_of
 from poise.env.goals.led import FALLS, LOST, REST, RETURNS, TRACKS, WAITS_S
+from poise.env.goals.steering import PROPOSALS, REACHED, Steering, cost_of
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import DOWN, plan_recovery

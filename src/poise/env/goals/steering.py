@@ -1,4 +1,4 @@
-"""Where characters go: of several futures that a kinematic policy proposes, the one that is done next."""
+"""Where characters go: of several futures that a kinematic policy proposes, which is done next."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def _go_about(
                     "anew on their motion."
                 )
                 own.doing[:] = TRACKS
-                env.backend.reset(None)
+                env.action[:] = 0
     finally:
         env.close()
         if ahead is not None:
@@ -214,9 +214,7 @@ class _Seen:
     goal: EndlessGoal
     stopped: Callable[[], bool]
 
-    def __init__(
-        self, characters: list[Character], pieces: list[Pieces], steps: int, show: Show | None
-    ):
+    def __init__(self, characters: list[Character], pieces: list[Pieces], steps: int, show: Show | None):
         self.characters, self.pieces, self.steps, self.show = characters, pieces, steps, show
         self._all = torch.arange(len(characters))
 

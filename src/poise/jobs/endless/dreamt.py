@@ -165,7 +165,9 @@ class Dreamt(Result):
         first, *others = self.characters
         sim, ref = track(first.done, "simulation"), track(first.asked, "kinematic policy")
         apart = (sim.pos - sim.pos[:, :1]) - (ref.pos - ref.pos[:, :1])
-        low = lowest_height(humanoid.table, torch.tensor(sim.pos).double(), torch.tensor(sim.quat).double())
+        low = lowest_height(
+            humanoid.table, torch.tensor(sim.pos).double(), torch.tensor(sim.quat).double()
+        )
         figures = self.figures["simulated"]
         facts = {
             "length": f"{self.seconds:.1f} s, of which {len(sim.pos) / fps:.0f} s are shown",

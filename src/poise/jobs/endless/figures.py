@@ -1,4 +1,4 @@
-"""What a motion is worth that follows no clip, piece by piece: slide, penetration, jerk, standing still."""
+"""What a motion that follows no clip is worth, piece by piece: slide, sinking, jerk, standing still."""
 
 from __future__ import annotations
 

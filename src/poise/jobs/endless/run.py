@@ -59,7 +59,7 @@ def begin(
         source: what else tells one library from another, in words.
 
     Returns:
-        the motions, and the settings of the run: those of the run that is in the folder, if there is one.
+        the motions, and the settings: those of the run that is in the folder, if there is one.
 
     Raises:
         PoiseError: the folder holds a run of another library or with other settings, or the library is

@@ -17,9 +17,9 @@ from poise.jobs.endless.model import GENERATOR, GeneratorModel
 from poise.jobs.perpetual.run import clips_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
+from poise.kin.fk import Kinematics
 from poise.learn.cvae import CVAEObjective, CVAETraining, Frames
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
-from poise.kin.fk import Kinematics
 from poise.motion import ClipLibrary
 from poise.nets.cosine_cvae import CosineCVAE, make_cvae
 from poise.nets.cvae import CVAE, CVAEConfig
@@ -49,9 +49,7 @@ class Endless:
         seed: seed of everything random.
     """
 
-    net: CVAEConfig = field(
-        default_factory=lambda: CVAEConfig(decoder="cosine", hidden=512, latent=64)
-    )
+    net: CVAEConfig = field(default_factory=lambda: CVAEConfig(decoder="cosine", hidden=512, latent=64))
     training: CVAETraining = field(default_factory=CVAETraining)
     steps: int = 20_000
     ema: float = 0.999
@@ -125,7 +123,8 @@ def motions_of(
     frames = torch.cat(parts)
     return Motions(
         Frames(frames, first), torch.stack([pasts[i] for i in picks]), bounds,
-        reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate, tuple(c.name for c in library),
+        reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate,
+        tuple(c.name for c in library),
     )  # fmt: skip
 
 
