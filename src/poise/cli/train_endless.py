@@ -27,7 +27,7 @@ def run(
 ) -> Answer:
     """Trains until the last step or Ctrl-C.
 
-    policy: the control policy on whose body the clips are brought; by default that of Poise.
+    policy: the control policy; clips are brought onto its body; by default that of Poise.
     """
     import torch
 

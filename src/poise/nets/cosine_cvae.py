@@ -1,4 +1,4 @@
-"""A kinematic policy whose futures are cosines: the same conditional variational autoencoder as
+"""A kinematic policy with futures made of cosines: the same conditional variational autoencoder as
 `nets.cvae`, with perceptrons where that has recurrent units.
 
     y(t) = y_0 + tau (1 - exp(-t / tau)) v_0 + r(t) sum_k c_k cos(pi k (t - 1/2) / f),  c = MLP[past; z]
@@ -104,7 +104,7 @@ class CosineCVAE(nn.Module):
 
 
 class Residual(nn.Module):
-    """A perceptron whose layers add to what came before them: x + W_2 silu(W_1 norm(x))."""
+    """A perceptron with layers that add to what came before them: x + W_2 silu(W_1 norm(x))."""
 
     def __init__(
         self, num_in: int, width: int, blocks: int, num_out: int, last: float, rng: torch.Generator
