@@ -185,7 +185,7 @@ def test_cosines_are_orthonormal_and_a_future_begins_as_the_past_ends() -> None:
     past = torch.cumsum(torch.full((2, 10, 14), 0.1), 1)
     made = net.decode(past, torch.randn(2, 8))
     # One frame later it has gone on by the velocity, and a hundredth of what the network says.
-    step = made[:, 0] - past[:, -1]
+    step = (made[:, 0] - past[:, -1]).detach()
     assert float((step - 0.1 * 4 * (1 - np.exp(-0.25))).abs().max()) < 0.05
     code = net.encode(past, made)
     assert code.mean.shape == (2, 8) and bool((code.log_var <= 2).all())
