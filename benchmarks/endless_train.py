@@ -1,6 +1,6 @@
 """Trains the kinematic policy that is to come with Poise, on clips of CMU and DeepMimic.
 
-    python benchmarks/endless_train.py --library FOLDER -o RUN [--steps 8000] [--minutes M]
+    python benchmarks/endless_train.py --library FOLDER -o RUN [--steps 12000] [--minutes M]
 
 FOLDER is that of `tracker/README.md`. Whole subjects of CMU are held out. Resumable.
 """
@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=8000)
+    parser.add_argument("--steps", type=int, default=12_000)
     parser.add_argument("--minutes", type=float)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
@@ -44,7 +44,8 @@ def main() -> None:
         args.library, tracker, config.net, HELD_OUT, print, leave_out=TWINS, config=how
     )
     args.out.mkdir(parents=True, exist_ok=True)
-    train_generator(motions, args.out, config, args.minutes, shown)
+    model, _, _ = train_generator(motions, args.out, config, args.minutes, shown)
+    model.save(args.out / "shipped.safetensors", half=True)
 
 
 if __name__ == "__main__":

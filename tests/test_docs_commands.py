@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from poise.cli.main import main
+from poise.jobs.endless.training import Endless
 from poise.motion import Clip, read_clip, trim
 from poise.motion.io import write_clip
+from poise.nets.cvae import CVAEConfig
 from poise.recipes import ResidualForce
 from poise.settings import to_toml
 from test_docs import WALK, _commands
@@ -67,6 +69,10 @@ def _shortened(line: str) -> list[str]:
             at = argv.index("--seconds")
             del argv[at : at + 2]
         argv += ["--seconds", "3", "--port", "0"]
+    if argv[:2] == ["train", "endless"]:
+        argv += ["--iterations", "2", "--threads", "1", "--config", "endless.toml"]
+    if argv[0] == "dream":
+        argv += ["--seconds", "0.4", "--controller", "policy", "--threads", "1"]
     if "--preset" in argv:
         argv += ["--ppo.horizon", "8"]
     if argv[0] == "fleet":
@@ -120,6 +126,8 @@ def _provide(path: Path, bones: dict[str, str]) -> None:
             write_clip(walk, path / f"{name}.bvh")
     elif path.name == "run":
         toy_run(path)
+    elif path.name == "endless.toml":
+        path.write_text(to_toml(Endless(CVAEConfig(past=10, future=12, hidden=16))))
     elif path.suffix == ".toml":
         path.write_text(to_toml(ResidualForce(seed=1)))
     elif path.name == "chair.json":

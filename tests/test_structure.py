@@ -44,11 +44,6 @@ EXPLAINED = {
         "sim/props/door.py:Door", "sim/props/lift.py:Lift",
         "env/teams.py:Teams",
     ),
-    "motion without end, which becomes a verb when a generator comes with Poise": (
-        "jobs/endless/dreaming.py:dream", "jobs/endless/dreaming.py:Dreamt.falls_per_hour",
-        "jobs/endless/training.py:read_motions", "jobs/endless/training.py:train_generator",
-        "synth/generator.py:Kinematic.endless",
-    ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",
     ),

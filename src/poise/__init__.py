@@ -7,6 +7,7 @@
     pushed = poise.push("walk.bvh", 150.0, at="hand")  # the same, while something pushes it
     filled = poise.inbetween("dance.bvh", (0, 30, 60))
     done = poise.complete("dance.bvh", (0, 30, 60))  # the same with a body
+    seen = poise.dream(60)                          # a character that goes about
     made.card, made.clip, made.notes, made.save("out")
     poise.open_run("out").evaluate(help_limit=0.0)
 
@@ -23,6 +24,9 @@ from poise.version import __version__
 
 if TYPE_CHECKING:
     from poise.jobs.complete import Completed, complete
+    from poise.jobs.endless.config import Dream
+    from poise.jobs.endless.dreaming import dream
+    from poise.jobs.endless.dreamt import Dreamt
     from poise.jobs.imitate import Imitated, imitate
     from poise.jobs.inbetween.fill import Inbetweened, inbetween
     from poise.jobs.inbetween.training import Inbetween
@@ -40,6 +44,8 @@ _PLACES = {
     "Clip": "poise.motion",
     "ClipLibrary": "poise.motion",
     "Completed": "poise.jobs.complete",
+    "Dream": "poise.jobs.endless.config",
+    "Dreamt": "poise.jobs.endless.dreamt",
     "Imitated": "poise.jobs.imitate",
     "Inbetween": "poise.jobs.inbetween.training",
     "Inbetweened": "poise.jobs.inbetween.fill",
@@ -49,6 +55,7 @@ _PLACES = {
     "TrackConfig": "poise.jobs.track",
     "Tracked": "poise.jobs.track",
     "complete": "poise.jobs.complete",
+    "dream": "poise.jobs.endless.dreaming",
     "imitate": "poise.jobs.imitate",
     "inbetween": "poise.jobs.inbetween.fill",
     "open_run": "poise.jobs.open",
@@ -62,6 +69,8 @@ __all__ = [
     "Clip",
     "ClipLibrary",
     "Completed",
+    "Dream",
+    "Dreamt",
     "Imitated",
     "Inbetween",
     "Inbetweened",
@@ -73,6 +82,7 @@ __all__ = [
     "Tracked",
     "__version__",
     "complete",
+    "dream",
     "imitate",
     "inbetween",
     "open_run",

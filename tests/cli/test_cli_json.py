@@ -64,6 +64,18 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
         "eval": [trained],
         "play": [trained, "-o", out / "o.html"],
         "doctor": [short, "--fix", "-o", out / "o.bvh"],
+        "dream": [
+            "--seconds",
+            "0.3",
+            "--controller",
+            "policy",
+            "--threads",
+            "1",
+            "--seed-clip",
+            short,
+            "-o",
+            out / "o",
+        ],
     }
     return given[verb], 0
 
@@ -84,7 +96,7 @@ def test_errors_are_documents_too(verb: str, tmp_path: Path, answered: Callable[
     found = answered(verb, "--no-such-option", code=2)
     check(found)
     assert f"poise {verb} --help" in found["error"]["hint"] and found["result"] is None
-    if verb not in ("train", "inbetween", "complete", "retarget", "doctor"):
+    if verb not in ("train", "inbetween", "complete", "retarget", "doctor", "dream"):
         more = ["-o", tmp_path / "o.bvh"] if verb in ("imitate", "track", "convert", "fleet") else []
         found = answered(verb, tmp_path / "absent.bvh", *more, code=2)
         assert found["inputs"] == [str(tmp_path / "absent.bvh")]

@@ -77,6 +77,7 @@ def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str
         "train": ["residual-force", "a.bvh", "-o", "out"],
         "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
         "complete": ["a.bvh", "--keyframes", "0,5", "-o", "out"],
+        "dream": ["-o", "out"],
     }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "push", "fleet") else [])])
     code = (
         "import sys, poise.cli.console as c, poise.cli.main as m\n"
@@ -127,7 +128,7 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     from poise.recipes import RECIPE, perpetual
 
     assert get_args(options.Rule) == tuple(RULES)
-    assert (RECIPE["name"], inbetween.RECIPE["name"], perpetual.RECIPE["name"]) == RECIPES
+    assert (RECIPE["name"], inbetween.RECIPE["name"], perpetual.RECIPE["name"], "endless") == RECIPES
 
 
 def test_info_json_holds_exactly_the_keys(clip: Path, answered) -> None:

@@ -105,10 +105,13 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     env.close()
 
 
-def test_without_recovery_clips_nothing_is_watched(tracker: Tracker, task: Imitation) -> None:
+def test_without_recovery_clips_a_character_stays_where_it_fell(
+    tracker: Tracker, task: Imitation
+) -> None:
     assert tracker.recovery_clips is not None
     goal = EndlessGoal(Stands(tracker.recovery_clips.ease.double()), task.humanoid, 30.0, None)
     env, _ = begun(task, goal)
-    assert not goal.watch(env.backend.state.qpos, env.pose().pos + 9.0, env.pose().linvel)
-    assert int(goal.doing) == TRACKS
+    for _ in range(3):
+        assert goal.watch(env.backend.state.qpos, env.pose().pos + 9.0, env.pose().linvel)
+    assert int(goal.doing) == FALLS and len(goal.falls) == 1 and not goal.back
     env.close()

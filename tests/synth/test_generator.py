@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,17 @@ from poise.jobs.endless.training import Endless, Motions, motions_of, train_gene
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.cvae import CVAETraining, Frames, falling
+from poise.learn.cvae import CVAETraining, Frames, falling, settling
 from poise.motion import ClipLibrary
+from poise.nets.cosine_cvae import CosineCVAE, cosines
 from poise.nets.cvae import CVAE, Code, CVAEConfig
 from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
-from poise.synth.generator import Kinematic
+from poise.synth.generator import Codes, Kinematic
 from poise.synth.place_free import ROOT, coordinates, features_of
 from toy_policy import walk
 
 SMALL = CVAEConfig(past=10, future=12, latent=8, hidden=32, layers=(32,))
+COSINE = CVAEConfig(past=10, future=12, latent=8, hidden=32, decoder="cosine", cosines=6)
 
 
 @pytest.fixture(scope="module")
@@ -78,19 +81,22 @@ def test_divergence_and_step_sizes_by_hand() -> None:
     assert [falling(k, 100, 0.2) for k in (0, 19, 60, 100)] == pytest.approx([1, 1, 0.5, 0])
 
 
-def test_training_lowers_the_loss_and_goes_on_bit_for_bit(motions: Motions, tmp_path: Path) -> None:
-    config = Endless(SMALL, CVAETraining(batch=8), steps=100, ema=0.9)
+@pytest.mark.parametrize("net", [SMALL, COSINE])
+def test_training_lowers_the_loss_and_goes_on_bit_for_bit(
+    motions: Motions, tmp_path: Path, net: CVAEConfig
+) -> None:
+    config = Endless(net, CVAETraining(batch=8), steps=100, ema=0.9)
     losses: list[float] = []
-    whole, _ = train_generator(
+    whole, _, _ = train_generator(
         motions, tmp_path / "a", config, on_block=lambda s: losses.append(s.parts["square"])
     )
     assert losses[-1] < losses[0]
     train_generator(motions, tmp_path / "b", config, on_block=lambda s: False)
-    resumed, _ = train_generator(motions, tmp_path / "b", config)
+    resumed, _, _ = train_generator(motions, tmp_path / "b", config)
     same = zip(whole.net.state_dict().values(), resumed.net.state_dict().values(), strict=True)
     assert all(torch.equal(a, b) for a, b in same)
     with pytest.raises(PoiseError, match="other settings"):
-        train_generator(motions, tmp_path / "b", Endless(SMALL, steps=7))
+        train_generator(motions, tmp_path / "b", Endless(net, steps=7))
 
 
 def test_a_segment_begins_where_the_past_ends(
@@ -145,7 +151,7 @@ def test_what_makes_no_sense_is_refused(
         model.generator(tracker.humanoid, -1.0)
     with pytest.raises(PoiseError, match="pasts of 10 frames"):
         Kinematic(model.net, motions.seeds[:, :5], 30.0)
-    with pytest.raises(PoiseError, match="the longest has 86"):
+    with pytest.raises(PoiseError, match=r"has 0 windows of 90 frames.*longest clip has 86"):
         motions_of(ClipLibrary.of([walk()]), tracker, CVAEConfig(), lambda _: None)
     tensors, meta = load_checkpoint(folder / "generator.safetensors")
     file = tmp_path / "bad.safetensors"
@@ -160,6 +166,64 @@ def test_what_makes_no_sense_is_refused(
         other.generator(tracker.humanoid)
     with pytest.raises(PoiseError, match="past 2 frames"):
         CVAEConfig(past=1)
+
+
+def test_what_is_off_dies_down_and_a_clean_past_changes_nothing() -> None:
+    true, future = torch.zeros(1, 4, 1), torch.zeros(1, 3, 1)
+    assert torch.equal(settling(true, true, future, 2.0), future)
+    # o = 1 and v = 0.5: (1 + (0.5 + 1 / 2) t) exp(-t / 2).
+    past = torch.tensor([0.0, 0.0, 0.5, 1.0])[None, :, None]
+    got = settling(past, true, future, 2.0)[0, :, 0]
+    want = [(1 + t) * np.exp(-t / 2) for t in (1, 2, 3)]
+    torch.testing.assert_close(got, torch.tensor(want).float())
+
+
+def test_cosines_are_orthonormal_and_a_future_begins_as_the_past_ends() -> None:
+    basis = cosines(12, 6)
+    torch.testing.assert_close(basis.T @ basis, torch.eye(6), atol=1e-6, rtol=0)
+    net = CosineCVAE(14, COSINE, generator=torch.Generator().manual_seed(0))
+    past = torch.cumsum(torch.full((2, 10, 14), 0.1), 1)
+    made = net.decode(past, torch.randn(2, 8))
+    # One frame later it has gone on by the velocity, and a hundredth of what the network says.
+    step = (made[:, 0] - past[:, -1]).detach()
+    assert float((step - 0.1 * 4 * (1 - np.exp(-0.25))).abs().max()) < 0.05
+    code = net.encode(past, made)
+    assert code.mean.shape == (2, 8) and bool((code.log_var <= 2).all())
+
+
+def test_codes_are_those_of_similar_pasts() -> None:
+    weights = torch.tensor([1.0, 0.5])
+    past = torch.randn(6, 12, 2, generator=torch.Generator().manual_seed(0))
+    codes = Codes(torch.empty(0), torch.arange(6.0)[:, None], torch.full((6, 1), -20.0), weights)
+    codes = replace(codes, keys=codes.key_of(past))
+    torch.testing.assert_close(codes.keys[2], (past[2, [-1, -5, -12]] * weights).flatten())
+    rng = torch.Generator().manual_seed(1)
+    # The very past of a window: its code, at any temperature.
+    assert codes.draw(past, 3, rng, 1.0).round().flatten().tolist() == [
+        k for k in range(6) for _ in "abc"
+    ]
+    between = torch.lerp(past[:1], past[1:2], 0.49)
+    drawn = codes.draw(between, 200, rng, 1.0).round().flatten().tolist()
+    assert set(drawn) >= {0.0, 1.0} and min(drawn.count(0.0), drawn.count(1.0)) > 20
+
+
+def test_several_futures_bend_where_the_character_walks(
+    trained: tuple[GeneratorModel, Path], tracker: Tracker
+) -> None:
+    made = trained[0].generator(tracker.humanoid, 0.0)
+    rng = torch.Generator().manual_seed(0)
+    futures = made.propose(made.begin(1, rng), rng, 9)[0]
+    assert futures.shape == (9, 12, tracker.humanoid.model.nq)
+    ends = futures[:, -1, :2]
+    assert float((ends[0] - ends[2]).norm()) < 0.05 < float((ends[3] - ends[8]).norm())
+
+
+def test_reach_is_larger_for_a_hip_than_for_a_wrist(motions: Motions, tracker: Tracker) -> None:
+    assert motions.reach.shape == (ROOT + len(motions.hinges),) and bool((motions.reach >= 0).all())
+    assert float(motions.weights.mean()) == pytest.approx(1.0, abs=1e-3)
+    # The root's height moves every body by as much.
+    height = motions.frames.frames[:, 3].std()
+    assert float(motions.reach[3]) == pytest.approx(float(height), rel=1e-3)
 
 
 def test_the_network_goes_on_from_any_number_of_frames() -> None:

@@ -15,7 +15,7 @@ from poise.errors import PoiseError
 #: Exit codes beside 0 (done) and 1 (a fault of Poise or of the machine).
 REFUSED, LOST, INTERRUPTED = 2, 3, 130
 #: Options that name what a verb reads.
-_INPUTS = ("clip", "clips", "source", "run", "library", "onto")
+_INPUTS = ("clip", "clips", "source", "run", "library", "onto", "seed_clip")
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 

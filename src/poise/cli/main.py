@@ -32,6 +32,7 @@ VERBS = {
     "track": "let a trained policy do any motion, without training",
     "push": "a motion with a push in it: the character gives way and comes back",
     "live": "streams of motion in, characters in a browser out: push them, they get up",
+    "dream": "let a character go about, without task, clip or end",
     "fleet": "imitate every clip of a library, here or on a Ray cluster",
     "eval": "score a trained run over every start frame",
     "play": "simulate a trained run from one frame and write a page to watch",

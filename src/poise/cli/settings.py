@@ -28,6 +28,7 @@ SOURCES = {
     "residual-force": ("recipes/residual_force.py", "ResidualForce"),
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
     "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
+    "endless": ("jobs/endless/training.py", "Endless"),
 }
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.

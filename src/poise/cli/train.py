@@ -38,7 +38,7 @@ class Options:
     """Train a recipe on one clip, on several clips of one skeleton or on a folder, and no more."""
 
     recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
-    """residual-force, inbetween, or perpetual."""
+    """residual-force, inbetween, perpetual, or endless."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
     clips: Annotated[
@@ -68,9 +68,12 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     again = command_line("train", argv)
     if o.recipe != "residual-force":
         _only_a_folder(o)
+        from poise.cli.train_endless import run as endless
         from poise.cli.train_inbetween import run as inbetween
         from poise.cli.train_perpetual import run as perpetual
 
+        if o.recipe == "endless":
+            return endless(o.library, config, o.out, o.training, o.primitives.going_on, again)
         if o.recipe == "inbetween":
             return inbetween(o.library, config, o.out, o.training, again)
         return perpetual(o, config, again)
@@ -106,13 +109,15 @@ def config_of(o: Options) -> Any:
     values = given(o.recipe_settings, o.network, o.primitives)
     default = class_of(o.recipe)()
     known = {f.name for f in fields(default)}
-    own = {"inbetween": ("dropout",), "perpetual": BY_HAND}.get(o.recipe, ())
+    own = {"inbetween": ("dropout",), "perpetual": BY_HAND, "endless": ("going_on",)}.get(o.recipe, ())
     for name in [*values, *(given(o.body) if "body" not in known else ())]:
         if name not in known and name not in own:
             option = {"num_envs": "envs", "going_on": "from"}.get(name, name.replace("_", "-"))
             raise PoiseError(f"the recipe {o.recipe} has no --{option}", hint="Leave it out")
     if o.recipe == "perpetual":
         return settings(o.primitives, o.training, o.body, values)
+    if o.recipe == "endless":
+        values.pop("going_on", None)
     if "dropout" in values:
         values["between_training.dropout"] = values.pop("dropout")
     t, clip = o.training, None

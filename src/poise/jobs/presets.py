@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from poise.errors import PoiseError, did_you_mean
+from poise.jobs.endless.training import Endless
 from poise.jobs.inbetween.training import Inbetween, small
 from poise.motion import Clip
 from poise.recipes.perpetual import Perpetual
@@ -26,11 +27,13 @@ _PRESETS: dict[str, dict[str, Callable[..., Any]]] = {
         "paper": lambda _: Inbetween.paper(), "code": lambda _: Inbetween.code(),
         "fast": lambda _: small(Inbetween()),
     },
+    "endless": {"paper": lambda _: Endless.paper(), "fast": lambda _: Endless()},
 }  # fmt: skip
 
 
 def preset_of(recipe: str, name: str, clip: Clip | None = None) -> Any:
-    """The settings of a recipe ("residual-force", "perpetual" or "inbetween") by the name of a preset.
+    """The settings of a recipe ("residual-force", "perpetual", "inbetween" or
+    "endless") by the name of a preset.
 
     clip: what is imitated, by which the paper chooses its reward and the code its damping.
 

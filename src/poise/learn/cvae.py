@@ -3,8 +3,14 @@
     L = |x - x~|^2 / (2 beta) + max(KL(q(z | x) || N(0, I)), tolerance)
 
 with squares of numbers in deviations, summed over a future. Its own past (Algorithm 1, line 11) is what
-a policy sees after the first segment, so it learns from that, too: in a share of the batches a second
-segment follows the first one that it made.
+a policy sees after the first segment, so it learns from that, too: in a share of the batches further
+segments follow those that it made. What is off at a segment's beginning is not to be gone in its first
+frame, which would jerk; it dies down as a critically damped spring does,
+
+    x'(t) = x(t) + (o + (v + o / s) t) exp(-t / s)
+
+with o the last frame's offset from the truth, v its change in a frame, and s frames. A past that is
+partly of another window teaches the same: the way back to motion that there is.
 """
 
 from __future__ import annotations
@@ -15,12 +21,15 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from poise.errors import PoiseError
+from poise.nets.cosine_cvae import CosineCVAE
 from poise.nets.cvae import CVAE, Code
 from poise.nets.mlp import bfloat16_is_fast
 from poise.settings import validate
+
+#: Deviations beyond which numbers of its own past are no motion.
+FAR = 8.0
 
 
 @dataclass(frozen=True)
@@ -35,34 +44,43 @@ class CVAETraining:
         tolerance: nats below which the code's KL costs nothing.
         smooth: weight of the squares of the frames' differences, which the paper does not have: without
             them frames of short trainings tremble.
-        own_past: share of batches in which a second segment follows what was made of the first.
-        noise: deviation of the noise on pasts, in deviations of the frames.
+        own_past: share of batches in which further segments follow what was made of the first.
+        segments: the most of them; the paper's n is 5.
+        noise: deviation of what is added to pasts, the same to all frames of one, in deviations.
+        mix: the most of another window in a past, as a share; in half of the pasts.
+        settle: frames in which what is off dies down by e, s above.
         grad_norm: gradients are scaled down to it.
         products: how matrices are multiplied; weights and losses are float32 in any case.
     """
 
-    batch: int = 64
-    lr: float = 1e-3
+    batch: int = 128
+    lr: float = 5e-4
     held: float = 0.5
     beta: float = 10.0
-    tolerance: float = 10.0
+    tolerance: float = 20.0
     smooth: float = 10.0
-    own_past: float = 0.5
+    own_past: float = 0.7
+    segments: int = 3
     noise: float = 0.05
+    mix: float = 0.4
+    settle: float = 5.0
     grad_norm: float = 1.0
     products: Literal["auto", "float32", "bfloat16"] = "auto"
 
     def __post_init__(self) -> None:
         validate(self)
-        if min(self.batch, self.lr, self.beta, self.grad_norm) <= 0:
-            raise PoiseError("batch, lr, beta and grad_norm must be above 0", "CVAETraining")
+        above = (self.batch, self.lr, self.beta, self.settle, self.segments, self.grad_norm)
+        if min(above) <= 0:
+            raise PoiseError(
+                "batch, lr, beta, settle, segments and grad_norm must be above 0", "CVAETraining"
+            )
 
     @classmethod
     def paper(cls) -> CVAETraining:
         """200 epochs at a constant step size and 800 in which it falls; minibatches of 256. An epoch's
         batch is 10,000 windows, so that the whole is 40,000 steps."""
-        return cls(batch=256, held=0.2, smooth=0.0, own_past=0.0, noise=0.0, grad_norm=1e9,
-                   products="float32")  # fmt: skip
+        return cls(batch=256, lr=1e-3, held=0.2, tolerance=10.0, smooth=0.0, own_past=0.0,
+                   segments=1, noise=0.0, mix=0.0, grad_norm=1e9, products="float32")  # fmt: skip
 
 
 class Frames:
@@ -99,13 +117,21 @@ class Frames:
 
 
 class CVAEObjective:
-    """Loss and update of a `CVAE`; see `learn.inbetween.InbetweenTrainer`.
+    """Loss and update of a kinematic policy; see `learn.inbetween.InbetweenTrainer`.
 
-    steps: of the whole training.
+    Args:
+        steps: of the whole training.
+        weights: `(D)` of the squares of a frame's numbers; by default all count the same.
     """
 
-    def __init__(self, net: CVAE, config: CVAETraining, steps: int):
-        self.net, self.config, self.steps = net, config, steps
+    def __init__(
+        self,
+        net: CVAE | CosineCVAE,
+        config: CVAETraining,
+        steps: int,
+        weights: Tensor | None = None,
+    ):
+        self.net, self.config, self.steps, self.weights = net, config, steps, weights
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
         self.optimizers: dict[str, torch.optim.Optimizer] = {
             "net": torch.optim.Adam(net.parameters(), lr=config.lr)
@@ -117,20 +143,24 @@ class CVAEObjective:
 
     def step(self, sampler: Frames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         """One update; the parts of the loss."""
-        c, size = self.config, self.net.config
-        twice = bool(torch.rand((), generator=generator) < c.own_past)
-        window = size.past + size.future * (2 if twice else 1)
-        if twice and not sampler.count(window):
-            twice, window = False, size.past + size.future
-        x = self.net.scaled(sampler.draw(c.batch, window, generator))
-        past, future = x[:, : size.past], x[:, size.past : size.past + size.future]
-        past = past + c.noise * torch.randn(past.shape, generator=generator)
-        loss, parts, made = self.loss(past, future, generator)
-        if twice:
-            own = torch.cat((past, made), 1)[:, -size.past :].detach()
-            more, second, _ = self.loss(own, x[:, size.past + size.future :], generator)
-            loss = 0.5 * (loss + more)
-            parts |= {f"second_{k}": v for k, v in second.items()}
+        c, p, f = self.config, self.net.config.past, self.net.config.future
+        segments = 1
+        if c.segments > 1 and bool(torch.rand((), generator=generator) < c.own_past):
+            segments = int(torch.randint(2, c.segments + 1, (), generator=generator))
+        while segments > 1 and not sampler.count(p + segments * f):
+            segments -= 1
+        x = self.net.scaled(sampler.draw(c.batch, p + segments * f, generator))
+        past = self.disturbed(x[:, :p], generator)
+        losses, parts = list[Tensor](), dict[str, Tensor]()
+        for k in range(segments):
+            true, at = x[:, k * f : k * f + p], p + k * f
+            future = settling(past, true, x[:, at : at + f], c.settle)
+            loss, of_it, made = self.loss(past, future, generator)
+            losses.append(loss)
+            parts |= of_it if k == 0 else {f"own_{n}": v for n, v in of_it.items()}
+            # What is no motion at all teaches nothing, and might grow from segment to segment.
+            past = torch.cat((past, made.detach().clamp(-FAR, FAR)), 1)[:, -p:]
+        loss = torch.stack(losses).mean()
         optimizer = self.optimizers["net"]
         for group in optimizer.param_groups:
             group["lr"] = c.lr * falling(step, self.steps, c.held)
@@ -139,6 +169,18 @@ class CVAEObjective:
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), c.grad_norm, foreach=True)
         optimizer.step()
         return {**parts, "loss": loss.detach()}
+
+    def disturbed(self, past: Tensor, rng: torch.Generator) -> Tensor:
+        """Pasts `(N, p, D)` that are off, by another one's share and by noise."""
+        c, n = self.config, len(past)
+        if c.mix:
+            share = (
+                c.mix * torch.rand(n, 1, 1, generator=rng) * (torch.rand(n, 1, 1, generator=rng) < 0.5)
+            )
+            past = torch.lerp(past, past.roll(1, 0), share)
+        if c.noise:
+            past = past + c.noise * torch.randn(n, 1, past.shape[-1], generator=rng)
+        return past
 
     def loss(
         self, past: Tensor, future: Tensor, rng: torch.Generator
@@ -149,18 +191,31 @@ class CVAEObjective:
             code = self.net.encode(past, future)
             made = self.net.decode(past, code.draw(rng)).float()
         code = Code(code.mean.float(), code.log_var.float())
-        count = len(past)
-        square = (made - future).square().sum() / count / (2 * c.beta)
+        square = self._squares(made, future)
         divergence = code.divergence().mean()
         parts = {"square": square.detach(), "kl": divergence.detach()}
         loss = square + divergence.clamp_min(c.tolerance)
         if c.smooth:
             last = past[:, -1:]
             own, true = (torch.diff(torch.cat((last, x), 1), dim=1) for x in (made, future))
-            rough = functional.mse_loss(own, true, reduction="sum") / count / (2 * c.beta)
+            rough = self._squares(own, true)
             parts["smooth"] = rough.detach()
             loss = loss + c.smooth * rough
         return loss, parts, made
+
+    def _squares(self, made: Tensor, true: Tensor) -> Tensor:
+        squares = (made - true).square()
+        if self.weights is not None:
+            squares = squares * self.weights
+        return squares.sum() / len(made) / (2 * self.config.beta)
+
+
+def settling(past: Tensor, true: Tensor, future: Tensor, settle: float) -> Tensor:
+    """Futures `(N, f, D)` as they are to be after a past that is off from the true one `(N, p, D)`."""
+    off = past[:, -2:] - true[:, -2:]
+    o, v = off[:, 1:], off[:, 1:] - off[:, :1]
+    t = torch.arange(1, future.shape[1] + 1).to(future)[:, None]
+    return future + (o + (v + o / settle) * t) * torch.exp(-t / settle)
 
 
 def falling(step: int, steps: int, held: float) -> float:

@@ -12,13 +12,14 @@ A frame is the one before it plus what is said of it, so that a segment begins w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
 from poise.nets.mlp import MLP, bare_linear
+from poise.settings import validate
 
 _MIN_STD = 1e-3
 
@@ -32,6 +33,11 @@ class CVAEConfig:
         latent: size of z.
         hidden: width of the recurrent units.
         layers: widths of the layers between them and what they say.
+        decoder: "recurrent", the paper's, or "cosine", see `nets.cosine_cvae`, for which `hidden`
+            counts as well, but not `layers`.
+        cosines: of "cosine", how many a past and a future are made of. 24 of 60 frames at 30 Hz go up
+            to 6 Hz.
+        blocks: of "cosine", pairs of layers.
     """
 
     past: int = 30
@@ -39,9 +45,14 @@ class CVAEConfig:
     latent: int = 128
     hidden: int = 256
     layers: tuple[int, ...] = (256,)
+    decoder: Literal["recurrent", "cosine"] = "recurrent"
+    cosines: int = 24
+    blocks: int = 2
 
     def __post_init__(self) -> None:
-        if min(self.past, self.future, self.latent, self.hidden, *self.layers) < 1 or self.past < 2:
+        validate(self)
+        sizes = (self.past, self.future, self.latent, self.hidden, self.cosines, self.blocks)
+        if min(*sizes, *self.layers) < 1 or self.past < 2:
             raise PoiseError("every size must be at least 1, and the past 2 frames", "CVAEConfig")
 
 

@@ -3,13 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from poise.errors import PoiseError
+from poise.nets.cosine_cvae import CosineCVAE
 from poise.nets.cvae import CVAE
 from poise.synth.place_free import coordinates, past_features
+
+#: Frames of a past, counted from its end, by which it is compared with others.
+COMPARED = (-1, -5, -12)
+#: How many of the most similar pasts a code is drawn from.
+NEAREST = 8
+#: Speed (m/s) from which on a character that walks can be turned as fast as `BEND` (rad/s) at most.
+WALKS, BEND = 0.8, 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Codes:
+    """What followed in the library, as codes: a prior that knows the past.
+
+    With N(0, I), the paper's, half of what is drawn is between what people do, so that motion dies down.
+    Here z is that of what once followed one of the most similar pasts, with its encoder's noise,
+
+        p(z | past) = sum_i w_i q_i(z),  w_i ~ exp(-(d_i^2 - d_1^2) / (2 T^2 d_1^2)),
+
+    with distances d_1 <= d_2 <= ... of pasts, and the temperature T, by which the noise is scaled, too.
+
+    Attributes:
+        keys: `(K, 3 D)` of pasts, see `key_of`.
+        mean, log_var: `(K, Z)` of q.
+        weights: `(D)` of a frame's numbers, in deviations.
+    """
+
+    keys: Tensor
+    mean: Tensor
+    log_var: Tensor
+    weights: Tensor
+
+    def key_of(self, past: Tensor) -> Tensor:
+        """`(N, 3 D)` of pasts `(N, p, D)` in deviations: some of their frames, weighted."""
+        picks = [max(k, -past.shape[1]) for k in COMPARED]
+        return (past[:, picks] * self.weights).flatten(1)
+
+    def draw(self, past: Tensor, count: int, rng: torch.Generator, temperature: float) -> Tensor:
+        """`(N * count, Z)`: so many codes for each of the pasts `(N, p, D)`, in deviations."""
+        apart = torch.cdist(self.key_of(past), self.keys)
+        near, index = apart.topk(min(NEAREST, len(self.keys)), largest=False)
+        least = near[:, :1].square().clamp_min(1e-6)
+        share = (-(near.square() - least) / (2 * max(temperature, 1e-3) ** 2 * least)).softmax(-1)
+        picks = torch.multinomial(share, count, replacement=True, generator=rng)
+        code = index.gather(1, picks).flatten()
+        noise = torch.randn(len(code), self.mean.shape[1], generator=rng)
+        return self.mean[code] + temperature * (0.5 * self.log_var[code]).exp() * noise
 
 
 class Kinematic:
@@ -21,15 +69,17 @@ class Kinematic:
         fps: frames a second.
         temperature: deviation of z; below 1 motion is more usual, above it less.
         bounds: `(2, n)` rad, least and most of each hinge; None leaves angles as they are made.
+        codes: from which z is drawn; None draws it from N(0, temperature^2), as the paper does.
     """
 
     def __init__(
         self,
-        net: CVAE,
+        net: CVAE | CosineCVAE,
         seeds: Tensor,
         fps: float,
         temperature: float = 1.0,
         bounds: Tensor | None = None,
+        codes: Codes | None = None,
     ):
         if seeds.ndim != 3 or seeds.shape[1] != net.config.past or not len(seeds):
             raise PoiseError(
@@ -38,7 +88,7 @@ class Kinematic:
         if not temperature >= 0:
             raise PoiseError(f"the temperature must be at least 0, got {temperature:g}")
         self.net, self.seeds, self.fps = net.eval(), seeds.double(), fps
-        self.temperature, self.bounds = temperature, bounds
+        self.temperature, self.bounds, self.codes = temperature, bounds, codes
         self.past, self.future = net.config.past, net.config.future
 
     def begin(self, count: int, rng: torch.Generator) -> Tensor:
@@ -47,16 +97,32 @@ class Kinematic:
         frames[..., :2] -= frames[:, -1:, :2].clone()
         return frames
 
-    @torch.no_grad()
     def generate(self, past: Tensor, ids: Tensor, rng: torch.Generator) -> Tensor:
         """`(n, future, 7 + n)` after `past (n, past, 7 + n)`."""
-        frames = past_features(past.double(), self.fps).float()
-        z = self.net.draw(len(past), rng, self.temperature)
-        made = coordinates(self.net.continued(frames, z).double(), past[:, -1].double(), self.fps)
+        return self.propose(past, rng, 1)[:, 0]
+
+    @torch.no_grad()
+    def propose(self, past: Tensor, rng: torch.Generator, count: int) -> Tensor:
+        """`(n, count, future, 7 + n)`: several futures of each past, each with a z of its own. All but
+        the first third of them bend to either side, as far as the character walks."""
+        own = past_features(past.double(), self.fps).float()
+        frames = own.repeat_interleave(count, 0)
+        if self.codes is None:
+            z = self.net.draw(len(frames), rng, self.temperature)
+        else:
+            z = self.codes.draw(self.net.scaled(own), count, rng, self.temperature)
+        made = self.net.continued(frames, z).double()
+        if count > 1:
+            bend = torch.linspace(-BEND, BEND, count).double()
+            bend[: count // 3] = 0.0
+            pace = (made[..., :2].norm(dim=-1) / WALKS).clamp_max(1.0)
+            made[..., 2] += bend.repeat(len(past))[:, None] * pace
+        last = past[:, -1].double().repeat_interleave(count, 0)
+        out = coordinates(made, last, self.fps)
         if self.bounds is not None:
             low, high = self.bounds
-            made[..., 7:] = made[..., 7:].clamp(low, high)
-        return made
+            out[..., 7:] = out[..., 7:].clamp(low, high)
+        return out.unflatten(0, (len(past), count))
 
     def rows(self) -> Mapping[str, Tensor]:
         """It remembers nothing but the past that it is given."""
@@ -71,6 +137,10 @@ class Kinematic:
         made = self.begin(1, rng) if past is None else past[None].double()
         if made.shape[1] != self.past:
             raise PoiseError(f"a past has {self.past} frames, got {made.shape[1]}")
-        while made.shape[1] < self.past + frames:
-            made = torch.cat((made, self.generate(made[:, -self.past :], one, rng)), 1)
-        return made[0, : self.past + frames]
+        parts, have = [made], self.past
+        while have < self.past + frames:
+            made = self.generate(made[:, -self.past :], one, rng)
+            parts.append(made)
+            have += self.future
+            made = torch.cat(parts[-2:], 1)
+        return torch.cat(parts, 1)[0, : self.past + frames]

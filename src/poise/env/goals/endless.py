@@ -11,6 +11,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env.goals.generator import GeneratorGoal, MotionGenerator
 from poise.env.goals.led import FALLS, LOST, REST, RETURNS, TRACKS, WAITS_S
+from poise.env.goals.steering import PROPOSALS, REACHED, Steering, cost_of
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import DOWN, plan_recovery
@@ -25,11 +26,14 @@ class EndlessGoal(GeneratorGoal):
         recovery_clips: of the library that the policy has learned; None never comes back.
         plans: whether recovery motions are planned here; a copy of such a world, in which a controller
             tries something for some steps, does without.
+        steering: where characters go, chosen among several futures of the generator.
+        pasts: `(N, p, 7 + n)` from which worlds begin; by default the generator's own.
 
     Attributes:
         doing: `(N,)`, `TRACKS`, `FALLS` or `RETURNS`.
         falls: (world, control step) of every time a motion was lost.
         back: (world, control step) of every time one was up again.
+        reached: (world, control step) of every target that was.
     """
 
     def __init__(
@@ -43,15 +47,22 @@ class EndlessGoal(GeneratorGoal):
         seed: int = 0,
         lead: int = 0,
         plans: bool = True,
+        steering: Steering | None = None,
+        pasts: Tensor | None = None,
     ):
         super().__init__(generator, humanoid, rate_hz, num_envs, device, seed, lead)
         self.plans, self.recovery_clips = plans, recovery_clips
+        if not plans:
+            # A copy reads what the world that it is of has known ahead, and makes nothing itself.
+            self.lead = 0
+        self.steering, self.pasts = steering or Steering(), pasts
         self.get_up = None
         if recovery_clips is not None:
             self.get_up = GetUpPlanner(recovery_clips, humanoid.table, rate_hz)
         self.doing, self._since = torch.zeros_like(self.at), torch.zeros_like(self.at)
         self.steps = torch.zeros_like(self.at)
         self.falls, self.back = list[tuple[int, int]](), list[tuple[int, int]]()
+        self.reached, self._passed = list[tuple[int, int]](), torch.zeros_like(self.at)
         # Recovery motions lie in a table; what of it each world has yet to read.
         self._ways = self.qpos[0, :0].clone()
         self._next, self._end = torch.zeros_like(self.at), torch.zeros_like(self.at)
@@ -59,6 +70,9 @@ class EndlessGoal(GeneratorGoal):
         self._until = torch.zeros_like(self.at)
 
     # --- frames -------------------------------------------------------------------------------
+
+    def begin(self, ids: Tensor) -> Tensor:
+        return super().begin(ids) if self.pasts is None else self.pasts[ids].clone()
 
     def draw(self, ids: Tensor) -> None:
         super().draw(ids)
@@ -81,6 +95,25 @@ class EndlessGoal(GeneratorGoal):
                 self._next[i] = last
         super().supply(ids)
 
+    def make(self, past: Tensor, ids: Tensor) -> Tensor:
+        """The next frames; where there is somewhere to go, of several futures the best."""
+        propose = getattr(self.generator, "propose", None)
+        if propose is None or not self.steering.chooses:
+            return super().make(past, ids)
+        futures, out = propose(past, self.rng, PROPOSALS), list[Tensor]()
+        steps = torch.arange(1, self.generator.future + 1, device=self.device)
+        for world, made in zip(ids.tolist(), futures, strict=True):
+            others = list[Tensor]()
+            for other in range(self.num_envs if self.steering.apart else 0):
+                if other != world:
+                    # The same moments of the other's motion, as far as they are known.
+                    ahead = int(self.count[world] - 1 - self.at[world])
+                    index = (self.at[other] + ahead + steps).clamp_max(int(self.count[other]) - 1)
+                    others.append(self.qpos[other, index % self.size, :2])
+            target = self.steering.target(int(self._passed[world]))
+            out.append(made[int(cost_of(made[..., :2], target, others).argmin())])
+        return torch.stack(out)
+
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
         # A motion waits for a character that falls.
         falling = self.doing == FALLS
@@ -91,8 +124,7 @@ class EndlessGoal(GeneratorGoal):
 
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
         """Notes worlds that have lost their motion, and leads those that have come to rest back."""
-        if self.recovery_clips is None:
-            return False
+        self._arrive(qpos)
         falling, returning = self.doing == FALLS, self.doing == RETURNS
         ref = self.layout.unpacked(self.now()).pos
         off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
@@ -102,9 +134,13 @@ class EndlessGoal(GeneratorGoal):
         self.doing[up] = TRACKS
         lost = off & ~falling & ~up
         for i in (lost & ~returning).nonzero().squeeze(-1).tolist():
-            self.falls.append((i, int(self.steps[i])))
+            if self.plans:
+                self.falls.append((i, int(self.steps[i])))
         self.doing[lost], self._since[lost] = FALLS, 0
         self._since += 1
+        if self.recovery_clips is None:
+            # It stays where it fell.
+            return bool((falling | lost).any())
         late = self._since > WAITS_S * self.rate_hz
         rests = falling & ((linvel.norm(dim=-1).mean(-1) < REST) | late)
         # What has not fallen needs no rest.
@@ -113,6 +149,16 @@ class EndlessGoal(GeneratorGoal):
         for i in rests.nonzero().squeeze(-1).tolist():
             self._lead(i, qpos[i].double().cpu())
         return bool((rests | falling | up).any())
+
+    def _arrive(self, qpos: Tensor) -> None:
+        """Notes characters that have reached their target."""
+        if not self.plans or not self.steering.targets:
+            return
+        for i in range(self.num_envs):
+            target = self.steering.target(int(self._passed[i]))
+            if target is not None and float((qpos[i, :2].double().cpu() - target).norm()) <= REACHED:
+                self._passed[i] += 1
+                self.reached.append((i, int(self.steps[i])))
 
     def _lead(self, world: int, qpos: Tensor) -> None:
         """A recovery motion for a world from where its character is, at the end of which it stands as
@@ -147,7 +193,7 @@ class EndlessGoal(GeneratorGoal):
 
     def rows(self) -> dict[str, Tensor]:
         own = {"doing": self.doing, "since": self._since, "steps": self.steps, "next": self._next,
-               "end": self._end, "until": self._until}  # fmt: skip
+               "end": self._end, "until": self._until, "passed": self._passed}  # fmt: skip
         return {**super().rows(), **own}
 
     def state(self) -> dict[str, Tensor]:

@@ -63,9 +63,17 @@ class GeneratorGoal(BufferedGoal):
         super().__init__(humanoid, rate_hz, num_envs, size, torch.device(device), seed)
         self.generator, self.lead = generator, lead
 
+    def begin(self, ids: Tensor) -> Tensor:
+        """`(n, past, 7 + n)` frames from which motions of worlds `ids (n,)` begin."""
+        return self.generator.begin(len(ids), self.rng)
+
+    def make(self, past: Tensor, ids: Tensor) -> Tensor:
+        """`(n, future, 7 + n)` frames that follow `past (n, past, 7 + n)` in worlds `ids (n,)`."""
+        return self.generator.generate(past, ids, self.rng)
+
     def draw(self, ids: Tensor) -> None:
         """New motions in worlds `ids`."""
-        frames = self.generator.begin(len(ids), self.rng)
+        frames = self.begin(ids)
         want = (len(ids), self.generator.past, self.humanoid.model.nq)
         if frames.shape != want or not bool(frames.isfinite().all()):
             raise PoiseError(
@@ -87,7 +95,7 @@ class GeneratorGoal(BufferedGoal):
             return
         index = self.count[short].unsqueeze(1) - g.past + torch.arange(g.past, device=self.device)
         past = self.qpos[short.unsqueeze(1), index.clamp_min(0) % self.size]
-        made = g.generate(past, short, self.rng).to(past)
+        made = self.make(past, short).to(past)
         if made.shape != (len(short), g.future, past.shape[-1]):
             raise PoiseError(
                 f"the generator made {tuple(made.shape)} coordinates, and {len(short)} motions of "

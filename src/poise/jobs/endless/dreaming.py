@@ -1,136 +1,74 @@
-"""A character that goes about without end: a kinematic policy says what comes next, and a control policy
+"""Characters that go about without end: a kinematic policy says what comes next, and a control policy
 that knows many motions does it (Residual Force Control, section 5), without help and without training.
 
-made = dream(60, "runs/endless")
+made = dream(60)
 made.clip, made.falls, made.save("out.bvh")
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
 from poise.env.goals import EndlessGoal
+from poise.env.goals.led import TRACKS
+from poise.env.goals.steering import Steering
 from poise.errors import PoiseError
 from poise.eval import simulate
+from poise.jobs.endless.config import Dream
+from poise.jobs.endless.dreamt import Character, Dreamt
+from poise.jobs.endless.frames import Body, FrameStore, Pieces
 from poise.jobs.endless.model import GeneratorModel, load_generator
+from poise.jobs.endless.writing import MotionWriter
 from poise.jobs.open import open_run
-from poise.jobs.result import Result, Shown
-from poise.jobs.track.controllers import look_ahead
+from poise.jobs.track.controllers import NO_CRITIC, look_ahead
+from poise.jobs.track.crowd import crowd, places
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
-from poise.kin import hold_feet, qpos_to_clip
-from poise.motion import Clip
-from poise.motion.io import home_suffix, write_clip
-from poise.plan import LookaheadConfig
-from poise.settings import changed, validate
+from poise.learn.run import interruptible
+from poise.motion import Clip, read_clip
+from poise.settings import changed
+from poise.sim.guard import UnstableError
+from poise.synth.generator import Kinematic
 
 #: Is told what is done, and how many control steps of how many.
 Show = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class Dream:
-    """How a character goes about.
-
-    Attributes:
-        temperature: deviation of what the kinematic policy draws; below 1 motion is more usual.
-        seed: of all draws.
-        controller: the policy looks ahead before it acts, or acts at once.
-        lookahead: how it looks ahead; its seed is `seed`.
-        recover: a character that has fallen gets up and goes on.
-        threads: cores of lookahead, 0 is all of them.
-    """
-
-    temperature: float = 1.0
-    seed: int = 0
-    controller: Literal["lookahead", "policy"] = "lookahead"
-    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
-    recover: bool = True
-    threads: int = 0
-
-    def __post_init__(self) -> None:
-        validate(self)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Dreamt(Result):
-    """What a character did.
-
-    Attributes:
-        motion: as it was simulated, on the body's skeleton.
-        asked: what the kinematic policy made, in the same frames.
-        falls: s at which it lost its motion.
-        back: s at which it was up again.
-        tracker: the control policy.
-        notes: sentences.
-    """
-
-    motion: Clip
-    asked: Clip
-    falls: tuple[float, ...]
-    back: tuple[float, ...]
-    tracker: Tracker
-    notes: tuple[str, ...] = ()
-
-    @property
-    def clip(self) -> Clip:
-        """The motion with standing feet held in place."""
-        return hold_feet(self.motion, self.tracker.humanoid.table)[0]
-
-    @property
-    def falls_per_hour(self) -> float:
-        """How often it lost its motion."""
-        return 3600.0 * len(self.falls) / self.motion.seconds
-
-    @property
-    def sentence(self) -> str:
-        """What became of it."""
-        said = f"{self.motion.seconds:.0f} s without help"
-        if not self.falls:
-            return f"{said}, without a fall."
-        times = "once" if len(self.falls) == 1 else f"{len(self.falls)} times"
-        lying = len(self.falls) - len(self.back)
-        rest = "and got up each time" if lying <= 0 else f"and did not get up {lying} times"
-        return f"{said}; the character lost its motion {times}, first at {self.falls[0]:.1f} s, {rest}."
-
-    def _shown(self) -> Shown:
-        return Shown(self.clip, self.asked, None, (self.sentence, *self.notes))
-
-    def _save_all(self, folder: Path) -> dict[str, Path]:
-        paths: dict[str, Path] = {}
-        for name, clip in (("simulated", self.clip), ("asked", self.asked)):
-            paths[name] = folder / f"{name}{home_suffix(clip)}"
-            write_clip(clip, paths[name])
-        return paths
-
-
 def dream(
-    seconds: float,
-    generator: GeneratorModel | str | Path,
+    seconds: float = 60.0,
+    generator: GeneratorModel | str | Path | None = None,
     policy: Tracker | str | Path | None = None,
     config: Dream | None = None,
     *,
+    seed_clip: Clip | str | Path | None = None,
+    out: str | Path | None = None,
     progress: Show | None = None,
     **settings: Any,
 ) -> Dreamt:
-    """Lets a character go about for some seconds, from one of the generator's pasts.
+    """Lets characters go about for some seconds.
 
     Args:
-        generator: a kinematic policy, its file or its run's folder.
+        generator: a kinematic policy, its file or its run's folder; by default the one that comes with
+            Poise.
         policy: the control policy; by default the one that comes with Poise.
-        config: how; `settings` are those that differ.
+        config: how; `settings` are those that differ, such as temperature=0.8 or targets=((5, 0),).
+        seed_clip: the motion goes on from the end of this clip, which may have another skeleton; by
+            default from a second of the library, drawn by the seed.
+        out: a motion file that is written as the motion is made, "NAME-2.bvh" and so on for further
+            characters.
         progress: is told what is done.
 
     Raises:
-        PoiseError: no such generator or policy, or they are of different bodies.
+        PoiseError: no such generator or policy, or they are of different bodies; a seed clip that is too
+            short; no room for the file.
     """
     config = changed(config or Dream(), settings)
     if not 0.1 <= seconds <= 36_000:
@@ -138,70 +76,161 @@ def dream(
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
     model = generator if isinstance(generator, GeneratorModel) else load_generator(generator)
     made = model.generator(tracker.humanoid, config.temperature)
-    rate, steps = tracker.config.sim.control_hz, round(seconds * tracker.config.sim.control_hz)
+    rate = tracker.config.sim.control_hz
     if model.fps != rate:
         raise PoiseError(f"the generator makes {model.fps:g} frames a second, the policy does {rate:g}")
+    steps = max(1, round(seconds * rate))
     notes: list[str] = []
     if config.recover and tracker.recovery_clips is None:
-        notes.append("The policy has not learned to get up, so it stays where it falls.")
+        notes.append("The policy has not learned to get up, so a character stays where it falls.")
+    if config.controller == "lookahead" and tracker.value is None:
+        notes.append(NO_CRITIC)
+    pasts = begun(made, config, None if seed_clip is None else past_of(seed_clip, made, tracker))
+    body = Body(tracker.humanoid.table, tracker.example, rate)
+    characters = [
+        Character(FrameStore(7 + len(model.hinges)), FrameStore(7 + len(model.hinges)))
+        for _ in range(config.count)
+    ]
+    writers = [
+        MotionWriter(path, tracker.example, steps)
+        for path in ([] if out is None else names_of(Path(out), config.count))
+    ]
+    pieces = [
+        Pieces(c.done, body, w.add, w.path.stem, config.hold_feet)
+        for c, w in zip(characters, writers, strict=False)
+    ]
+    seen = _Seen(characters, pieces, steps, progress)
+    try:
+        with interruptible() as interrupt:
+            seen.stopped = interrupt.is_set
+            goal = _go_about(tracker, made, config, pasts, steps, seen, notes)
+            interrupted = interrupt.is_set()
+        for piece in pieces:
+            piece.finish()
+        paths = tuple(p for w in writers if (p := w.close()) is not None)
+    finally:
+        for writer in writers:
+            writer.discard()
+    return Dreamt(
+        tracker, body, tuple(characters),
+        tuple((i, s / rate) for i, s in goal.falls), tuple((i, s / rate) for i, s in goal.back),
+        tuple((i, s / rate) for i, s in goal.reached), config, (*notes, *goal.notes), paths, interrupted,
+    )  # fmt: skip
+
+
+def begun(generator: Kinematic, config: Dream, past: Tensor | None) -> Tensor:
+    """`(N, p, 7 + n)` pasts from which characters begin, side by side, the first at the origin."""
+    rng = torch.Generator().manual_seed(config.seed)
+    pasts = generator.begin(config.count, rng)
+    if past is not None:
+        pasts = past.double().expand(config.count, -1, -1).clone()
+        pasts[..., :2] -= pasts[:, -1:, :2].clone()
+    pasts[..., :2] += torch.tensor(places(config.count))[:, None]
+    return pasts
+
+
+def past_of(clip: Clip | str | Path, generator: Kinematic, tracker: Tracker) -> Tensor:
+    """The last `(p, 7 + n)` frames of a clip on a policy's body, onto which it is retargeted.
+
+    Raises:
+        PoiseError: the clip cannot be read, or is too short.
+    """
+    clip = clip if isinstance(clip, Clip) else read_clip(clip)
+    qpos = torch.tensor(place(clip, tracker).qpos)
+    if len(qpos) < generator.past:
+        raise PoiseError(
+            f"the generator sees {generator.past} frames at {generator.fps:g} Hz, "
+            f"{generator.past / generator.fps:.1f} s, and the seed clip has {len(qpos)}",
+            clip.name, "Give a longer one",
+        )  # fmt: skip
+    return qpos[-generator.past :]
+
+
+def names_of(out: Path, count: int) -> list[Path]:
+    """The file of each character's motion."""
+    return [out, *(out.with_name(f"{out.stem}-{k}{out.suffix}") for k in range(2, count + 1))]
+
+
+def _go_about(
+    tracker: Tracker, made: Kinematic, config: Dream, pasts: Tensor, steps: int, seen: _Seen,
+    notes: list[str],
+) -> EndlessGoal:  # fmt: skip
+    """Simulates until all steps are made or `seen` has seen enough; the goal that was followed."""
+    steering = Steering(config.targets, config.count > 1)
 
     def goal(worlds: int, plans: bool) -> EndlessGoal:
         clips = tracker.recovery_clips if config.recover else None
         lead = max(config.lookahead.horizon, *tracker.config.window, 1) + 1
-        out = EndlessGoal(
-            made, tracker.humanoid, rate, clips, worlds, seed=config.seed, lead=lead, plans=plans
-        )
-        out.draw(torch.arange(worlds))
-        return out
+        own = EndlessGoal(
+            made, tracker.humanoid, tracker.config.sim.control_hz, clips, worlds, seed=config.seed,
+            lead=lead, plans=plans, steering=steering,
+            pasts=pasts if plans else pasts[:1].expand(worlds, -1, -1),
+        )  # fmt: skip
+        own.draw(torch.arange(worlds))
+        return own
 
     # The body's own task; what it follows is the goal.
     task = imitation_of(tracker, [place(tracker.example, tracker)])
     task = replace(task, task=replace(task.task, help_by="all"))
-    env, own = task.env(1, None, False, 1, help_scale=0.0), goal(1, True)
+    rows = crowd(task.humanoid, task.config.sim, config.count) if config.count > 1 else None
+    env, own = task.env(1, None, False, 1, help_scale=0.0, backend=rows), goal(config.count, True)
+    seen.goal = own
     acts: Acts = tracker.policy
     ahead = None
     if config.controller == "lookahead" and tracker.value is not None:
         acts = ahead = look_ahead(tracker, task, config.lookahead, config.threads, config.seed)
         ahead.copies.set_goal(goal(ahead.copies.num_envs, False))
-        ahead.watch(env)
-    seen = _Seen(own, steps, progress)
     try:
-        env.backend.write(None, *own.start(None))
-        env.age[:] = 0
-        simulate(env, acts, env.set_goal(own), steps, seen)
+        while len(seen) < steps and not seen.stopped():
+            # Characters stand where their motion is: at the beginning, and after a simulation went bad.
+            if ahead is not None:
+                ahead.watch(env)
+            env.backend.write(None, *own.start(None))
+            env.age[:] = 0
+            try:
+                simulate(env, acts, env.set_goal(own), steps - len(seen), seen)
+            except UnstableError as problem:
+                at = len(seen) / tracker.config.sim.control_hz
+                notes.append(
+                    f"The simulation went bad at {at:.1f} s ({problem.failures[0].cause}); all began "
+                    "anew on their motion."
+                )
+                own.doing[:] = TRACKS
+                env.action[:] = 0
     finally:
         env.close()
         if ahead is not None:
             ahead.copies.close()
-    table, example = tracker.humanoid.table, tracker.example
-
-    def clip(frames: list[Tensor], name: str) -> Clip:
-        qpos = torch.stack(frames).double().numpy()
-        # Joints without hinges stay as the first frame of the body's example has them.
-        rot = example.rot[:1].repeat(len(qpos), 0)
-        like = example.replaced(root_pos=qpos[:, :3].copy(), rot=rot, fps=rate, name=name, cyclic=False)
-        return qpos_to_clip(qpos, table, example.skeleton, rate, like, name)
-
-    times = (tuple(s / rate for _, s in x) for x in (own.falls, own.back))
-    falls, back = times
-    return Dreamt(
-        clip(seen.qpos, "dream"), clip(seen.asked, "asked"), falls, back, tracker,
-        (*notes, *own.notes),
-    )  # fmt: skip
+    return own
 
 
 class _Seen:
-    """Observes where the character is, and where it was to be."""
+    """Observes where characters are, and where they were to be.
 
-    def __init__(self, goal: EndlessGoal, steps: int, show: Show | None):
-        self.goal, self.steps, self.show = goal, steps, show
-        self.qpos, self.asked = list[Tensor](), list[Tensor]()
-        self._one = torch.zeros(1, dtype=torch.long)
+    Attributes:
+        goal: what they follow. stopped: whether Ctrl-C was pressed.
+    """
+
+    goal: EndlessGoal
+    stopped: Callable[[], bool]
+
+    def __init__(self, characters: list[Character], pieces: list[Pieces], steps: int, show: Show | None):
+        self.characters, self.pieces, self.steps, self.show = characters, pieces, steps, show
+        self._all = torch.arange(len(characters))
+
+    def __len__(self) -> int:
+        return self.characters[0].done.count
 
     def see(self, env: ImitationEnv, step: int) -> bool:
-        """Keeps control step `step`."""
-        self.qpos.append(env.backend.state.qpos[0].float().clone())
-        self.asked.append(self.goal.coordinates(self._one, self.goal.at)[0][0].float())
+        """Keeps a control step; the state before the first one is that of the past, which is known."""
+        if step == 0:
+            return self.stopped()
+        asked = self.goal.coordinates(self._all, self.goal.at)[0]
+        for k, character in enumerate(self.characters):
+            character.done.append(env.backend.state.qpos[k].cpu().numpy())
+            character.asked.append(asked[k].cpu().numpy())
+        for piece in self.pieces:
+            piece.more()
         if self.show is not None:
-            self.show("going about", step, self.steps)
-        return False
+            self.show("going about", len(self), self.steps)
+        return self.stopped()

@@ -13,14 +13,20 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.state import load_module, prefixed
+from poise.learn.state import load_module, prefixed, take
+from poise.nets.cosine_cvae import CosineCVAE, make_cvae
 from poise.nets.cvae import CVAE, CVAEConfig
 from poise.settings import from_data
-from poise.synth.generator import Kinematic
+from poise.synth.generator import Codes, Kinematic
 from poise.synth.place_free import ROOT
 
 #: The file in a run's folder.
 GENERATOR = "generator.safetensors"
+#: The one that comes with Poise.
+SHIPPED = Path(__file__).parents[2] / "data" / GENERATOR
+#: How the names of the encoder's weights begin.
+ENCODER = ("net/encoder", "net/posterior", "net/coming")
+_CODES = ("keys", "mean", "log_var", "weights")
 
 
 class _Meta(TypedDict):
@@ -42,14 +48,16 @@ class GeneratorModel:
         hinges: names of the body's hinges, in order.
         fps: frames a second.
         about: clips, steps, seconds, seed of the training.
+        codes: from which z is drawn; None draws it from N(0, I).
     """
 
-    net: CVAE
+    net: CVAE | CosineCVAE
     seeds: Tensor
     bounds: Tensor
     hinges: tuple[str, ...]
     fps: float
     about: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    codes: Codes | None = None
 
     def generator(self, humanoid: Humanoid, temperature: float = 1.0) -> Kinematic:
         """What makes its motion for a body.
@@ -62,14 +70,17 @@ class GeneratorModel:
                 "the generator is of another body",
                 hint="Give the policy that it was trained with, or train a generator for this one",
             )
-        return Kinematic(self.net, self.seeds, self.fps, temperature, self.bounds)
+        return Kinematic(self.net, self.seeds, self.fps, temperature, self.bounds, self.codes)
 
     def save(self, path: Path, half: bool = False) -> None:
-        """Writes it as one file; `half` keeps weights in half precision."""
+        """Writes it as one file; `half` keeps numbers in half precision, and leaves out the encoder,
+        which only training needs."""
         weights = prefixed("net", self.net.state_dict())
         tensors = {**weights, "seeds": self.seeds.float(), "bounds": self.bounds.float()}
+        if self.codes is not None:
+            tensors |= {f"codes/{k}": getattr(self.codes, k) for k in _CODES}
         if half:
-            tensors = {k: v.half() for k, v in tensors.items()}
+            tensors = {k: v.half() for k, v in tensors.items() if not k.startswith(ENCODER)}
         meta = {
             "kind": "kinematic policy", "config": asdict(self.net.config), "hinges": list(self.hinges),
             "fps": self.fps, "about": dict(self.about),
@@ -77,13 +88,13 @@ class GeneratorModel:
         save_checkpoint(path, tensors, meta)
 
 
-def load_generator(path: str | Path) -> GeneratorModel:
-    """A kinematic policy from its file or its run's folder.
+def load_generator(path: str | Path | None = None) -> GeneratorModel:
+    """A kinematic policy from its file or its run's folder; by default the one that comes with Poise.
 
     Raises:
         PoiseError: there is none, or the file is damaged or of another kind.
     """
-    file = Path(path)
+    file = SHIPPED if path is None else Path(path)
     file = file / GENERATOR if file.is_dir() else file
     tensors, meta = load_checkpoint(file, _Meta)
     if meta["kind"] != "kinematic policy":
@@ -96,9 +107,16 @@ def load_generator(path: str | Path) -> GeneratorModel:
         value = tensors.get(name, torch.empty(0))
         if value.ndim != len(shape) + 1 or value.shape[1:] != shape or not bool(value.isfinite().all()):
             raise PoiseError(f"the file's '{name}' is missing or damaged", file)
-    net = CVAE(ROOT + len(hinges), config, generator=torch.Generator().manual_seed(0))
+    net = make_cvae(ROOT + len(hinges), config, torch.Generator().manual_seed(0))
+    if not any(k.startswith(ENCODER) for k in tensors):
+        # It was left out.
+        own = prefixed("net", net.state_dict())
+        tensors |= {k: v for k, v in own.items() if k.startswith(ENCODER)}
     load_module(net, tensors, "net")
+    codes = None
+    if any(k.startswith("codes/") for k in tensors):
+        codes = Codes(*(take(tensors, f"codes/{k}") for k in _CODES))
     return GeneratorModel(
         net.eval(), tensors["seeds"].double(), tensors["bounds"].double(), hinges, float(meta["fps"]),
-        meta["about"],
+        meta["about"], codes,
     )  # fmt: skip

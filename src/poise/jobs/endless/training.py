@@ -4,27 +4,35 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.jobs.endless.model import GENERATOR, GeneratorModel
 from poise.jobs.perpetual.run import clips_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
+from poise.kin.fk import Kinematics
 from poise.learn.cvae import CVAEObjective, CVAETraining, Frames
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, train_inbetween
 from poise.motion import ClipLibrary
+from poise.nets.cosine_cvae import CosineCVAE, make_cvae
 from poise.nets.cvae import CVAE, CVAEConfig
 from poise.settings import to_data, validate
-from poise.synth.place_free import ROOT, features_of
+from poise.synth.generator import Codes
+from poise.synth.place_free import ROOT, coordinates, features_of
 
 #: Pasts that are kept, from which motions begin.
 SEEDS = 256
+#: Windows below which a library is too small.
+LEAST_WINDOWS = 50
+#: Share of the mean weight that every number has, and how long velocities are thought to last, s.
+LEAST, LASTS = 0.3, 0.5
 
 
 @dataclass(frozen=True)
@@ -32,16 +40,20 @@ class Endless:
     """Settings of a kinematic policy's training.
 
     Attributes:
-        net, training: see `nets.cvae` and `learn.cvae`.
-        steps: of the whole training.
+        net: sizes and kind of the network, see `nets.cvae`.
+        training: see `learn.cvae`.
+        steps: steps of the whole training.
         ema: how much of the averaged weights stays at each step.
-        seed: of the first weights and all draws.
+        codes: windows of the library that are kept as codes, from which z is drawn; 0 draws z from
+            N(0, I), as the paper does.
+        seed: seed of everything random.
     """
 
-    net: CVAEConfig = field(default_factory=CVAEConfig)
+    net: CVAEConfig = field(default_factory=lambda: CVAEConfig(decoder="cosine", hidden=512, latent=64))
     training: CVAETraining = field(default_factory=CVAETraining)
-    steps: int = 8000
+    steps: int = 20_000
     ema: float = 0.999
+    codes: int = 4096
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -50,7 +62,7 @@ class Endless:
     @classmethod
     def paper(cls) -> Endless:
         """What the paper states: 1,000 epochs of 10,000 windows in minibatches of 256."""
-        return cls(training=CVAETraining.paper(), steps=40_000, ema=0.0)
+        return cls(CVAEConfig(), CVAETraining.paper(), steps=40_000, ema=0.0, codes=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +73,7 @@ class Motions:
         frames: windows of frames that know no place, see `synth.place_free`.
         seeds: `(S, p, 7 + n)` pasts of the library, evenly spread.
         bounds: `(2, n)` rad, least and most of each hinge.
+        reach: `(10 + n)` m, how far a deviation of each number moves the body, see `reach_of`.
         hinges: names.
         fps: frames a second.
         clips: names.
@@ -69,9 +82,16 @@ class Motions:
     frames: Frames
     seeds: Tensor
     bounds: Tensor
+    reach: Tensor
     hinges: tuple[str, ...]
     fps: float
     clips: tuple[str, ...]
+
+    @property
+    def weights(self) -> Tensor:
+        """Of the squares of a frame's numbers: all hinges are not worth the same."""
+        share = self.reach.square() / self.reach.square().mean()
+        return (share + LEAST) / (1 + LEAST)
 
 
 def motions_of(
@@ -80,17 +100,18 @@ def motions_of(
     """The clips on a policy's body.
 
     Raises:
-        PoiseError: too few frames in a row.
+        PoiseError: too few windows.
     """
     rate = tracker.config.sim.control_hz
     qpos = [torch.tensor(place(c, tracker).qpos) for c in library]
     window = config.past + config.future
     usable = sum(max(0, len(q) - window + 1) for q in qpos)
-    if not usable:
+    if usable < LEAST_WINDOWS:
         longest = max((len(q) for q in qpos), default=0)
         raise PoiseError(
-            f"no clip has {window} frames in a row at {rate:g} Hz; the longest has {longest}",
-            hint="Give longer clips, or a shorter past and future",
+            f"the library has {usable} windows of {window} frames in a row at {rate:g} Hz, and at least "
+            f"{LEAST_WINDOWS} are needed; its longest clip has {longest} frames",
+            hint=f"Give more clips that last longer than {window / rate:.1f} s",
         )
     tell(f"{len(qpos)} clips, {usable:,} windows of {window} frames")
     parts = [features_of(q, rate).float() for q in qpos]
@@ -99,10 +120,31 @@ def motions_of(
     picks = np.linspace(0, len(pasts) - 1, min(SEEDS, len(pasts))).round().astype(int)
     angles = torch.cat(qpos)[:, 7:]
     bounds = torch.stack((angles.amin(0), angles.amax(0)))
+    frames = torch.cat(parts)
     return Motions(
-        Frames(torch.cat(parts), first), torch.stack([pasts[i] for i in picks]), bounds,
-        tuple(tracker.humanoid.hinges), rate, tuple(c.name for c in library),
+        Frames(frames, first), torch.stack([pasts[i] for i in picks]), bounds,
+        reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate,
+        tuple(c.name for c in library),
     )  # fmt: skip
+
+
+def reach_of(frames: Tensor, table: BodyTable, fps: float, samples: int = 48) -> Tensor:
+    """How far one deviation of each number of `frames (F, 10 + n)` moves the bodies' origins, root mean
+    square of some frames, m `(10 + n)`; of velocities, in half a second."""
+    some = frames[torch.linspace(0, len(frames) - 1, samples).long()].double()
+    kinematics, deviations = Kinematics(table), frames.double().std(0)
+    last = torch.zeros(samples, frames.shape[1] - ROOT + 7).double()
+    last[:, 3] = 1.0
+
+    def places(numbers: Tensor) -> Tensor:
+        return kinematics(coordinates(numbers[:, None], last, fps)[:, 0]).pos
+
+    out = torch.empty(frames.shape[1])
+    for k, deviation in enumerate(deviations):
+        other = some.clone()
+        other[:, k] += deviation * (LASTS * fps if k < 3 else 1.0)
+        out[k] = (places(other) - places(some)).square().sum(-1).mean().sqrt().float()
+    return out
 
 
 def read_motions(
@@ -123,31 +165,56 @@ def train_generator(
     config: Endless | None = None,
     minutes: float | None = None,
     on_block: Callable[[BlockStats], bool | None] | None = None,
-) -> tuple[GeneratorModel, bool]:
+) -> tuple[GeneratorModel, BlockStats | None, bool]:
     """Trains, or goes on training, in `folder`, and writes the model there.
 
     Returns:
-        the model, and whether Ctrl-C ended the training early.
+        the model, the last block (None where nothing was left to do), and whether Ctrl-C ended the
+        training early.
 
     Raises:
         PoiseError: the folder holds a training with other settings or of another library.
     """
     c = config or Endless()
-    features = ROOT + len(motions.hinges)
-    net = CVAE(features, c.net, generator=torch.Generator().manual_seed(c.seed))
-    net.calibrate(motions.frames.frames)
-    learner = CVAEObjective(net, c.training, c.steps)
     trainer = InbetweenTrainer(
-        learner, motions.frames, c.seed, c.steps, c.training.batch, ema=c.ema,
+        learner_of(motions, c), motions.frames, c.seed, c.steps, c.training.batch, ema=c.ema,
         metadata={"config": to_data(c), "clips": list(motions.clips)},
     )  # fmt: skip
-    _, stopped = train_inbetween(trainer, folder, minutes, on_block, tensorboard=False)
+    stats, stopped = train_inbetween(trainer, folder, minutes, on_block, tensorboard=False)
     made = copy.deepcopy(trainer.averaged).eval()
-    assert isinstance(made, CVAE)
+    assert isinstance(made, CVAE | CosineCVAE)
     about = {
         "clips": list(motions.clips), "frames": len(motions.frames.frames), "steps": trainer.step,
         "of": c.steps, "seconds": round(trainer.seconds, 1), "seed": c.seed,
     }  # fmt: skip
-    model = GeneratorModel(made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about)
+    codes = codes_of(made, motions, c.codes) if c.codes else None
+    model = GeneratorModel(
+        made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about, codes
+    )
     model.save(folder / GENERATOR)
-    return model, stopped
+    return model, stats, stopped
+
+
+def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
+    """A fresh network, calibrated to the motions, with how it learns."""
+    features = ROOT + len(motions.hinges)
+    net = make_cvae(features, config.net, torch.Generator().manual_seed(config.seed))
+    net.calibrate(motions.frames.frames)
+    return CVAEObjective(net, config.training, config.steps, motions.weights)
+
+
+@torch.no_grad()
+def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int) -> Codes:
+    """Codes of windows of the library, evenly spread."""
+    p, window = net.config.past, net.config.past + net.config.future
+    frames, room = motions.frames.frames, motions.frames.room
+    usable = (room >= window).nonzero()[:, 0]
+    start = usable[torch.linspace(0, len(usable) - 1, min(count, len(usable))).long()]
+    codes = Codes(torch.empty(0), torch.empty(0), torch.empty(0), motions.weights.sqrt())
+    parts = list[tuple[Tensor, Tensor, Tensor]]()
+    for some in start.split(512):
+        x = net.scaled(frames[some[:, None] + torch.arange(window)])
+        code = net.encode(x[:, :p], x[:, p:])
+        parts.append((codes.key_of(x[:, :p]), code.mean, code.log_var))
+    keys, mean, log_var = (torch.cat(x) for x in zip(*parts, strict=True))
+    return replace(codes, keys=keys, mean=mean, log_var=log_var)

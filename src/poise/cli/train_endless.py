@@ -1,0 +1,81 @@
+"""`poise train endless`: a kinematic policy for `poise dream` from a folder of clips."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from poise.cli.answer import Answer
+from poise.cli.console import say, tell
+from poise.cli.library_options import Library
+from poise.cli.output import claimed
+from poise.cli.progress import showing
+from poise.cli.train_inbetween import times
+from poise.cli.training import held_already
+from poise.cli.training import stopped as interrupted
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.cli.options import Training
+    from poise.jobs.endless.training import Endless
+    from poise.learn.inbetween import BlockStats
+
+
+def run(
+    library: Library, config: Endless, out: Path, training: Training, policy: Path | None, again: str
+) -> Answer:
+    """Trains until the last step or Ctrl-C.
+
+    policy: the control policy; clips are brought onto its body; by default that of Poise.
+    """
+    import torch
+
+    from poise.jobs.endless.model import GENERATOR
+    from poise.jobs.endless.run import RUN_FILE, begin
+    from poise.jobs.endless.training import train_generator
+    from poise.jobs.open import open_run
+
+    folder = library.folder("endless")
+    for name in ("backwards", "onto"):
+        if getattr(library, name):
+            hint = "Leave it out; --from POLICY chooses the body" if name == "onto" else "Leave it out"
+            raise PoiseError(f"the recipe endless has no --{name}", hint=hint)
+    if (out / RUN_FILE).exists() and not training.resume:
+        raise held_already(out)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    torch.set_num_threads(training.threads or cores)
+    if training.iterations is not None:
+        from poise.cli.settings import configured
+
+        config = configured(config, {"steps": training.iterations})
+    counted = training.iterations is not None or training.preset == "paper"
+    with claimed(out):
+        motions, config = begin(
+            out, folder, open_run(policy).tracker, config, None if counted else training.minutes,
+            () if library.hold_out is None else (library.hold_out,),
+            () if library.never is None else (library.never,), library.reading(), library.source(), tell,
+        )  # fmt: skip
+    frames = len(motions.frames.frames)
+    say(f"{len(motions.clips)} clips, {frames:,} frames to learn from; {config.steps:,} steps")
+    with showing("training") as show:
+        _, stats, stopped = train_generator(
+            motions, out, config, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}")
+        )
+    if stopped:
+        return interrupted(out, again)
+    if stats is None:
+        say(f"{out} had reached its last step before; nothing was trained.")
+    else:
+        say(f"Trained {stats.seconds:.0f} s, {stats.samples:,} windows")
+        say(f"poise dream --generator {out} -o OUT lets a character go about by it")
+    result = None if stats is None else {"seconds": stats.seconds, "samples": stats.samples}
+    return Answer(result, {"run": out, "generator": out / GENERATOR})
+
+
+def figures(stats: BlockStats) -> str:
+    """What one block of steps says."""
+    names = {"loss": "loss", "square": "error", "kl": "KL", "own_square": "error on its own past"}
+    said = [f"{stats.samples_per_s:,.0f} windows/s"]
+    said += [f"{text} {stats.parts[k]:.1f}" for k, text in names.items() if k in stats.parts]
+    return "  ".join(said)

@@ -1,0 +1,50 @@
+"""How characters go about without end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from poise.env.goals.steering import Steering
+from poise.errors import PoiseError
+from poise.plan import LookaheadConfig
+from poise.settings import validate
+
+#: The most characters in a world.
+MOST = 16
+
+
+@dataclass(frozen=True)
+class Dream:
+    """How characters go about.
+
+    Attributes:
+        temperature: deviation of what the kinematic policy draws; below 1 motion is more usual.
+        count: characters in one world, which keep away from each other.
+        targets: x and y, in m, of points that each character is to reach one after another; it begins at
+            the origin.
+        seed: of all draws.
+        controller: the policy looks ahead before it acts, or acts at once.
+        lookahead: how it looks ahead; its seed is `seed`.
+        recover: a character that has fallen gets up and goes on.
+        hold_feet: standing feet are held in place in what is written.
+        threads: cores of lookahead, 0 is all of them.
+    """
+
+    temperature: float = 1.0
+    count: int = 1
+    targets: tuple[tuple[float, float], ...] = ()
+    seed: int = 0
+    controller: Literal["lookahead", "policy"] = "lookahead"
+    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
+    recover: bool = True
+    hold_feet: bool = True
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if not 1 <= self.count <= MOST:
+            raise PoiseError(f"there may be 1 to {MOST} characters, got {self.count}")
+        if not 0 <= self.temperature <= 10:
+            raise PoiseError(f"the temperature must lie in 0 to 10, got {self.temperature:g}")
+        Steering(self.targets)

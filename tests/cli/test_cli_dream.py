@@ -1,0 +1,85 @@
+"""`poise dream` and `poise train endless`, from the command line to files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from poise.cli.dream import targets_of
+from poise.cli.main import main
+from poise.errors import PoiseError
+from poise.jobs.endless.training import Endless
+from poise.motion import read_clip
+from poise.motion.io import write_clip
+from poise.nets.cvae import CVAEConfig
+from poise.settings import to_toml
+from toy_policy import walk
+
+
+def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.bvh"
+    argv = ["dream", "--seconds", "0.5", "--controller", "policy", "--threads", "1", "-o", str(out)]
+    assert main([*argv, "--steer", "5,0", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["result"]["outcome"] == "dreamt" and said["result"]["falls"] == []
+    assert read_clip(out).frames == 15
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"score.json", "report.html"}
+    assert main(argv) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--seconds", "0"], "--seconds must lie in 0.1 to 36000"),
+        (["--steer", "5"], "'5' is no point"),
+        (["--count", "99"], "1 to 16 characters"),
+        (["--temperature", "-1"], "temperature must lie in 0 to 10"),
+        (["--generator", "none"], "could not be read"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    more: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["dream", "-o", str(tmp_path / "out"), *more]) == 2
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith("error: ") and said in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_points_stand_on_the_line_or_in_a_file(tmp_path: Path) -> None:
+    assert targets_of("5,0 -1.5,2") == ((5.0, 0.0), (-1.5, 2.0))
+    (tmp_path / "way.txt").write_text("# there and back\n5, 0\n\n0,0  # home\n")
+    assert targets_of(str(tmp_path / "way.txt")) == ((5.0, 0.0), (0.0, 0.0))
+    (tmp_path / "way.txt").write_text("# nothing\n")
+    with pytest.raises(PoiseError, match="1 to 10,000 points, got 0"):
+        targets_of(str(tmp_path / "way.txt"))
+
+
+def test_a_generator_is_trained_and_gone_on_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    library, run = tmp_path / "clips", tmp_path / "run"
+    library.mkdir()
+    write_clip(walk(), library / "one.bvh")
+    settings = tmp_path / "small.toml"
+    argv = ["train", "endless", "--library", str(library), "-o", str(run), "--iterations", "4",
+            "--threads", "1", "--config", str(settings)]  # fmt: skip
+    settings.write_text(to_toml(Endless()))
+    assert main(argv) == 2
+    assert "the library has 0 windows of 90 frames" in capsys.readouterr().err and not run.exists()
+    net = CVAEConfig(past=10, future=12, latent=4, hidden=16, decoder="cosine", cosines=6)
+    settings.write_text(to_toml(Endless(net)))
+    assert main(argv) == 0
+    said = capsys.readouterr()
+    assert "4 steps" in said.out and (run / "generator.safetensors").exists()
+    assert main(argv) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert main([*argv, "--resume"]) == 0
+    assert "nothing was trained" in capsys.readouterr().out
+    other = [*argv, "--resume"]
+    other[other.index("4")] = "5"
+    assert main(other) == 2
+    assert "another library or with other settings" in capsys.readouterr().err
