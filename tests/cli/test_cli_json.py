@@ -20,6 +20,8 @@ from poise.motion import read_clip, trim, write_clip
 from poise.settings import plain
 from toy_policy import WALK, toy_run
 
+#: No lookahead.
+ALONE = ("--controller", "policy")
 KEYS = ("poise", "verb", "ok", "exit_code", "inputs", "outputs", "notes", "result", "error")
 
 
@@ -64,18 +66,9 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
         "eval": [trained],
         "play": [trained, "-o", out / "o.html"],
         "doctor": [short, "--fix", "-o", out / "o.bvh"],
-        "dream": [
-            "--seconds",
-            "0.3",
-            "--controller",
-            "policy",
-            "--threads",
-            "1",
-            "--seed-clip",
-            short,
-            "-o",
-            out / "o",
-        ],
+        "dream": ["--seconds", "0.3", *ALONE, "--threads", "1", "--seed-clip", short, "-o", out / "o"],
+        "push": [WALK, "--force", "20", "--seconds", "0.1", *ALONE, "-o", out / "o"],
+        "live": [short, "--seconds", "1", "--port", "0", "--record", "-o", out / "o.bvh"],
     }
     return given[verb], 0
 
@@ -97,7 +90,8 @@ def test_errors_are_documents_too(verb: str, tmp_path: Path, answered: Callable[
     check(found)
     assert f"poise {verb} --help" in found["error"]["hint"] and found["result"] is None
     if verb not in ("train", "inbetween", "complete", "retarget", "doctor", "dream"):
-        more = ["-o", tmp_path / "o.bvh"] if verb in ("imitate", "track", "convert", "fleet") else []
+        writes = ("imitate", "track", "push", "convert", "fleet")
+        more = ["-o", tmp_path / "o.bvh"] if verb in writes else []
         found = answered(verb, tmp_path / "absent.bvh", *more, code=2)
         assert found["inputs"] == [str(tmp_path / "absent.bvh")]
         assert "absent.bvh" in found["error"]["where"]

@@ -71,7 +71,7 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     lying = env.backend.state.qpos.clone()
     up = tracker.recovery_clips.ups[0][0]
     lying[1] = up.to(lying)
-    lying[1, :2] = torch.tensor([1.0, 0.5]).to(lying)
+    lying[1, :2] = ease[:2].to(lying) + torch.tensor([1.0, 0.5]).to(lying)
     still = torch.zeros_like(env.backend.state.qvel)
     env.backend.write(None, lying, still)
     obs = env.observe()

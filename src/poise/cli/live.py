@@ -60,6 +60,8 @@ class Options:
     """Open the page in the browser."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise, of blows and of lookahead."""
+    json: Flag = False
+    """Print one JSON document at the end and nothing else on stdout, see docs/json.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
