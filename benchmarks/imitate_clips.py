@@ -47,12 +47,11 @@ def measured(name: str, data: Path, minutes: float, seed: int, threads: int) -> 
     with tempfile.TemporaryDirectory() as folder:
         made = imitate(clip, minutes, folder=folder, threads=threads, seed=seed)
         card, total = made.card, time.perf_counter() - began
-        samples = int(made.policy.meta.get("samples", 0))
     return {
         "seconds": round(clip.seconds, 2), "first_whole": first.card.tracked == 1.0,
         "first_s": round(seen, 1), "first_mm": first.card.mpjpe_global_mm,
         "train_s": round(total - seen, 1),
-        "succ": card.succ, "mpjpe_mm": card.mpjpe_mm, "samples": samples, "threads": threads,
+        "succ": card.succ, "mpjpe_mm": card.mpjpe_mm, "threads": threads,
     }  # fmt: skip
 
 
