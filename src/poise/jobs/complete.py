@@ -38,7 +38,7 @@ KEY_WEIGHT = 20.0
 BUDGET, SLACK = 768.0, 0.3
 #: Rounds of retiming; a gap is made longer by so much in each in which it is not done; m by which a
 #: keyframe may be missed, on average over the joints, and still be met.
-ROUNDS, LONGER, MET_M = 4, 1.3, 0.1
+ROUNDS, LONGER, MET_M = 6, 1.3, 0.1
 
 #: Is told what is done, and how much of how much.
 Show = Callable[[str, int, int], None]
