@@ -76,11 +76,18 @@ def through_lock(angles: Tensor, order: str) -> Tensor:
 
 
 def within_turns(qpos: np.ndarray, humanoid: Humanoid) -> np.ndarray:
-    """`qpos (T, 7 + n)` with each hinge shifted by whole turns as near to its range as can be."""
-    middle = humanoid.model.jnt_range[1:].mean(-1)
-    turns = np.round((qpos[:, 7:].mean(0) - middle) / (2 * np.pi))
+    """`qpos (T, 7 + n)` with hinges that lie outside their ranges shifted by the whole turns that bring
+    them nearest. A range may have room for several turns: a hinge that lies in it stays where it is."""
+    low, high = humanoid.model.jnt_range[1:].T
+    mean = qpos[:, 7:].mean(0)
+    turns = np.round((mean - (low + high) / 2) / (2 * np.pi))
+
+    def outside(angle: np.ndarray) -> np.ndarray:
+        return np.maximum(np.maximum(low - angle, angle - high), 0.0)
+
+    nearer = outside(mean - 2 * np.pi * turns) < outside(mean)
     out = qpos.copy()
-    out[:, 7:] -= 2 * np.pi * turns
+    out[:, 7:] -= 2 * np.pi * np.where(nearer, turns, 0.0)
     return out
 
 

@@ -126,14 +126,16 @@ class _Choice:
 def draw_offsets(
     count: int, env: ImitationEnv, noise_range: tuple[float, float], rng: torch.Generator
 ) -> Tensor:
-    """`(count, A)` rad, random offsets of an environment's joint targets; none of what is no joint.
+    """`(count, A)`, offsets of an environment's actions that move its joint targets at random; none of
+    what is no joint.
 
-    noise_range: (low, high) rad, between which the deviation of each row is drawn, evenly in its
-        logarithm.
+    noise_range: (low, high) rad of the targets, between which the deviation of each row is drawn, evenly
+        in its logarithm.
     """
     low, high = noise_range
     size = low * (high / low) ** torch.rand(count, 1, generator=rng)
     out = size * torch.randn(count, env.num_actions, generator=rng)
+    out[:, : env.hinges] /= env.task.pd.scale
     out[:, env.hinges :] = 0.0
     return out
 
