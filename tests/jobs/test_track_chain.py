@@ -13,6 +13,7 @@ import pytest
 from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
+from poise.jobs.track import recovering
 from poise.jobs.track import track, write
 from poise.jobs.track.parts import cut, parts_of
 from poise.jobs.track.placement import home, place, place_all
@@ -118,6 +119,25 @@ def test_a_clip_that_is_lost_on_the_way_is_come_back_to(tracker: Tracker) -> Non
     first, second = tracked.parts
     assert first.lost is not None and not first.done and second.done
     assert tracked.failures == ((0, first.lost),)
+
+
+def test_a_clip_that_is_given_up_is_left_for_the_next(
+    tracker: Tracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recovering, "LOSSES", 0)
+    clips = apart((0.6, 0.0))
+    pos = clips[0].root_pos.copy()
+    pos[15:, 1] += 2.0
+    clips[0] = clips[0].replaced(root_pos=pos)
+    tracked = track(clips, tracker, controller="policy", recover=True)
+    first, second = tracked.parts
+    assert not first.done and first.lost is not None and second.done and second.begins is not None
+    losses = tracked.losses
+    assert losses is not None and losses.given_up == losses.lost[:1] and len(losses.back) == 1
+    assert "It left a clip for the next, first at" in losses.sentence()
+    # What follows is no part of it.
+    assert int(tracked.evaluation.rollouts.lengths[0]) > second.begins * 30
+    assert tracked.card.per_clip[0]["frames"] <= second.begins * 30 + 1
 
 
 def test_clips_of_other_skeletons_come_onto_the_first_ones(tracker: Tracker) -> None:

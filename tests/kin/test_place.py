@@ -39,6 +39,22 @@ def test_a_clip_on_the_bodys_skeleton_takes_every_step_once():
     assert on.ground.lift_m == ground.lift_m and on.cycle is None and on.joint_error_mm < 30
 
 
+def test_a_hinge_stays_where_its_range_has_room_for_turns():
+    clip = walk()
+    humanoid = make_humanoid(clip.skeleton, generate_table(clip.skeleton, None, [clip]))
+    q = clip_to_qpos(clip, humanoid.table)
+    low, high = humanoid.model.jnt_range[1:].T
+    turned = q.copy()
+    turned[:, 7:] += 2 * np.pi
+    # Outside its range it comes back, by whole turns.
+    shifted = within_turns(turned, humanoid)[:, 7:]
+    narrow = high - low < 2 * np.pi
+    np.testing.assert_allclose(shifted[:, narrow], q[:, 7:][:, narrow], atol=1e-12)
+    # A range from -1 to 2 turns has its middle half a turn off.
+    humanoid.model.jnt_range[1:] = (-2 * np.pi, 6 * np.pi)
+    np.testing.assert_array_equal(within_turns(q, humanoid), q)
+
+
 def test_another_skeleton_is_retargeted_and_steps_can_be_left_out():
     clip, large = walk(), human(1.3)
     table = generate_table(large, None, [])

@@ -206,6 +206,13 @@ class LedGoal(Goal):
             self._qpos = torch.cat((self._qpos, motion.qpos))
         self._on[worlds], self.at[worlds], self.doing[worlds] = True, 0, RETURNS
 
+    def leave(self, worlds: Tensor) -> None:
+        """Worlds `(n,)` leave their clips, and are led to the first frames of the next ones."""
+        self.goal.clip[worlds] += 1
+        self.frame[worlds] = self.at[worlds] = 0
+        self.doing[worlds], self._since[worlds], self._on[worlds] = FALLS, 0, False
+        self.goal.frame.copy_(self.frame)
+
     def _tidy(self) -> None:
         """Drops motions that no world is on, where they are most of the table."""
         on = self._on.nonzero().squeeze(-1)

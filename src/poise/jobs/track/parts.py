@@ -57,12 +57,13 @@ class Part:
 def cut(r: RolloutSet, spans: Sequence[Span], reference: Reference) -> RolloutSet:
     """One episode as an episode per clip of `reference`, without what lies between them.
 
-    A clip that was not reached has an episode without frames.
+    A clip that was not reached has an episode without frames, and that of one that was given up ends
+    where the next one begins.
     """
-    end = int(r.lengths[0])
-    rows = [
-        slice(0, 0) if b is None else slice(b, end if e is None else e + 1) for b, e in spans
-    ]  # fmt: skip
+    rows, end = list[slice](), int(r.lengths[0])
+    for b, e in reversed(spans):
+        rows.insert(0, slice(0, 0) if b is None else slice(b, end if e is None else e + 1))
+        end = end if b is None else b
     lengths = torch.tensor([row.stop - row.start for row in rows])
     most = max(1, int(lengths.max()))
 

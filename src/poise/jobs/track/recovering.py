@@ -25,17 +25,18 @@ from poise.plan import Lookahead, SamplingConfig, SamplingControl, SamplingResul
 from poise.recipes.imitation import Imitation
 from poise.spatial import slerp
 
-#: A motion that is lost more often is given up, and so is one that the character has left for so many s.
+#: A clip that is lost more often is given up, and so is one that the character has left for so many s.
 LOSSES, AWAY_S = 8, 30.0
 
 
 @dataclass(frozen=True)
 class Losses:
     """When a motion was lost and when it was found again, s of what comes out; `back` is shorter by one
-    where it was given up."""
+    where it was given up. given_up: when a clip was left for the next one, s."""
 
     lost: tuple[float, ...]
     back: tuple[float, ...]
+    given_up: tuple[float, ...] = ()
 
     def sentence(self) -> str:
         """What became of the motion."""
@@ -45,7 +46,11 @@ class Losses:
             last = f"the loss at {self.lost[-1]:.1f} s"
             return f"{said} and did not come back after {last}; the result ends where it was given up."
         away = sum(self.back) - sum(self.lost)
-        return f"{said} and came back; the motion waited for it, and is {away:.1f} s longer in all."
+        said = f"{said} and came back; the motion waited for it, and is {away:.1f} s longer in all."
+        if self.given_up:
+            clips = "a clip" if len(self.given_up) == 1 else f"{len(self.given_up)} clips"
+            said += f" It left {clips} for the next, first at {self.given_up[0]:.1f} s."
+        return said
 
 
 class Led(NamedTuple):
@@ -103,7 +108,7 @@ def led_along(
         how = tracker.recovery_clips, len(placed) > 1, returns
         goal = LedGoal(env.goal.clips, *how)
         led = _Led(goal, env.reference.coordinates(zero, zero)[0], show)
-        most = led.total + int((LOSSES + len(placed)) * AWAY_S * led.rate)
+        most = led.total + int((LOSSES + 1) * len(placed) * AWAY_S * led.rate)
         obs = env.set_goal(goal)
         if ahead is not None:
             ahead.copies.set_goal(LedGoal(ahead.copies.goal.clips, *how, plans=False))
@@ -112,7 +117,7 @@ def led_along(
     finally:
         env.close()
     replayed = Replay(torch.cat(led.actions))
-    losses = Losses(tuple(led.lost), tuple(led.back)) if led.lost else None
+    losses = Losses(tuple(led.lost), tuple(led.back), tuple(led.given_up)) if led.lost else None
     if losses is None and len(placed) == 1:
         return Led(placed[0], imitation, replayed, None, led.spans)
     qpos, body, rate = torch.cat(led.frames).cpu().numpy(), imitation.humanoid, led.rate
@@ -134,6 +139,7 @@ class _Led:
         of: the motion, and the frame of it, that each of them is of.
         actions: `(1, A)` each.
         lost, back: when it lost a motion and found it again, s.
+        given_up: when it left a clip for the next one, s.
         spans: see `Led`.
     """
 
@@ -142,14 +148,14 @@ class _Led:
         self.last = (goal.reference.length - 1).tolist()
         self.total = sum(self.last)
         self.frames, self.of, self.actions = [start], [(0, 0)], list[Tensor]()
-        self.lost, self.back = list[float](), list[float]()
+        self.lost, self.back, self.given_up = list[float](), list[float](), list[float]()
         self.spans: list[tuple[int | None, int | None]] = [(None, None)] * len(self.last)
         # Whether it is on a motion, on which, and at which frame of it, before the next step; the s at
-        # which it left the last one.
-        self._here, self._clip, self._frame, self._left = True, 0, 0, 0.0
+        # which it left the last one, and how often it lost this one.
+        self._here, self._clip, self._frame, self._left, self._losses = True, 0, 0, 0.0, 0
 
     def see(self, env: ImitationEnv, step: int) -> bool:
-        """Keeps what the step aimed at; True: the motions are over, or given up."""
+        """Keeps what the step aimed at; True: the motions are over, or the last one is given up."""
         now, clip = step / self.rate, self._clip
         if step:
             at = self._frame + 1 if self._here else self._frame
@@ -164,14 +170,25 @@ class _Led:
             self.show(sum(self.last[:clip]) + self._frame, self.total)
         was, self._here = self._here, int(self.goal.doing) == TRACKS
         self._clip, self._frame = int(self.goal.clips.clip), int(self.goal.frame)
+        self._losses = self._losses if self._clip == clip else 0
         self._left = now if was and not self._here else self._left
         if self._here and self.spans[self._clip][0] is None:
             self.spans[self._clip] = step, None
         if len(self.goal.lost) > len(self.lost):
             self.lost.append(now)
+            self._losses += 1
         if self._here and len(self.back) < len(self.lost):
             self.back.append(now)
-        return len(self.lost) > LOSSES or (not self._here and now > self._left + AWAY_S)
+        if self._losses <= LOSSES and (self._here or now <= self._left + AWAY_S):
+            return False
+        # Once for each: a character that does not come to the next clip either ends.
+        if not self.goal.chained or self._clip == len(self.last) - 1 or not self._losses:
+            return True
+        self.goal.leave(torch.zeros(1, dtype=torch.long))
+        self.given_up.append(now)
+        self._here, self._left, self._losses = False, now, 0
+        self._clip, self._frame = int(self.goal.clips.clip), 0
+        return False
 
 
 def one_after_another(
