@@ -33,7 +33,7 @@ def config(teacher: Perpetual, rounds: int, seed: int) -> Perpetual:
     """The teacher's settings for places alone, with many rounds of teaching and small steps after it."""
     told = taught_by(teacher, goal="keypoints")
     ppo = replace(told.ppo, policy_lr=1e-5, kl_target=0.05, lr_range=(5e-6, 1e-4), critic_warmup=8)
-    clone = CloneConfig(steps=256, rounds=rounds, epochs=(6, 2), lr=7e-4)
+    clone = CloneConfig(steps=256, rounds=rounds, epochs=(6, 2), most=600_000)
     return replace(told, ppo=ppo, clone=clone, num_envs=4096, evaluate_every=12, cooling=0.0, seed=seed)
 
 
@@ -54,9 +54,7 @@ def main() -> None:
         imitation = resume(a.out, settings, source)
     else:
         how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
-        library, notes = clips_of(
-            a.library, BodyConfig(), HELD_OUT, TWINS, print, teacher.target, how
-        )
+        library, notes = clips_of(a.library, BodyConfig(), HELD_OUT, TWINS, print, teacher.target, how)
         print(*notes, sep="\n")
         imitation = begin(a.out, library, settings, source, earlier=teacher)
         trained = distilled(teacher, imitation, a.threads, a.out / "dumps", beginning())

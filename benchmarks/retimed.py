@@ -18,7 +18,9 @@ import numpy as np
 from poise.motion.io import read_clip, write_clip
 
 #: Takes of walking, jogging and running by their names, without those walked backwards.
-GAITS = re.compile(r"expmaps.*(walking|running)|amc/(02/02_0[123]|07/|35/|06/|08/)|_(walk|jog|run|long_walk\d)\.txt")
+GAITS = re.compile(
+    r"expmaps.*(walking|running)|amc/(02/02_0[123]|07/|35/|06/|08/)|_(walk|jog|run|long_walk\d)\.txt"
+)
 SLOWEST, FASTEST = 0.88, 1.3
 
 

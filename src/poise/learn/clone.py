@@ -39,6 +39,8 @@ class CloneConfig:
     epochs: tuple[int, int] = (6, 4)
     """Passes over all data after round 0 and after each later one."""
     minibatch: int = 2048
+    most: int = 0
+    """A pass takes so many samples of all at most, drawn anew; 0 takes all."""
     lr: float = 1e-3
     """Adam's step size; it falls to a tenth over each round's fit."""
     critic_steps: int = 32
@@ -47,7 +49,13 @@ class CloneConfig:
     """Times that the critic learns from them, with returns estimated anew."""
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("rounds", 0), ("minibatch", 1), ("critic_steps", 0)):
+        for name, least in (
+            ("steps", 1),
+            ("rounds", 0),
+            ("minibatch", 1),
+            ("most", 0),
+            ("critic_steps", 0),
+        ):
             if getattr(self, name) < least:
                 raise PoiseError(
                     f"{name} must be at least {least}, got {getattr(self, name)}", "CloneConfig"
@@ -154,10 +162,11 @@ class _Fitter:
         policy, norm = self.actor.policy, self.actor.norm
         norm.freeze()
         scale = (-policy.action_log_std.detach()).exp()
-        parts = max(1, round(self.size / self.config.minibatch))
+        taken = min(self.size, self.config.most or self.size)
+        parts = max(1, round(taken / self.config.minibatch))
         mean = 0.0
         for epoch in range(epochs):
-            order = torch.randperm(self.size, generator=self.shuffle, device=self.obs.device)
+            order = torch.randperm(self.size, generator=self.shuffle, device=self.obs.device)[:taken]
             # From lr to lr / 10, geometrically.
             for group in self.optimizer.param_groups:
                 group["lr"] = self.config.lr * 0.1 ** (epoch / max(1, epochs - 1))

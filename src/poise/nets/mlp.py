@@ -36,8 +36,9 @@ def bare_linear(num_in: int, num_out: int, bias: bool = True) -> nn.Linear:
 
 
 def bfloat16_is_fast() -> bool:
-    """Whether this processor multiplies bfloat16 matrices itself (else they are slower than float32)."""
-    return bool(torch.cpu.get_capabilities().get("avx512_bf16", False))
+    """Whether this processor multiplies bfloat16 matrices in tiles (AMX). With the instructions of
+    AVX-512 alone an update takes 1.7 times as long as in float32, and without either still longer."""
+    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
 def product(layer: nn.Module, x: Tensor, last: bool = False) -> Tensor:
