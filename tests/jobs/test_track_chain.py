@@ -13,8 +13,7 @@ import pytest
 from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
-from poise.jobs.track import recovering
-from poise.jobs.track import track, write
+from poise.jobs.track import recovering, track, write
 from poise.jobs.track.parts import cut, parts_of
 from poise.jobs.track.placement import home, place, place_all
 from poise.jobs.tracker import Tracker

@@ -58,6 +58,11 @@ def test_the_clone_does_what_the_teacher_does() -> None:
     assert all(math.isnan(s.failure_rate) or 0 <= s.failure_rate <= 1 for s in seen)
 
 
+def test_a_pass_may_take_a_part_of_all_samples() -> None:
+    started = cloned(config=replace(QUICK, most=640))[0]
+    assert mean_reward(started) > mean_reward(None) - 0.04 and started.samples == 3840 + 1280
+
+
 def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
     states = []
     for seed in (3, 3, 4):
