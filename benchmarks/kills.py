@@ -2,9 +2,9 @@
 
 python benchmarks/kills.py --kills 50 --json benchmarks/kills.json
 
-Each recipe trains a miniature once without a kill. Then the same command is started, killed after a random
-time and started again with --resume, up to three times a run, and goes on to its end. Every file that a run
-leaves is compared bit for bit; only clocks may differ.
+Each recipe trains a miniature once without a kill. Then the same command is started, killed after a
+random time and started again with --resume, up to three times a run, and goes on to its end. Every file
+that a run leaves is compared bit for bit; only clocks may differ.
 """
 
 from __future__ import annotations

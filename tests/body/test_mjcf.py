@@ -194,7 +194,11 @@ def test_a_body_without_hands_gets_joints_for_their_tips(tmp_path):
 
 
 def asset(line: str) -> str:
-    return mjcf().replace("<worldbody>", f"<asset>{line}</asset><worldbody>")
+    return above(f"<asset>{line}</asset>")
+
+
+def above(line: str) -> str:
+    return mjcf().replace("<worldbody>", f"{line}<worldbody>")
 
 
 BOMB = '<texture name="t" type="2d" builtin="flat" width="60000" height="60000"/>'
@@ -203,20 +207,20 @@ BOMB = '<texture name="t" type="2d" builtin="flat" width="60000" height="60000"/
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (mjcf().replace("<worldbody>", '<include file="../x.xml"/><worldbody>'), "a file outside its folder"),
-        (mjcf().replace("<worldbody>", '<include file="/etc/passwd"/><worldbody>'), "outside its folder"),
+        (above('<include file="../x.xml"/>'), "a file outside its folder"),
+        (above('<include file="/etc/passwd"/>'), "a file outside its folder"),
         (asset('<mesh name="m" file="../../m.stl"/>'), "a file outside its folder ('../../m.stl')"),
-        (mjcf().replace("<worldbody>", '<extension><plugin plugin="x"/></extension><worldbody>'), "plug-ins"),
+        (above('<extension><plugin plugin="x"/></extension>'), "plug-ins"),
         (asset(BOMB), "its <texture> makes 3.6e+09 with width and height, more than"),
-        (asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>'), "its <hfield> makes 1.6e+09"),
-        (mjcf().replace("<worldbody>", '<size nuserdata="2000000000"/><worldbody>'), "its <size> makes"),
-        (mjcf().replace("<worldbody>", '<size nkey="2000000000"/><worldbody>'), "its <size> makes"),
+        (asset('<hfield nrow="40000" ncol="40000" size="1 1 1 1"/>'), "its <hfield> makes 1.6e+09"),
+        (above('<size nuserdata="2000000000"/>'), "its <size> makes"),
+        (above('<size nkey="2000000000"/>'), "its <size> makes"),
         (mjcf(more='<replicate count="100000"><body/></replicate>'), "its <replicate> makes 1e+05 with"),
-        (mjcf(more='<flexcomp name="f" type="grid" count="300 300 300"/>'), "its <flexcomp> makes 2.7e+07"),
+        (mjcf(more='<flexcomp type="grid" count="300 300 300"/>'), "its <flexcomp> makes 2.7e+07"),
         (mjcf(more="<body>" * 300 + "</body>" * 300), "more than 200 deep"),
         ('<!DOCTYPE a [<!ENTITY x "y">]>' + mjcf(), "it declares entities"),
         ("", "the file is empty"),
-        ("<mujoco>" + "<geom/>" * 200_001 + "</mujoco>", "more than 200000 elements"),
+        ("<mujoco>" + "<geom/>" * 50_001 + "</mujoco>", "more than 50000 elements"),
     ],
 )  # fmt: skip
 def test_files_from_strangers_are_limited(tmp_path, text, message):

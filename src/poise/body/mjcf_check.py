@@ -11,8 +11,8 @@ from xml.parsers.expat import ExpatError
 from poise.errors import PoiseError
 from poise.motion.io.text import check_file, shown
 
-#: Bytes of all files, files, elements of all of them, and how deep they may lie.
-MOST_BYTES, MOST_FILES, MOST_ELEMENTS, MOST_DEEP = 64 << 20, 200, 200_000, 200
+#: Bytes of all files, files, elements of each of them, and how deep they may lie.
+MOST_BYTES, MOST_FILES, MOST_ELEMENTS, MOST_DEEP = 64 << 20, 200, 50_000, 200
 #: What one element may make: pixels, points of a height field, copies, numbers of a size.
 MOST_MADE = 1 << 24
 MOST_COPIES = 1000
@@ -41,8 +41,6 @@ def check_mjcf(path: Path) -> int:
                 waiting.append(_inside(named, "", file, folder))
             if element.tag == "compiler":
                 dirs |= {element.get(k, "") for k in ("meshdir", "texturedir", "assetdir")}
-    if sum(1 for root in roots.values() for _ in root.iter()) > MOST_ELEMENTS:
-        raise PoiseError(f"it has more than {MOST_ELEMENTS} elements", path)
     assets = set[Path]()
     for root in roots.values():
         for named in {x.get("file", "") for x in root.iter()} - {""}:
@@ -93,16 +91,18 @@ def _bound(element: ElementTree.Element, names: tuple[str, ...], most: int, file
 
 
 def _tree(file: Path) -> ElementTree.Element:
-    depth, root = 0, None
+    depth, count, root = 0, 0, None
     try:
         text = file.read_bytes()
         if re.search(rb"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
             raise PoiseError("it declares entities, which no body needs", file)
         for event, element in ElementTree.iterparse(file, ("start", "end")):
             depth += 1 if event == "start" else -1
-            root = element if root is None else root
+            count, root = count + 1, element if root is None else root
             if depth > MOST_DEEP:
                 raise PoiseError(f"its elements lie more than {MOST_DEEP} deep", file)
+            if count > 2 * MOST_ELEMENTS:
+                raise PoiseError(f"it has more than {MOST_ELEMENTS} elements", file)
     except (ElementTree.ParseError, ExpatError, ValueError, LookupError, OSError) as problem:
         raise PoiseError(f"MuJoCo cannot read it: {shown(problem)}", file) from None
     if root is None:

@@ -1,7 +1,7 @@
 """Run as a script in a process of its own: a parser in native code, under limits of memory and time.
 
-It imports nothing of Poise, so that it starts at once. What it reads goes to the standard output as an npz,
-what it refuses as JSON; see `limited`, which starts it.
+It imports nothing of Poise, so that it starts at once. What it reads goes to the standard output as an
+npz, what it refuses as JSON; see `limited`, which starts it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Parsers in native code, started in a process of their own: a crash or a hang of theirs is one sentence."""
+"""Parsers in native code, in a process of their own: a crash or a hang of theirs is one sentence."""
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
@@ -60,9 +59,11 @@ def read_limited(
     except OSError as error:
         raise PoiseError(f"no process could be started to read it ({error.strerror})", path) from None
     if done.returncode == 0:
-        with contextlib.suppress(ValueError, OSError, EOFError, zipfile.BadZipFile):
+        try:
             with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
                 return dict(arrays)
+        except (ValueError, OSError, EOFError, zipfile.BadZipFile):
+            said = {}
     if done.returncode == -getattr(signal, "SIGXCPU", 24):
         raise slow
     if done.returncode == MEMORY:
