@@ -19,7 +19,7 @@ from poise.body.mjcf_check import check_mjcf
 from poise.body.parts import find_anatomy
 from poise.body.presets import PARTS, PartNumbers, Strength
 from poise.body.table import BodyRow, BodyTable, Geom, floats
-from poise.errors import PoiseError
+from poise.errors import PoiseError, brief
 from poise.motion import Skeleton
 from poise.motion.io.limited import read_limited
 from poise.motion.roles import find_roles
@@ -67,7 +67,10 @@ def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
     path = Path(path)
     if not path.is_file():
         raise PoiseError("there is no such file", str(path))
-    made = read_limited(_SCRIPT, path, check_mjcf(path), "MJCF file", "Make it smaller")
+    try:
+        made = read_limited(_SCRIPT, path, check_mjcf(path), "MJCF file", "Make it smaller")
+    except PoiseError as problem:
+        raise brief(problem, path) from None
     model = mujoco.MjModel.from_binary_path("body.mjb", {"body.mjb": made["model"].tobytes()})
     reader = _Reader(model, str(path))
     skeleton = reader.skeleton()

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from poise.errors import PoiseError
+from poise.errors import PoiseError, printable
 
 MAX_FILE_BYTES = 512 << 20
 """Larger files are refused before they are read (22 joints at 30 Hz: about seven hours)."""
@@ -182,7 +182,7 @@ def json_object(data: bytes, path: Path) -> dict[str, Any]:
 def shown(token: object) -> str:
     """A token for an error message: printable and short."""
     text = token.decode("utf-8", "replace") if isinstance(token, bytes) else str(token)
-    text = "".join(c if c.isprintable() else "?" for c in text)
+    text = printable(text)
     return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
 
 
