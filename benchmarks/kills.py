@@ -110,7 +110,8 @@ def finished(argv: list[str], log: Path, within: float) -> float:
     process.join(within)
     if process.exitcode != 0:
         process.kill()
-        raise SystemExit(f"{' '.join(argv)} ended with {process.exitcode}; see {log}")
+        said = log.read_text()[-2000:]
+        raise SystemExit(f"{' '.join(argv)} ended with {process.exitcode}:\n{said}")
     return time.monotonic() - begun
 
 

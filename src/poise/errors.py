@@ -29,7 +29,7 @@ def did_you_mean(name: str, known: list[str] | tuple[str, ...]) -> str:
     return (f"Did you mean '{close[0]}'? " if close else "") + f"Known: {listed}"
 
 
-#: Characters of an error's sentence and of its hint together, of its place, and of one word in it.
+#: Characters of an error behind the file's name, of the place in the file, and of one word.
 _MOST, _PLACE, _WORD = 300, 100, 100
 
 
@@ -52,9 +52,11 @@ def brief(error: PoiseError, path: Path) -> PoiseError:
         rest = f", {rest}"
     else:
         rest = ""
-    what = _cut(error.what, _MOST - 60 if error.hint else _MOST)
-    hint = None if error.hint is None else _cut(error.hint, _MOST - len(what) - 2)
-    return PoiseError(what, where + _cut(rest, _PLACE), hint)
+    place = _cut(rest, _PLACE)
+    most = _MOST - len(place) - 4
+    what = _cut(error.what, most - 60 if error.hint else most)
+    hint = None if error.hint is None else _cut(error.hint, most - len(what))
+    return PoiseError(what, where + place, hint)
 
 
 def _cut(text: str, most: int) -> str:

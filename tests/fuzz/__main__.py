@@ -151,9 +151,8 @@ def main() -> None:
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)
         cases = {hash_of(c[2]): c for some in kept.values() for c in some}
-        print(
-            f"{pack(cases.values(), args.keep / f'kept_{args.seed}.tar.xz')} files are kept in {args.keep}"
-        )
+        count = pack(cases.values(), args.keep / f"kept_{args.seed}.tar.xz")
+        print(f"{count} files are kept in {args.keep}")
 
 
 if __name__ == "__main__":

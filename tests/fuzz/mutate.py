@@ -29,7 +29,8 @@ _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
 #: What a mutation raises that does not suit the data.
 _UNFIT = (
-    ValueError, LookupError, struct.error, zipfile.BadZipFile, RuntimeError, EOFError, OSError, zlib.error,
+    ValueError, LookupError, RuntimeError, EOFError, OSError,
+    struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
 
 
