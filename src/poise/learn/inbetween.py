@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import LATEST, load_checkpoint, remove_partial, save_checkpoint
+from poise.learn.lock import alone
 from poise.learn.log import Log
 from poise.learn.rollout import TrainingError
 from poise.learn.run import interruptible
@@ -190,6 +191,7 @@ class InbetweenTrainer:
         return meta
 
 
+@alone
 def train_inbetween(
     trainer: InbetweenTrainer,
     folder: Path,

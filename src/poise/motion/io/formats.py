@@ -37,7 +37,7 @@ from poise.motion.io.refused import (
     refuse_openpose,
     refuse_robot,
 )
-from poise.motion.io.text import read_head, shown
+from poise.motion.io.text import below_comments, read_head, shown
 from poise.motion.io.usd.read import pxr_package, read_usd
 from poise.motion.io.usd.write import write_usd
 
@@ -165,6 +165,11 @@ def _reader_of(path: Path) -> Reader:
     for reader in READERS:
         if reader.looks_like(text):
             return reader
+    if text[:1] == b"#":
+        below = below_comments(path)
+        for reader in READERS:
+            if reader.looks_like(below):
+                return reader
     suffix = path.suffix.lower()
     other = next((name for magic, name in _MAGIC if head.startswith(magic)), _NOT_YET.get(suffix))
     if other is not None:

@@ -79,6 +79,15 @@ def read_head(path: Path) -> bytes:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
 
 
+def below_comments(path: Path, most: int = 4 << 20) -> bytes:
+    """The first 4 kB below the lines of a long comment ("# ..."), sought in `most` bytes."""
+    with path.open("rb") as file:
+        while file.tell() < most and (line := file.readline(_CHUNK)):
+            if line.strip() and not line.lstrip().startswith(b"#"):
+                return line + file.read(4096)
+    return b""
+
+
 def read_binary(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """All bytes of a file of any kind, after `check_file`."""
     check_file(path, limit)
