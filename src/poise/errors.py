@@ -27,3 +27,40 @@ def did_you_mean(name: str, known: list[str] | tuple[str, ...]) -> str:
     close = difflib.get_close_matches(name, known, n=1)
     listed = ", ".join(known[:40]) + (", ..." if len(known) > 40 else "")
     return (f"Did you mean '{close[0]}'? " if close else "") + f"Known: {listed}"
+
+
+#: Characters of an error behind the file's name, of the place in the file, and of one word.
+_MOST, _PLACE, _WORD = 300, 100, 100
+
+
+def printable(text: str, kept: str = "") -> str:
+    """The text with "?" for what a terminal would obey instead of showing it, but for `kept`."""
+    return "".join(c if c.isprintable() or c in kept else "?" for c in text)
+
+
+def brief(error: PoiseError, path: Path) -> PoiseError:
+    """An error about a file from a stranger: printable, short, and with the file's name.
+
+    path: the file; where the error names another place, it stands before it or in it.
+    """
+    where, rest = str(path), error.where or ""
+    if rest.startswith(str(path.parent)):
+        # Another file in the same folder, such as a skeleton, or a place within this one.
+        known = where if rest.startswith(where) else str(path.parent)
+        where, rest = known, rest.removeprefix(known)
+    elif rest and rest != path.stem:
+        rest = f", {rest}"
+    else:
+        rest = ""
+    place = _cut(rest, _PLACE)
+    most = _MOST - len(place) - 4
+    what = _cut(error.what, most - 60 if error.hint else most)
+    hint = None if error.hint is None else _cut(error.hint, most - len(what))
+    return PoiseError(what, where + place, hint)
+
+
+def _cut(text: str, most: int) -> str:
+    """Printable text on one line, its long words and itself cut."""
+    words = (w if len(w) <= _WORD else w[: _WORD - 3] + "..." for w in printable(text).split(" "))
+    text = " ".join(words)
+    return text if len(text) <= most else text[: most - 3] + "..."

@@ -191,3 +191,50 @@ def test_a_body_without_hands_gets_joints_for_their_tips(tmp_path):
     assert own.skeleton.names[-2:] == ("left_hand", "right_hand")
     assert len(own.table.rows) == len(own.skeleton) - 2
     np.testing.assert_allclose(own.skeleton.offsets[-1], [0.0, 0.0, -0.24], atol=1e-6)
+
+
+def asset(line: str) -> str:
+    return above(f"<asset>{line}</asset>")
+
+
+def above(line: str) -> str:
+    return mjcf().replace("<worldbody>", f"{line}<worldbody>")
+
+
+BOMB = '<texture name="t" type="2d" builtin="flat" width="60000" height="60000"/>'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (above('<include file="../x.xml"/>'), "a file outside its folder"),
+        (above('<include file="/etc/passwd"/>'), "a file outside its folder"),
+        (asset('<mesh name="m" file="../../m.stl"/>'), "a file outside its folder ('../../m.stl')"),
+        (above('<extension><plugin plugin="x"/></extension>'), "plug-ins"),
+        (asset(BOMB), "its <texture> makes 3.6e+09 with width and height, more than"),
+        (asset('<hfield nrow="40000" ncol="40000" size="1 1 1 1"/>'), "its <hfield> makes 1.6e+09"),
+        (above('<size nuserdata="2000000000"/>'), "its <size> makes"),
+        (above('<size nkey="2000000000"/>'), "its <size> makes"),
+        (mjcf(more='<replicate count="100000"><body/></replicate>'), "its <replicate> makes 1e+05 with"),
+        (mjcf(more='<flexcomp type="grid" count="300 300 300"/>'), "its <flexcomp> makes 2.7e+07"),
+        (mjcf(more="<body>" * 300 + "</body>" * 300), "more than 200 deep"),
+        ('<!DOCTYPE a [<!ENTITY x "y">]>' + mjcf(), "it declares entities"),
+        ("", "the file is empty"),
+        ("<mujoco>" + "<geom/>" * 50_001 + "</mujoco>", "more than 50000 elements"),
+    ],
+)  # fmt: skip
+def test_files_from_strangers_are_limited(tmp_path, text, message):
+    path = written(tmp_path, text)
+    with pytest.raises(PoiseError) as error:
+        read_mjcf(path)
+    said = str(error.value)
+    assert message in said and said.startswith(str(path)) and len(said) < len(str(path)) + 200
+
+
+def test_what_lies_in_its_folder_is_included(tmp_path):
+    text = mjcf()
+    start, end = text.index("<worldbody>"), text.index("</worldbody>") + len("</worldbody>")
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/body.xml").write_text(f"<mujoco>{text[start:end]}</mujoco>")
+    path = written(tmp_path, text[:start] + '<include file="parts/body.xml"/>' + text[end:])
+    assert len(read_mjcf(path).skeleton) == len(read_mjcf(written(tmp_path, text)).skeleton)

@@ -182,6 +182,14 @@ def test_csv_by_hand(tmp_path: Path) -> None:
     assert read_clip(stated).fps == 25.0
 
 
+def test_a_table_below_a_long_licence_is_read(tmp_path: Path) -> None:
+    licence = "".join(f"# line {k} of a long licence text\n" for k in range(400))
+    clip = read_clip(saved(tmp_path, licence + csv_text(walking()), "x.csv"))
+    assert clip.frames == 8 and clip.skeleton.source.format == "csv"
+    with pytest.raises(PoiseError, match="belong to no known|version|no header"):
+        read_clip(saved(tmp_path, licence, "x.csv"))
+
+
 def test_csv_confidence_of_zero_is_a_missing_point(tmp_path: Path) -> None:
     lines = csv_text(walking()).splitlines()
     lines = [f"{lines[0]},Nose_confidence"] + [f"{row},{int(t != 2)}" for t, row in enumerate(lines[1:])]

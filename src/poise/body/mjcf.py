@@ -15,14 +15,17 @@ import mujoco
 import numpy as np
 
 from poise.body import presets
+from poise.body.mjcf_check import check_mjcf
 from poise.body.parts import find_anatomy
 from poise.body.presets import PARTS, PartNumbers, Strength
 from poise.body.table import BodyRow, BodyTable, Geom, floats
-from poise.errors import PoiseError
+from poise.errors import PoiseError, brief
 from poise.motion import Skeleton
+from poise.motion.io.limited import read_limited
 from poise.motion.roles import find_roles
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_SCRIPT = Path(__file__).with_name("mjcf_file.py")
 #: Shapes that are kept, and those that become the box around them.
 _SHAPES, _BOXED = ("sphere", "capsule", "box"), ("mesh", "cylinder", "ellipsoid")
 #: How far (m) the hinges of one body may lie apart, and how far (degrees) from right angles, to be set
@@ -52,27 +55,26 @@ def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
     """The humanoid in an MJCF file.
 
     Args:
-        path: the file; what it includes (meshes) is read as MuJoCo does.
+        path: the file; what it includes (meshes) is read as MuJoCo does, from its own folder alone.
+            MuJoCo compiles it in a process of its own, under limits of memory and time.
         damping: joint damping as a fraction of kp in seconds where a hinge has none.
 
     Raises:
         PoiseError: a file that MuJoCo cannot read (its own message with the line), no free root, ball or
-            slide joints, hinges of one body far from right angles or from one another, no human tree.
+            slide joints, hinges of one body far from right angles or from one another, no human tree;
+            files outside its folder, plug-ins, elements that make more than a body needs.
     """
     path = Path(path)
     if not path.is_file():
         raise PoiseError("there is no such file", str(path))
     try:
-        model = mujoco.MjSpec.from_file(str(path)).compile()
-    except (ValueError, OSError) as problem:
-        raise PoiseError(f"MuJoCo cannot read it: {_one_line(problem)}", str(path)) from None
+        made = read_limited(_SCRIPT, path, check_mjcf(path), "MJCF file", "Make it smaller")
+    except PoiseError as problem:
+        raise brief(problem, path) from None
+    model = mujoco.MjModel.from_binary_path("body.mjb", {"body.mjb": made["model"].tobytes()})
     reader = _Reader(model, str(path))
     skeleton = reader.skeleton()
     return MjcfBody(skeleton, reader.table(skeleton, damping), tuple(reader.notes))
-
-
-def _one_line(problem: Exception) -> str:
-    return " ".join(str(problem).split()).removeprefix("Error: ")
 
 
 class _Reader:

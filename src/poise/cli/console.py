@@ -13,6 +13,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from poise.errors import printable
+
 if TYPE_CHECKING:
     from poise.eval import ScoreCard
 
@@ -56,12 +58,12 @@ def err() -> Console:
 
 def say(text: str, style: str = "") -> None:
     """One line of result; it is never wrapped, so that paths can be copied."""
-    out().print(Text(text, style=style), soft_wrap=True)
+    out().print(Text(printable(text, "\n\t"), style=style), soft_wrap=True)
 
 
 def tell(text: str, style: str = "") -> None:
     """One line beside the results, on stderr."""
-    err().print(Text(text, style=style), soft_wrap=True)
+    err().print(Text(printable(text, "\n\t"), style=style), soft_wrap=True)
 
 
 def error(sentence: str, everywhere: bool = False) -> None:
@@ -69,8 +71,7 @@ def error(sentence: str, everywhere: bool = False) -> None:
 
     everywhere: of several processes also those speak that are silent otherwise.
     """
-    line = " ".join(sentence.split())
-    line = "".join(c if c.isprintable() else "?" for c in line)
+    line = printable(" ".join(sentence.split()))
     if rank():
         line = f"process {rank()}: {line}"
     _console(sys.stderr, everywhere).print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
@@ -100,7 +101,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], lef
     for k, name in enumerate(columns):
         grid.add_column(Text(name), justify="left" if k < left else "right", overflow="fold")
     for row in rows:
-        grid.add_row(*(c if isinstance(c, Text) else Text(str(c)) for c in row))
+        grid.add_row(*(c if isinstance(c, Text) else Text(printable(str(c), "\n")) for c in row))
     out().print(grid)
 
 

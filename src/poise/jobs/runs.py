@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,8 @@ from poise.learn import (
     load_policy,
     run,
 )
-from poise.learn.parallel import ALONE, Comm
+from poise.learn.lock import only_writer
+from poise.learn.parallel import ALONE, Comm, together
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
@@ -95,11 +97,13 @@ def train(
 
     device: "cpu" or "cuda". It is no part of the run: a run may go on on another device.
     """
-    trainer = start_training(imitation, folder, threads, beginning, comm, device)
-    try:
+    with ExitStack() as held:
+        with together(comm):
+            if comm.rank == 0:
+                held.enter_context(only_writer(folder))
+        trainer = start_training(imitation, folder, threads, beginning, comm, device)
+        held.callback(trainer.env.close)
         return run(trainer, until, folder, on_iteration=on_iteration, tensorboard=tensorboard)
-    finally:
-        trainer.env.close()
 
 
 def trained_policy(folder: Path, imitation: Imitation) -> tuple[PolicyBundle, dict[str, Any]]:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from poise.errors import PoiseError
 from poise.learn.checkpoint import LATEST, load_checkpoint, remove_partial, save_checkpoint
+from poise.learn.lock import alone
 from poise.learn.log import Log
 from poise.learn.rollout import TrainingError
 from poise.learn.run import interruptible
@@ -30,6 +31,9 @@ from poise.learn.state import (
     take,
     under,
 )
+
+#: Times that saving takes, which pass until the next checkpoint at least.
+_SAVING = 20.0
 
 
 class Objective(Protocol):
@@ -187,6 +191,7 @@ class InbetweenTrainer:
         return meta
 
 
+@alone
 def train_inbetween(
     trainer: InbetweenTrainer,
     folder: Path,
@@ -202,7 +207,7 @@ def train_inbetween(
     Args:
         folder: holds `checkpoint.safetensors` and the log; what is there is gone on with.
         validate: figures of the averaged network, logged every `validate_every` steps.
-        save_every: seconds between checkpoints.
+        save_every: seconds between checkpoints at most; every block is saved where that costs little.
 
     Returns:
         The last block (None where nothing was left to do) and whether it was interrupted.
@@ -212,7 +217,8 @@ def train_inbetween(
     if path.exists():
         trainer.load(path)
     remove_partial(folder)
-    log, saved = Log(folder, trainer.step, tensorboard), time.monotonic()
+    # A kill loses what was learned since; saving may take a twentieth of the time.
+    log, saved, due = Log(folder, trainer.step, tensorboard), time.monotonic(), 0.0
     try:
         with interruptible() as interrupt:
             stop = trainer.done
@@ -228,10 +234,12 @@ def train_inbetween(
                     stats = dataclasses.replace(stats, parts={k: float(v) for k, v in row.items()})
                 row |= {"time/seconds": stats.seconds, "time/samples_per_s": stats.samples_per_s}
                 log.write(row)
-                if stop or interrupt.is_set() or time.monotonic() - saved >= save_every:
+                if stop or interrupt.is_set() or time.monotonic() - saved >= due:
+                    start = time.monotonic()
                     log.flush()
                     trainer.save(path)
                     saved = time.monotonic()
+                    due = min(save_every, _SAVING * (saved - start))
                 if on_block is not None and on_block(stats) is False:
                     stop = True
             interrupted = interrupt.is_set()

@@ -28,6 +28,7 @@ from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, 
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, WarmStart, load_checkpoint
 from poise.learn.checkpoint import PolicyMeta
+from poise.learn.lock import alone
 from poise.learn.run import interruptible
 from poise.learn.state import prefixed, under
 from poise.motion import ClipLibrary
@@ -199,6 +200,7 @@ def knows_recovery(folder: Path) -> bool:
         raise PoiseError("it does not say what its stage learns", path, "The file is damaged") from None
 
 
+@alone
 def train(
     imitation: Imitation,
     folder: Path,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from poise.errors import PoiseError
+from poise.errors import PoiseError, brief
 from poise.motion.clip import Clip
 from poise.motion.io.acclaim.amc import read_amc
 from poise.motion.io.angles.deepmimic import read_deepmimic
@@ -37,7 +37,7 @@ from poise.motion.io.refused import (
     refuse_openpose,
     refuse_robot,
 )
-from poise.motion.io.text import read_head, shown
+from poise.motion.io.text import below_comments, read_head, shown
 from poise.motion.io.usd.read import pxr_package, read_usd
 from poise.motion.io.usd.write import write_usd
 
@@ -100,9 +100,7 @@ READERS = (
 )
 #: Readers that only say what to give instead.
 _REFUSERS = ("ASF", "robot", "OpenPose")
-READABLE = "Formats that can be read: " + ", ".join(
-    f"{r.name} ({', '.join(r.suffixes)})" for r in READERS if r.name not in _REFUSERS
-)
+READABLE = "Formats that can be read: " + ", ".join(r.name for r in READERS if r.name not in _REFUSERS)
 _MAGIC = (
     (b"Kaydara FBX", "FBX"),
     (b"PK\x03\x04", "zip"),
@@ -153,10 +151,8 @@ def read_clip(
     try:
         return reader.read(path, options)
     except PoiseError as error:
-        # A clip's own checks know its name only; the user needs the file.
-        if error.where == path.stem or error.where is None:
-            raise PoiseError(error.what, path, error.hint) from None
-        raise
+        # A clip's own checks know its name only; what a file says may be long or obeyed by a terminal.
+        raise brief(error, path) from None
     except MemoryError:
         raise PoiseError("the file needs more memory than there is", path, "Cut it shorter") from None
 
@@ -169,6 +165,11 @@ def _reader_of(path: Path) -> Reader:
     for reader in READERS:
         if reader.looks_like(text):
             return reader
+    if text[:1] == b"#":
+        below = below_comments(path)
+        for reader in READERS:
+            if reader.looks_like(below):
+                return reader
     suffix = path.suffix.lower()
     other = next((name for magic, name in _MAGIC if head.startswith(magic)), _NOT_YET.get(suffix))
     if other is not None:

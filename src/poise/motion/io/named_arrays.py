@@ -80,7 +80,7 @@ def _read(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     for kind in KINDS:
         if kind.holds(data):
             return kind.read(data, path, options)
-    there = listed(shown(k) for k in data) if len(data) else "none at all"
+    there = listed((shown(k) for k in data), 4) if len(data) else "none at all"
     known = "; ".join(kind.name for kind in KINDS[:-1])
     raise PoiseError(f"its arrays are no motion that is known ({there})", path, f"Known: {known}")
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from poise.errors import PoiseError
+from poise.errors import PoiseError, printable
 
 MAX_FILE_BYTES = 512 << 20
 """Larger files are refused before they are read (22 joints at 30 Hz: about seven hours)."""
@@ -77,6 +77,15 @@ def read_head(path: Path) -> bytes:
             return file.read(4096)
     except OSError as error:
         raise PoiseError(f"the file cannot be read ({error.strerror})", path) from None
+
+
+def below_comments(path: Path, most: int = 4 << 20) -> bytes:
+    """The first 4 kB below the lines of a long comment ("# ..."), sought in `most` bytes."""
+    with path.open("rb") as file:
+        while file.tell() < most and (line := file.readline(_CHUNK)):
+            if line.strip() and not line.lstrip().startswith(b"#"):
+                return line + file.read(4096)
+    return b""
 
 
 def read_binary(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -182,7 +191,7 @@ def json_object(data: bytes, path: Path) -> dict[str, Any]:
 def shown(token: object) -> str:
     """A token for an error message: printable and short."""
     text = token.decode("utf-8", "replace") if isinstance(token, bytes) else str(token)
-    text = "".join(c if c.isprintable() else "?" for c in text)
+    text = printable(text)
     return f"'{text[:30]}...'" if len(text) > 30 else f"'{text}'"
 
 

@@ -120,6 +120,8 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
             raise PoiseError("the first chunk of the GLB is not JSON", path)
         found.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
+    if JSON_CHUNK not in found:
+        raise PoiseError(f"the GLB header states {total} bytes, which hold no JSON", path, CUT_OFF)
     return found[JSON_CHUNK], found.get(BIN_CHUNK)
 
 

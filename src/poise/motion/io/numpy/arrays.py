@@ -188,7 +188,9 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
         wanted = " x ".join("any" if n is None else str(n) for n in shape)
         found = " x ".join(map(str, value.shape)) or "()"
         raise PoiseError(f"it has the shape {found}, not {wanted}", where)
-    return value.astype(np.float64)
+    # Numbers that double precision lacks become infinite, which is refused where they are used.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return value.astype(np.float64)
 
 
 def one_number(data: Mapping[str, Any], key: str, path: Path) -> float:

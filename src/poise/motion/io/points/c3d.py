@@ -2,42 +2,20 @@
 
 from __future__ import annotations
 
-import io
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.limited import read_limited
 from poise.motion.io.points.raw import UNITS_M, RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
 from poise.motion.io.text import CUT_OFF, check_file, listed, shown
 
 _KEY = 0x50
 _BLOCK = 512
-# Prints an npz of points, residuals, rate, and the text parameters of the group POINT.
-_READER = """
-import io, sys
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]),) * 2)
-except (ImportError, ValueError, OSError):
-    pass
-import ezc3d
-import numpy as np
-file = ezc3d.c3d(sys.argv[1])
-point = file["parameters"]["POINT"]
-texts = {k: v["value"] for k, v in point.items() if v.get("type") == -1}
-out = {k: np.array([str(x) for x in v], dtype=str) for k, v in texts.items()}
-out["points"] = np.asarray(file["data"]["points"], dtype=float)
-out["residuals"] = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)
-out["rate"] = np.array(file["header"]["points"]["frame_rate"], dtype=float)
-buffer = io.BytesIO()
-np.savez(buffer, **out)
-sys.stdout.buffer.write(buffer.getvalue())
-"""
+_SCRIPT = Path(__file__).with_name("c3d_file.py")
 # What Vicon writes beside markers: lists of labels that are no places.
 _NO_PLACES = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "EVENTS", "REACTIONS")
 
@@ -62,9 +40,10 @@ def c3d_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
             "C3D files need the package ezc3d", path, "Install it with pip install 'poise-motion[c3d]'"
         )
     size = _check_header(path)
-    point = _read_apart(path, size)
+    # Damaged files make the C++ library loop without end or take any memory.
+    point = read_limited(_SCRIPT, path, size, "C3D file")
     points, residuals = np.asarray(point.pop("points")), np.asarray(point.pop("residuals"))
-    rate = float(np.ravel(point.pop("rate"))[0])
+    rate = float(point.pop("rate").ravel()[0])
     labels = _labels(point)
     if points.shape[1] < len(labels) or not labels:
         raise PoiseError(
@@ -115,28 +94,6 @@ def _check_header(path: Path) -> int:
     if (start - 1) * _BLOCK > size or (head[0] - 1) * _BLOCK >= size:
         raise PoiseError("its header points beyond the end of the file", path, CUT_OFF)
     return size
-
-
-def _read_apart(path: Path, size: int) -> dict[str, np.ndarray]:
-    """What ezc3d reads, by name; in a process of its own.
-
-    Damaged files make the C++ library loop without end or take any memory, so it works under a limit of
-    both and can be stopped.
-    """
-    seconds = 10 + size / 5e5
-    command = [sys.executable, "-c", _READER, str(path.resolve()), str(int(4e9 + 40 * size))]
-    try:
-        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
-    except subprocess.TimeoutExpired:
-        raise PoiseError(
-            f"the C3D file could not be read in {seconds:.0f} s: it seems damaged", path, CUT_OFF
-        ) from None
-    if done.returncode != 0:
-        said = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        reason = said[-1].rsplit("Error: ", 1)[-1] if said else f"exit code {done.returncode}"
-        raise PoiseError(f"the C3D file is damaged ({shown(reason)})", path, CUT_OFF)
-    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
-        return dict(arrays)
 
 
 def _labels(point: dict[str, np.ndarray]) -> list[str]:

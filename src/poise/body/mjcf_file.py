@@ -1,0 +1,28 @@
+"""What MuJoCo compiles of an MJCF file; a script of its own, see `motion.io.limited`."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+
+def read(path: str, refuse: Callable[[str], None]) -> dict[str, np.ndarray]:
+    """The compiled model as bytes."""
+    import mujoco
+
+    with tempfile.TemporaryDirectory() as folder:
+        # MuJoCo writes its log where it works.
+        os.chdir(folder)
+        try:
+            model = mujoco.MjSpec.from_file(path).compile()
+        except (ValueError, OSError) as problem:
+            said = " ".join(str(problem).split()).removeprefix("Error: ")
+            refuse(f"MuJoCo cannot read it: {said}")
+            raise
+        mujoco.mj_saveModel(model, "model.mjb")
+        os.chdir("/")
+        return {"model": np.frombuffer(Path(folder, "model.mjb").read_bytes(), dtype=np.uint8)}
