@@ -141,22 +141,22 @@ def test_buffer_noise_and_pause_are_set_while_it_runs(tracker: Tracker, walk: Cl
         {"type": "pull", "character": 0, "body": 3, "point": [0, 0, 0], "to": [0, 0, 1]}
     )
     played.run(0.2)
-    assert live.steps > steps and 0 in live.world._pulls
+    assert live.steps > steps and 0 in live.world.hands.pulls
     # A hand that says nothing more has let go.
     played.run(1.2)
-    assert live.world._pulls == {}
+    assert live.world.hands.pulls == {}
     live.close()
 
 
 def test_a_pull_is_a_spring(tracker: Tracker, walk: Clip) -> None:
     """The chest of a character at ease goes where it is drawn, and comes back."""
     live = Live(tracker, clock=lambda: 0.0)
-    chest = live.world._chest
+    chest = live.world.humanoid.rows_of("spine")[-1]
     place = live.world.rows.state.xpos
     for k in range(10):
         live.step(k * STEP)
     before = place[0, chest + 1].clone()
-    live.world.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
+    live.world.hands.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
     live._pulled[0] = 0.0
     for k in range(15):
         live.step(0.3 + k * STEP)

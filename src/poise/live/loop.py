@@ -227,7 +227,7 @@ class Live:
             self._do(self.commands.popleft(), now_s)
         for k in [k for k, t in self._pulled.items() if now_s - t > HOLDS_S]:
             del self._pulled[k]
-            self.world.let_go(k)
+            self.world.hands.let_go(k)
 
     def _do(self, command: dict[str, Any], now_s: float) -> None:
         """A command that was checked, see `poise.live.commands`."""
@@ -236,14 +236,16 @@ class Live:
             return
         if kind == "pull":
             if command["body"] < len(self.world.humanoid.bodies):
-                self.world.pull(k, command["body"], np.array(command["point"]), np.array(command["to"]))
+                self.world.hands.pull(
+                    k, command["body"], np.array(command["point"]), np.array(command["to"])
+                )
                 self._pulled[k] = now_s
         elif kind == "release":
             self._pulled.pop(k, None)
-            self.world.let_go(k)
+            self.world.hands.let_go(k)
         elif kind == "knock":
             angle = self._rng.uniform(0, 2 * np.pi)
-            self.world.blow(k, np.array([np.cos(angle), np.sin(angle), 0.0]))
+            self.world.hands.blow(k, np.array([np.cos(angle), np.sin(angle), 0.0]))
         elif kind == "ball":
             self.world.drop_ball(k)
         elif kind == "pause":
