@@ -131,7 +131,7 @@ def test_level_0_is_no_compliance(task: Imitation) -> None:
 
 
 def test_physics_steps_are_made_at_once_where_nothing_yields(task: Imitation) -> None:
-    """At level 0, and at any level while nothing pushes; a push of which some is left makes them single."""
+    """At level 0, and at any level while nothing pushes; a push makes them single."""
     made = list[int]()
     for level, least in ((0.0, 0), (0.5, 1)):
         env = begun(yielding(task, Compliance(level=level)))

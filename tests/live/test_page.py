@@ -187,15 +187,22 @@ def test_push_fall_recovery_and_record_in_chromium(tmp_path: Path) -> None:
             page.mouse("mousePressed", x, y)
             for k in range(6):
                 page.mouse("mouseMoved", x + 8 * k, y - 4 * k)
-            assert session.live.world._pulls or session.live.commands or session.live.steps
+            assert session.live.world.hands.pulls or session.live.commands or session.live.steps
             page.until("true")
             page.mouse("mouseReleased", x + 40, y - 20)
-            page.js(
-                "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 'k', bubbles: true}))"
-            )
+            key = "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: '%s', bubbles: true}))"
+            page.js(key % "k")
             page.until("['falls', 'gets up'].includes(document.body.dataset.doing)")
             page.until("document.body.dataset.doing == 'tracks'", 40)
             assert page.js("Number(document.getElementById('recovered').textContent)") >= 1
+            for _ in range(2):
+                page.js(key % "+")
+            page.until("document.body.dataset.compliance == '0.1'")
+            page.js("document.getElementById('dream').click()")
+            page.until("document.getElementById('dream').ariaPressed == 'true'")
+            page.until("document.getElementById('says').textContent.includes('endless motion')")
+            page.js(key % "e")
+            page.until("!document.getElementById('says').textContent.includes('endless motion')")
             page.js("document.getElementById('record').click()")
             page.until("document.getElementById('says').textContent.includes('take.bvh')")
             assert page.errors == [] and page.js("document.body.dataset.status") == "live"

@@ -141,7 +141,7 @@ class Yielding(Plugin):
             felt = plugin.felt()
             if felt is None:
                 continue
-            # What is no part of the drive, or is told anew at each physics step, may come at any of them.
+            # What is no part of the drive, or is told anew at each physics step, may come in between.
             held = felt.driven and type(plugin).push_substep is Plugin.push_substep
             if not held or bool((felt.force.norm(dim=-1) >= self.given.least_n).any()):
                 return True

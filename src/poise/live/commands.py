@@ -119,6 +119,8 @@ COMMANDS: dict[str, Mapping[str, Callable[[Any], Any]]] = {
     "release": _CHARACTER,
     "knock": _CHARACTER,
     "ball": _CHARACTER,
+    "comply": {**_CHARACTER, "level": lambda v: number(v, 0.0, 1.0)},
+    "dream": {**_CHARACTER, "on": flag},
     "pause": {"on": flag},
     "record": {"on": flag},
     "follow": {**_CHARACTER, "person": _maybe},

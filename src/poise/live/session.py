@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from poise.errors import PoiseError
+from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
 from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Inbox
@@ -20,6 +22,7 @@ from poise.live.sinks.vmc import Puppet, VmcSink
 from poise.live.sources.file import FileSource
 from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
+from poise.synth.generator import Kinematic
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,8 @@ class Session:
     def __init__(self, tracker: Tracker, config: LiveConfig, wanted: Wanted):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="poise-live")
         self.inbox, clock = Inbox(), time.perf_counter
-        self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock)
+        made = generator_for(tracker)
+        self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock, generator=made)
         world = self.live.world
         self.recorder = Recorder(
             wanted.record, world.humanoid.table, tracker.example, world.count, world.rate_hz
@@ -65,7 +69,7 @@ class Session:
         self.recorded: list[Path] = []
         self.last: dict[str, Any] = {}
         self.live.recording = self._record
-        hello = hello_of(world, {"records": True})
+        hello = hello_of(world, {"records": True, "dreams": made is not None})
         guard = Guard(wanted.host, wanted.port, wanted.token)
         self.server = PageServer(
             guard, hello, self.inbox, self.live.commands.append, self.figures, clock
@@ -112,3 +116,14 @@ class Session:
         else:
             # Files are written beside the loop.
             self._pool.submit(lambda: self.recorded.extend(self.recorder.stop()))
+
+
+def generator_for(tracker: Tracker) -> Kinematic | None:
+    """What makes endless motion for a policy's body; None where none comes along for it."""
+    model = load_generator()
+    if model.fps != tracker.config.sim.control_hz:
+        return None
+    try:
+        return model.generator(tracker.humanoid)
+    except PoiseError:
+        return None

@@ -232,11 +232,14 @@ class PageServer:
             self._programs -= text
 
     async def _send(self, connection: ServerConnection, text: bool) -> None:
-        told = ""
+        told, last = "", self._newest
         try:
             while self._fresh is not None:
-                await self._fresh.wait()
-                frame, words = self._newest
+                # What came while this page was sent the one before is not missed.
+                if self._newest is last:
+                    await self._fresh.wait()
+                last = self._newest
+                frame, words = last
                 if text and words:
                     await connection.send(words)
                 elif not text:
