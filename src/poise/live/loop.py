@@ -25,6 +25,7 @@ from poise.live.character import FALLS, RETURNS, tensor
 from poise.live.endless import Endless
 from poise.live.packet import Inbox, Packet
 from poise.live.people import People
+from poise.live.sinks.vmc import Own
 from poise.live.world import Seen, World
 from poise.motion import Clip
 from poise.settings import validate
@@ -37,6 +38,8 @@ HOLDS_S = 1.0
 #: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
 #: nothing is caught up with.
 CATCHES_UP, GIVES_UP_S = 0.15, 1.5
+#: Steps of which it is kept what was read; goals are fewer behind.
+READ = 16
 #: s in which errors wander.
 WANDERS_S = 0.3
 #: s for which no character looks ahead after a step that came too late.
@@ -123,6 +126,8 @@ class Live:
         self.generator, self._executor = generator, executor
         self.endless = dict[int, Endless]()
         self._hurry, self._errors = 0, dict[int, np.ndarray]()
+        #: What was read of each character's person in the last steps; None where the goal is another.
+        self.read = [deque[Own | None](maxlen=READ) for _ in range(c.characters)]
         self.recording: Callable[[bool], None] | None = None
         self._rng = np.random.default_rng(c.seed)
         self._latency: deque[float] = deque(maxlen=STEPS)
@@ -189,7 +194,7 @@ class Live:
     def _frame(self, k: int, now_s: float) -> Tensor:
         """The newest frame that character k's goal knows."""
         character, person = self.world.characters[k], self.people.of(k)
-        endless, qpos = self.endless.get(k), None
+        endless, qpos, own = self.endless.get(k), None, None
         follows = endless or self.people.follows[k]
         if self._was[k] != follows:
             self._was[k] = follows
@@ -203,7 +208,17 @@ class Live:
                 if pose.jumped:
                     character.jump()
                 qpos = tensor(self._noisy(k, person.onto(pose.root_pos, pose.rot)))
-        return character.next(qpos, self.world.body(k), self.world.lead[k])
+                onto = person.onto
+                where = replace(onto.where)
+                own = Own(onto.passage.source, pose.root_pos, pose.rot, where, onto.scale)
+        frame = character.next(qpos, self.world.body(k), self.world.lead[k])
+        self.read[k].append(own if frame is qpos else None)
+        return frame
+
+    def own(self, k: int) -> Own | None:
+        """The person's pose that character k's goal is now; None where it follows something else."""
+        read, back = self.read[k], self.world.lead[k]
+        return read[-back] if len(read) >= back else None
 
     def _noisy(self, k: int, qpos: np.ndarray) -> np.ndarray:
         size = self.config.noise

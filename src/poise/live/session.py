@@ -18,7 +18,7 @@ from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
 from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
 from poise.live.sinks.record import Recorder
-from poise.live.sinks.vmc import Puppet, VmcSink
+from poise.live.sinks.vmc import OwnPuppet, VmcSink
 from poise.live.sources.file import FileSource
 from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
@@ -79,7 +79,7 @@ class Session:
         self.vmc = None if wanted.vmc is None else VmcSource(wanted.host, wanted.vmc, self.inbox, clock)
         self.sink = None
         if wanted.vmc_out is not None:
-            self.sink = VmcSink(wanted.vmc_out, Puppet(world.humanoid.table, tracker.example))
+            self.sink = VmcSink(wanted.vmc_out, OwnPuppet(world.humanoid.table, tracker.example))
             self.live.shows.append(ShowVmc(self.sink))
         self.files.start()
         if self.vmc is not None:
