@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import struct
@@ -24,6 +25,7 @@ from poise.jobs.open import open_run
 from poise.live.commands import MOST_BYTES
 from poise.live.loop import LiveConfig
 from poise.live.packet import Inbox
+from poise.live.page.doorway import A_SECOND
 from poise.live.page.frames import HEAD, as_json, packed
 from poise.live.page.guard import EACH, Guard
 from poise.live.page.server import PAGES, PageServer
@@ -153,6 +155,36 @@ def test_strangers_are_kept_out(served: Served) -> None:
     while time.monotonic() < end and served.guard._open.total():
         time.sleep(0.02)
     assert served.get("/")[0] == 200
+
+
+def test_a_flood_of_connections_is_looked_at_slowly_and_others_still_come_in() -> None:
+    out = Served()
+    where = "127.0.0.1", out.guard.port
+    made: list[socket.socket] = []
+    try:
+        for _ in range(2 * A_SECOND):
+            one = socket.socket()
+            one.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                one.connect(where)
+            made.append(one)
+        time.sleep(0.5)
+        seen = out.guard.refused["too many connections from this address"]
+        # A second or two of them were looked at, as slow as this machine may be.
+        assert 0 < seen <= 2 * A_SECOND - EACH
+        for one in made:
+            one.close()
+        end = time.monotonic() + 60
+        status = 0
+        while status != 200 and time.monotonic() < end:
+            with contextlib.suppress(OSError):
+                status = out.get("/")[0]
+            time.sleep(0.2)
+        assert status == 200
+    finally:
+        for one in made:
+            one.close()
+        out.server.close()
 
 
 def test_others_need_the_token() -> None:

@@ -23,6 +23,7 @@ from websockets.http11 import Request, Response
 from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION, command, parse
 from poise.live.packet import Inbox
+from poise.live.page.doorway import WAITING, Doorway, pauses
 from poise.live.page.guard import Bucket, Guard
 from poise.live.sources.stream import JsonStream
 
@@ -46,45 +47,20 @@ TOLD = 50
 
 
 class _Connection(ServerConnection):
-    """A connection that is turned away before anything is read where there are too many."""
+    """A connection that is counted out when it ends."""
 
     guard: Guard
-    address = ""
+    _peer = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         peer = transport.get_extra_info("peername")
-        address = str(peer[0]) if peer else ""
-        why = self.guard.enter(address)
-        if why is None:
-            self.address = address
-            super().connection_made(transport)
-            return
-        assert isinstance(transport, asyncio.Transport)
-        body = (why + "\n").encode()
-        head = f"HTTP/1.1 503 Service Unavailable\r\nContent-Length: {len(body)}\r\n"
-        transport.write((head + "Connection: close\r\n\r\n").encode() + body)
-        transport.close()
+        # One that is gone already has no name.
+        self._peer = str(peer[0]) if peer else ""
+        super().connection_made(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self.address:
-            self.guard.leave(self.address)
-            super().connection_lost(exc)
-
-    def data_received(self, data: bytes) -> None:
-        if self.address:
-            super().data_received(data)
-
-    def eof_received(self) -> None:
-        if self.address:
-            super().eof_received()
-
-    def pause_writing(self) -> None:
-        if self.address:
-            super().pause_writing()
-
-    def resume_writing(self) -> None:
-        if self.address:
-            super().resume_writing()
+        self.guard.leave(self._peer)
+        super().connection_lost(exc)
 
 
 class PageServer:
@@ -166,9 +142,10 @@ class PageServer:
         )
         guard = self.guard
         kind = type("Connection", (_Connection,), {"guard": guard})
+        self._loop.set_exception_handler(pauses)
         try:
             server: Server = await serve(
-                self._handle, guard.host, guard.port, process_request=self._answer,
+                self._handle, sock=Doorway(guard), backlog=WAITING, process_request=self._answer,
                 create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
                 open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=20,
                 compression=None, server_header=None, logger=_quiet(),
