@@ -24,7 +24,7 @@ from poise.live.calibration import OntoBody, calibrated
 from poise.live.character import FALLS, RETURNS, tensor
 from poise.live.endless import Endless
 from poise.live.packet import Inbox, Packet
-from poise.live.people import People
+from poise.live.people import STAND, People
 from poise.live.sinks.vmc import Own
 from poise.live.world import Seen, World
 from poise.motion import Clip
@@ -323,6 +323,10 @@ class Live:
             "people": [
                 {"name": p.name, "calibrated": round(p.share, 2), "said": "" if p.onto else p.said}
                 for p in people.known.values()
+            ]
+            + [
+                {"name": name, "calibrated": round(share, 2), "said": STAND}
+                for name, share in list(self.inbox.standing.items())
             ],
             "characters": [self._figures(k) for k in range(self.config.characters)],
         }  # fmt: skip

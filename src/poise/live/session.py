@@ -19,7 +19,9 @@ from poise.live.page.server import PageServer
 from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
 from poise.live.sinks.record import Recorder
 from poise.live.sinks.vmc import OwnPuppet, VmcSink
+from poise.live.sources.door import StreamDoor
 from poise.live.sources.file import FileSource
+from poise.live.sources.points import PointFit
 from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
 from poise.synth.generator import Kinematic
@@ -31,6 +33,7 @@ class Wanted:
 
     Attributes:
         clips: played as people, by their names.
+        keypoints: TCP and UDP port on which keypoints are listened for, None for none.
         vmc: UDP port on which VMC is listened for, None for none.
         vmc_out: HOST:PORT to which the first character is sent as VMC.
         record: where recordings go.
@@ -41,6 +44,7 @@ class Wanted:
     """
 
     clips: Mapping[str, Clip] = field(default_factory=dict)
+    keypoints: int | None = None
     vmc: int | None = None
     vmc_out: str | None = None
     record: Path = Path("live.bvh")
@@ -70,18 +74,27 @@ class Session:
         self.last: dict[str, Any] = {}
         self.live.recording = self._record
         hello = hello_of(world, {"records": True, "dreams": made is not None})
+        self.points = PointFit(self.inbox, tracker.example, world.humanoid.table)
         guard = Guard(wanted.host, wanted.port, wanted.token)
         self.server = PageServer(
-            guard, hello, self.inbox, self.live.commands.append, self.figures, clock
+            guard, hello, self.inbox, self.live.commands.append, self.figures, clock, self.points
         )
         self.live.shows += [ShowPage(self.server), ShowRecorder(self.recorder)]
         self.files = FileSource(dict(wanted.clips), self.inbox, clock)
         self.vmc = None if wanted.vmc is None else VmcSource(wanted.host, wanted.vmc, self.inbox, clock)
+        self.door = None
+        if wanted.keypoints is not None:
+            self.door = StreamDoor(
+                wanted.host, wanted.keypoints, self.inbox, self.points, clock, wanted.token
+            )
         self.sink = None
         if wanted.vmc_out is not None:
             self.sink = VmcSink(wanted.vmc_out, OwnPuppet(world.humanoid.table, tracker.example))
             self.live.shows.append(ShowVmc(self.sink))
         self.files.start()
+        self.points.start()
+        if self.door is not None:
+            self.door.start()
         if self.vmc is not None:
             self.vmc.start()
         if wanted.records:
@@ -100,6 +113,9 @@ class Session:
         """Ends everything; the files of the recordings."""
         self.last = self.figures()
         self.files.close()
+        if self.door is not None:
+            self.door.close()
+        self.points.close()
         if self.vmc is not None:
             self.vmc.close()
         if self.sink is not None:

@@ -25,6 +25,7 @@ from poise.live.commands import MOST_BYTES, VERSION, command, parse
 from poise.live.packet import Inbox
 from poise.live.page.doorway import WAITING, Doorway, pauses
 from poise.live.page.guard import Bucket, Guard
+from poise.live.sources.points import PointFit
 from poise.live.sources.stream import JsonStream
 
 #: What can be fetched: a fixed list, so that no path leads to a file of the user's.
@@ -73,6 +74,7 @@ class PageServer:
         command: takes a checked command.
         figures: what is shown beside the characters, asked for a few times a second.
         clock: s, by which packets arrive.
+        points: fits keypoints of streams; None takes none.
 
     Raises:
         PoiseError: the address is taken or is none of this machine.
@@ -86,7 +88,9 @@ class PageServer:
         command: Callable[[dict[str, Any]], None],
         figures: Callable[[], dict[str, Any]],
         clock: Callable[[], float],
+        points: PointFit | None = None,
     ):
+        self._points = points
         self.guard, self.inbox, self.clock = guard, inbox, clock
         self._command, self._figures = command, figures
         self._hello = json.dumps({"v": VERSION, "type": "hello", **hello})
@@ -233,7 +237,7 @@ class PageServer:
         bucket, path = Bucket(), urlsplit(connection.request.path if connection.request else "").path
         self._streams += path == "/stream"
         said = 0
-        stream = JsonStream(self.inbox, f"{self._streams}:") if path == "/stream" else None
+        stream = JsonStream(self.inbox, f"{self._streams}:", self._points) if path == "/stream" else None
         try:
             async for message in connection:
                 if not bucket.takes():
