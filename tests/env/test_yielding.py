@@ -130,6 +130,26 @@ def test_level_0_is_no_compliance(task: Imitation) -> None:
     b.close()
 
 
+def test_physics_steps_are_made_at_once_where_nothing_yields(task: Imitation) -> None:
+    """At level 0, and at any level while nothing pushes; a push makes them single."""
+    made = list[int]()
+    for level, least in ((0.0, 0), (0.5, 1)):
+        env = begun(yielding(task, Compliance(level=level)))
+        step = env.backend.step
+        env.backend.step = lambda n, step=step: (made.append(n), step(n))[1]  # type: ignore[method-assign]
+        singles = 0
+        for k in range(30):
+            made.clear()
+            env.step(still(env))
+            singles += made == [1] * env.substeps
+            assert made in ([env.substeps], [1] * env.substeps)
+            if k == 0:
+                # No push comes within the first 0.05 s.
+                assert made == [env.substeps]
+        assert singles >= least and (level > 0 or singles == 0)
+        env.close()
+
+
 @pytest.mark.parametrize("given", [Compliance(level=0.5), Stiffness(150.0)])
 def test_copies_of_a_world_yield_alike(task: Imitation, given: Compliance | Stiffness) -> None:
     env = begun(yielding(task, given))

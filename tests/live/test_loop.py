@@ -11,6 +11,7 @@ from poise.jobs.tracker import Tracker
 from poise.live.character import EASE, FALLS, RETURNS, TRACKS
 from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Packet
+from poise.live.session import generator_for
 from poise.live.sources.file import Loop, packet_of
 from poise.motion import Clip, read_clip
 from test_docs import WALK
@@ -141,22 +142,67 @@ def test_buffer_noise_and_pause_are_set_while_it_runs(tracker: Tracker, walk: Cl
         {"type": "pull", "character": 0, "body": 3, "point": [0, 0, 0], "to": [0, 0, 1]}
     )
     played.run(0.2)
-    assert live.steps > steps and 0 in live.world._pulls
+    assert live.steps > steps and 0 in live.world.hands.pulls
     # A hand that says nothing more has let go.
     played.run(1.2)
-    assert live.world._pulls == {}
+    assert live.world.hands.pulls == {}
+    live.close()
+
+
+def test_a_dial_lets_a_character_give_way(tracker: Tracker, walk: Clip) -> None:
+    """The same pull moves the goal of a compliant character alone, and the goal comes back."""
+    live = Live(tracker, LiveConfig(characters=2), clock=lambda: 0.0)
+    world, row = live.world, live.world.humanoid.rows_of("hand")[0]
+    live.commands.append({"type": "comply", "character": 1, "level": 0.5})
+    for k in range(10):
+        live.step(k * STEP)
+    for c in range(2):
+        at = world.rows.state.xpos[c, row + 1].double().numpy()
+        world.hands.pull(c, row, np.zeros(3), at + np.array([0.3, 0, 0]))
+        live._pulled[c] = 0.3
+    for k in range(12):
+        live.step(0.3 + k * STEP)
+    moved = world.yielding.goal.offset.abs().amax(1)
+    assert float(moved[0]) == 0.0 and float(moved[1]) > 0.01
+    assert [c["compliance"] for c in live.figures()["characters"]] == [0.0, 0.5]
+    for c in range(2):
+        world.hands.let_go(c)
+    for k in range(60):
+        live.step(0.7 + k * STEP)
+    assert float(world.yielding.goal.offset.abs().max()) < 0.02
+    live.close()
+
+
+def test_endless_motion_begins_and_ends(tracker: Tracker) -> None:
+    made = generator_for(tracker)
+    assert made is not None
+    live = Live(tracker, clock=lambda: 0.0, generator=made)
+    live.commands.append({"type": "dream", "character": 0, "on": True})
+    heights = []
+    for k in range(90):
+        seen = live.step(k * STEP)
+        assert seen is not None
+        heights.append(seen.qpos[0, 2])
+    character = live.world.characters[0]
+    assert character.doing in (TRACKS, FALLS, RETURNS) and live.figures()["characters"][0]["endless"]
+    # It begins where the character stood.
+    assert np.abs(live.world.body(0).qpos[:2].numpy()).max() < 6.0 and np.isfinite(heights).all()
+    live.commands.append({"type": "dream", "character": 0, "on": False})
+    for k in range(5):
+        live.step(3.0 + k * STEP)
+    assert not live.endless and character.doing != TRACKS
     live.close()
 
 
 def test_a_pull_is_a_spring(tracker: Tracker, walk: Clip) -> None:
     """The chest of a character at ease goes where it is drawn, and comes back."""
     live = Live(tracker, clock=lambda: 0.0)
-    chest = live.world._chest
+    chest = live.world.humanoid.rows_of("spine")[-1]
     place = live.world.rows.state.xpos
     for k in range(10):
         live.step(k * STEP)
     before = place[0, chest + 1].clone()
-    live.world.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
+    live.world.hands.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
     live._pulled[0] = 0.0
     for k in range(15):
         live.step(0.3 + k * STEP)

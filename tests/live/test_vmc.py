@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.jobs.open import open_run
 from poise.live import quats as q
 from poise.live.calibration import OntoBody
+from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Inbox
 from poise.live.passage import world_of
-from poise.live.sinks.vmc import Puppet, VmcSink, datagram
-from poise.live.sources.osc import MESSAGES, bundled, encoded, messages
+from poise.live.sinks.vmc import OwnPuppet, Puppet, VmcSink, datagram
+from poise.live.sources.osc import MESSAGES, Message, bundled, encoded, messages
 from poise.live.sources.vmc import Avatar, VmcSource
 from poise.live.vrm import NEEDED, from_unity, skeleton_of, standard, t_pose, to_unity
 from poise.motion import Clip, Skeleton, read_clip
@@ -27,6 +29,15 @@ def joints(skeleton: Skeleton, root: np.ndarray, rot: np.ndarray) -> np.ndarray:
     for j, parent in enumerate(skeleton.parents[1:], 1):
         out.append(out[parent] + q.rotate(world[parent], skeleton.offsets[j]))
     return np.stack(out)
+
+
+def body_of(bones: list[Message]) -> tuple[Skeleton, np.ndarray, np.ndarray]:
+    """Model, hips and rotations of the messages of a frame."""
+    rows = {m.arguments[0]: np.array(m.arguments[1:], float) for m in bones}
+    pos, rot = from_unity(*np.split(np.stack(list(rows.values())), [3], 1))
+    skeleton = skeleton_of(dict(zip(map(str, rows), pos, strict=True)))
+    assert list(skeleton.names) == list(rows)
+    return skeleton, pos[0], rot
 
 
 def on_vrm() -> Clip:
@@ -115,8 +126,6 @@ def test_through_the_body_and_out_again() -> None:
     """Without physics: what a body's hinges cannot do is lost, and nothing else."""
     import mujoco
 
-    from poise.jobs.open import open_run
-
     tracker, clip = open_run(None).tracker, on_vrm()
     assert tracker.recovery_clips is not None
     ease = tracker.recovery_clips.ease.numpy()
@@ -136,14 +145,48 @@ def test_through_the_body_and_out_again() -> None:
     assert max(worst) < 0.06
 
 
-def test_a_sink_is_heard() -> None:
-    from poise.jobs.open import open_run
+def test_in_through_the_body_and_out_agree_to_a_millimetre_on_the_wire() -> None:
+    """VMC in, a character that is exactly where its goal is, VMC out: what came is what goes. Where a
+    character differs from its goal, the model differs by as much."""
+    tracker, clip = open_run(None).tracker, on_vrm()
+    live, now, out = Live(tracker, LiveConfig(buffer_s=0.1), clock=lambda: 0.0), 0.0, list[Message]()
+    source, avatar = Avatar("a"), OwnPuppet(tracker.humanoid.table, tracker.example)
+    worst, seen_once, bent = list[float](), 0, list[float]()
+    for k in range(150):
+        # It stands for 2 s, then walks.
+        t = max(0, k - 75) % clip.frames
+        for packet in source.take(
+            messages(datagram(clip.skeleton, clip.root_pos[t], clip.rot[t], 1 + now)), now
+        ):
+            live.inbox.offer(packet, now)
+        seen = live.step(now)
+        now += 1 / 30
+        assert seen is not None
+        own = live.own(0)
+        if own is None:
+            continue
+        seen_once += 1
+        skeleton, hips, rot = avatar(seen.goals[0], seen.goals[0], own)
+        out = [m for m in messages(datagram(skeleton, hips, rot, 1.0)) if m.address.endswith("Bone/Pos")]
+        told = body_of(out)
+        here = q.yaw(own.where.yaw)
+        want = q.rotate(here, joints(own.skeleton, own.root_pos, own.rot)) + own.where.shift / own.factor
+        worst.append(float(np.abs(joints(*told) - want).max()))
+        _, hips, rot = avatar(seen.bodies[0], seen.goals[0], own)
+        apart = np.linalg.norm(joints(skeleton, hips, rot) - want, axis=-1).mean()
+        bent.append(float(apart * own.factor - seen.off_m[0]))
+    live.close()
+    assert seen_once > 30 and max(worst) < 1e-3
+    # With physics it is off by the tracking error.
+    assert abs(np.median(bent)) < 0.03
 
+
+def test_a_sink_is_heard() -> None:
     tracker = open_run(None).tracker
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.bind(("127.0.0.1", 0))
         ear.settimeout(5)
-        puppet = Puppet(tracker.humanoid.table, tracker.example)
+        puppet = OwnPuppet(tracker.humanoid.table, tracker.example)
         sink = VmcSink(f"127.0.0.1:{ear.getsockname()[1]}", puppet)
         bodies = np.zeros((1, len(tracker.humanoid.bodies), 7))
         bodies[..., 3] = 1.0
@@ -151,7 +194,7 @@ def test_a_sink_is_heard() -> None:
         told = messages(ear.recv(65_507))
         sink.close()
     assert [m.arguments for m in told if m.address == "/VMC/Ext/T"] == [(2.5,)]
-    assert {m.arguments[0] for m in told if "Bone" in m.address} == set(puppet.skeleton.names)
+    assert {m.arguments[0] for m in told if "Bone" in m.address} == set(standard().names)
     with pytest.raises(PoiseError, match="HOST:PORT"):
         VmcSink("nowhere", puppet)
 

@@ -39,6 +39,10 @@ class Options:
     """How many characters look ahead before they act; each costs about half a core."""
     noise: Annotated[float, arg(metavar="0-1")] = 0.0
     """What is added to the motion as a video estimator errs."""
+    keypoints: Annotated[int | None, arg(metavar="PORT", help_behavior_hint="")] = None
+    """Listen for keypoints of pose estimators (TCP and UDP, docs/live.md) instead of playing files."""
+    bones: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """A motion file of an avatar: the characters take its proportions."""
     vmc: Annotated[int | None, arg(metavar="PORT", help_behavior_hint="")] = None
     """Listen for VMC (avatar tools send it over UDP, mostly to port 39539) instead of playing files."""
     vmc_out: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
@@ -70,9 +74,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     o = options
     check_range("port", o.port, 0, 65_535)
     check_range("vmc", o.vmc, 0, 65_535)
+    check_range("keypoints", o.keypoints, 0, 65_535)
     check_range("seconds", o.seconds, 0.1)
     check_range("seed", o.seed, 0)
-    if o.clips and (o.vmc is not None or o.stream):
+    live_in = o.vmc is not None or o.keypoints is not None or o.stream
+    if o.clips and live_in:
         raise PoiseError("files and a live stream were both given", hint="Leave one of them out")
     from poise.jobs.open import open_run
     from poise.live.loop import LiveConfig
@@ -80,21 +86,35 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.live.session import Session, Wanted
 
     with working("opening the policy"):
-        live_in = o.vmc is not None or o.stream
         paths = () if live_in else o.clips or (Path(__file__).parents[1] / "data" / "walk.bvh",)
         clips = {f"{k + 1} {p.stem}"[:64]: o.reading.read(p) for k, p in enumerate(paths)}
         count = o.characters or max(1, len(clips))
         config = LiveConfig(count, o.buffer, o.lookahead, o.noise, o.seed)
         token = None if o.host in LOOPBACK else secrets.token_urlsafe(24)
         wanted = Wanted(
-            clips, o.vmc, o.vmc_out, o.out or Path("live.bvh"), o.host, o.port, token, o.record
+            clips,
+            o.keypoints,
+            o.vmc,
+            o.vmc_out,
+            o.out or Path("live.bvh"),
+            o.host,
+            o.port,
+            token,
+            o.record,
         )
         kept = list[Path]()
-        session = Session(open_run(o.policy).tracker, config, wanted)
+        tracker = open_run(o.policy).tracker
+        if o.bones is not None:
+            tracker = tracker.with_bones_of(o.reading.read(o.bones))
+        session = Session(tracker, config, wanted)
     try:
         say(f"Poise live: {session.server.url}", "bold")
         if token is not None:
             tell(f"Others can reach this machine at {o.host}. The token in the address lets them in.")
+        if session.door is not None:
+            tell(f"Waiting for keypoints on TCP and UDP port {session.door.port}. Stand still for 2 s.")
+            if token is not None:
+                tell(f'Each connection\'s first line and each datagram there needs "token": "{token}".')
         if session.vmc is not None:
             tell(f"Waiting for VMC on UDP port {session.vmc.port}. Stand still for 2 s at first.")
             if token is not None:

@@ -105,7 +105,7 @@ def steps(drivers: Sequence[Actuation], step: Callable[[int], None], substeps: i
     """
     for driver in drivers:
         driver.push()
-    if not any(driver.pushing_substeps for driver in drivers):
+    if not any(plugin.busy() for driver in drivers for plugin in driver.pushing_substeps):
         step(substeps)
         return
     held = [driver.held() for driver in drivers]

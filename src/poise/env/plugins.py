@@ -117,6 +117,11 @@ class Plugin:
     def push_substep(self, drive: Drive) -> None:
         """Adds forces to what drives the worlds, anew before each physics step."""
 
+    def busy(self) -> bool:
+        """Whether `push_substep` has anything to do in the control step that begins, asked after `push`;
+        where none has, its physics steps are made at once."""
+        return True
+
     def felt(self) -> Felt | None:
         """Forces on the characters to which compliance gives way; None where there are none."""
         return None

@@ -32,6 +32,8 @@ from poise.spatial import quat_conj, quat_rotate
 
 #: Forces on one character that count, the strongest ones.
 MOST = 4
+#: m, rad and their rates below which u is 0.
+LEAST = 1e-9
 
 
 class Yielding(Plugin):
@@ -115,7 +117,11 @@ class Yielding(Plugin):
             self.level.copy_(state["compliance/level"])
 
     def push(self, drive: Drive) -> None:
-        """A control step begins."""
+        """A control step begins; what is left of u is nothing once it is too small to be seen."""
+        u, rate = self.goal.offset, self.goal.rate
+        gone = (u.abs().amax(1, True) < LEAST) & (rate.abs().amax(1, True) < LEAST)
+        u.masked_fill_(gone, 0.0)
+        rate.masked_fill_(gone, 0.0)
         self._before.copy_(self.goal.offset)
         self._k = 0
         inner = self.goal.goal
@@ -124,6 +130,22 @@ class Yielding(Plugin):
         hinges = table[rows].double()
         self._least = torch.minimum(self._low, hinges) - hinges
         self._most = torch.maximum(self._high, hinges) - hinges
+
+    def busy(self) -> bool:
+        """Whether u may move: it is not 0, or a force acts or may come where the dial is not at 0."""
+        if bool((self.goal.offset != 0.0).any() or (self.goal.rate != 0.0).any()):
+            return True
+        if isinstance(self.given, Compliance) and not bool((self.level > 0.0).any()):
+            return False
+        for plugin in self._felt:
+            felt = plugin.felt()
+            if felt is None:
+                continue
+            # What is no part of the drive, or is told anew at each physics step, may come in between.
+            held = felt.driven and type(plugin).push_substep is Plugin.push_substep
+            if not held or bool((felt.force.norm(dim=-1) >= self.given.least_n).any()):
+                return True
+        return False
 
     def push_substep(self, drive: Drive) -> None:
         """Moves u over the physics step that comes, and the targets with it."""

@@ -23,14 +23,41 @@ FEWEST = 8
 
 
 @dataclass(eq=False)
+class Elsewhere:
+    """Motion that goes on from elsewhere.
+
+    Attributes:
+        yaw: rad, by which its world is turned.
+        shift: `(3)` m, by which it is then moved.
+    """
+
+    yaw: float = 0.0
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def __call__(self, qpos: np.ndarray) -> np.ndarray:
+        """Coordinates `(7 + n)` there."""
+        out, turn = qpos.copy(), q.yaw(self.yaw)
+        out[:3] = q.rotate(turn, qpos[:3]) + self.shift
+        out[3:7] = q.mul(turn, qpos[3:7])
+        return out
+
+    def move(self, seen: np.ndarray, to: np.ndarray) -> None:
+        """Lets the motion go on so that the coordinates `seen (7 + n)` are where and face as `to
+        (7 + n)` does; heights stay."""
+        turn = q.heading(to[3:7]) - q.heading(seen[3:7])
+        flat = np.append(seen[:2], 0.0)
+        self.shift = q.rotate(q.yaw(turn), self.shift - flat) + np.append(to[:2], 0.0)
+        self.yaw = math.remainder(self.yaw + turn, 2 * math.pi)
+
+
+@dataclass(eq=False)
 class OntoBody:
     """Poses of one skeleton as coordinates of a body.
 
     `move` lets the motion go on from elsewhere; at first it is where the source has it.
 
     Attributes:
-        yaw: rad, by which the source's world is turned.
-        shift: `(3)` m, by which it is then moved.
+        where: it is, against where the source has it.
         floor: m, by which it is lifted.
         planted: `(n)` rad that are added to the hinges.
         scale: of the person's path.
@@ -40,8 +67,7 @@ class OntoBody:
     hinges: Hinges
     feet: dict[int, np.ndarray]
     first: np.ndarray
-    yaw: float = 0.0
-    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    where: Elsewhere = field(default_factory=Elsewhere)
     floor: float = 0.0
     planted: np.ndarray | float = 0.0
     _last: np.ndarray | None = None
@@ -92,19 +118,12 @@ class OntoBody:
         qpos = self.hinges(root, world, last)
         self._last = qpos[7:].copy()
         qpos[7:] += self.planted
-        turn = q.yaw(self.yaw)
-        qpos[:3] = q.rotate(turn, qpos[:3]) + self.shift
         qpos[2] += self.floor
-        qpos[3:7] = q.mul(turn, qpos[3:7])
-        return qpos
+        return self.where(qpos)
 
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """Lets the motion go on so that the coordinates `seen (7 + n)` are where and face as `to
-        (7 + n)` does; heights stay."""
-        turn = q.heading(to[3:7]) - q.heading(seen[3:7])
-        flat = np.append(seen[:2], 0.0)
-        self.shift = q.rotate(q.yaw(turn), self.shift - flat) + np.append(to[:2], 0.0)
-        self.yaw = math.remainder(self.yaw + turn, 2 * math.pi)
+        """See `Elsewhere.move`."""
+        self.where.move(seen, to)
 
 
 class Standing:

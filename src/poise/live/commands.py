@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live.packet import NAME
+from poise.live.packet import FAR_M, NAME
 from poise.motion import Skeleton
 
 #: Version of the protocol; bytes and depth of a message; joints of a skeleton.
 VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
 _MOST = 1e6
+#: Verticals; -Y is that of cameras, whose x is to the right and z into the picture.
+UPS = ("Y", "Z", "-Y")
 
 
 def parse(text: str | bytes) -> dict[str, Any]:
@@ -119,6 +121,8 @@ COMMANDS: dict[str, Mapping[str, Callable[[Any], Any]]] = {
     "release": _CHARACTER,
     "knock": _CHARACTER,
     "ball": _CHARACTER,
+    "comply": {**_CHARACTER, "level": lambda v: number(v, 0.0, 1.0)},
+    "dream": {**_CHARACTER, "on": flag},
     "pause": {"on": flag},
     "record": {"on": flag},
     "follow": {**_CHARACTER, "person": _maybe},
@@ -161,6 +165,26 @@ def numbers(value: Any, width: int, most: int) -> np.ndarray:
         raise PoiseError("not finite", "message") from None
 
 
+def points_of(message: Mapping[str, Any], count: int) -> np.ndarray:
+    """The keypoints in a message, `(K, 3)`, Z up; NaN where one is missing.
+
+    Raises:
+        PoiseError: another number of them, or what is no point.
+    """
+    rows, sure = message.get("points"), message.get("confidence")
+    if not isinstance(rows, list) or len(rows) != count:
+        raise PoiseError("other keypoints", "message")
+    out = numbers([[math.nan] * 3 if row is None else row for row in rows], 3, JOINTS)
+    if sure is not None:
+        if not isinstance(sure, list) or len(sure) != count:
+            raise PoiseError("other keypoints", "message")
+        out[~(numbers([[c] for c in sure], 1, JOINTS)[:, 0] > 0.0)] = np.nan
+    out[~np.isfinite(out).all(-1)] = np.nan
+    if np.nanmax(np.abs(out), initial=0.0) > FAR_M:
+        raise PoiseError("too far away", "message")
+    return turned(out, vertical(message))
+
+
 def skeleton_of(message: Mapping[str, Any]) -> Skeleton:
     """The skeleton in a message, Z up.
 
@@ -186,15 +210,17 @@ def skeleton_of(message: Mapping[str, Any]) -> Skeleton:
 def vertical(message: Mapping[str, Any]) -> str:
     """The message's vertical."""
     up = message.get("up", "Z")
-    if up not in ("Y", "Z"):
+    if up not in UPS:
         raise PoiseError("no vertical", "message")
     return str(up)
 
 
 def turned(values: np.ndarray, up: str) -> np.ndarray:
     """Points `(..., 3)` or rotations `(..., 4)` of a right-handed world, Z up: (x, y, z) of Y up is
-    (z, x, y) of Z up."""
+    (z, x, y) of Z up; (x, y, z) of -Y up is (x, -y, -z) of Y up."""
     if up == "Z":
         return values
+    if up == "-Y":
+        values = values * ([1.0] * (values.shape[-1] - 2) + [-1.0, -1.0])
     head, tail = values[..., :-3], values[..., -3:]
     return np.concatenate((head, tail[..., [2, 0, 1]]), -1)

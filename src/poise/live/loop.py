@@ -21,12 +21,15 @@ from poise.errors import PoiseError
 from poise.jobs.tracker import Tracker
 from poise.live.buffer import MARGIN_S
 from poise.live.calibration import OntoBody, calibrated
-from poise.live.character import tensor
+from poise.live.character import FALLS, RETURNS, tensor
+from poise.live.endless import Endless
 from poise.live.packet import Inbox, Packet
-from poise.live.people import People
+from poise.live.people import STAND, People
+from poise.live.sinks.vmc import Own
 from poise.live.world import Seen, World
 from poise.motion import Clip
 from poise.settings import validate
+from poise.synth.generator import Kinematic
 
 #: Commands that wait at most, and steps of which figures are made.
 COMMANDS, STEPS = 256, 1800
@@ -35,6 +38,8 @@ HOLDS_S = 1.0
 #: Share by which motion is faster or slower while what is behind is caught up with, and s behind which
 #: nothing is caught up with.
 CATCHES_UP, GIVES_UP_S = 0.15, 1.5
+#: Steps of which it is kept what was read; goals are fewer behind.
+READ = 16
 #: s in which errors wander.
 WANDERS_S = 0.3
 #: s for which no character looks ahead after a step that came too late.
@@ -90,6 +95,7 @@ class Live:
         shows: what steps go to.
         executor: calibrates and plans beside the loop; None does it at once, as tests do.
         clock: s; the clock by which packets arrive.
+        generator: makes endless motion; None: there is none.
 
     Attributes:
         commands: what pages want, see `poise.live.commands`.
@@ -105,6 +111,7 @@ class Live:
         shows: Sequence[Shows] = (),
         executor: Executor | None = None,
         clock: Callable[[], float] = time.perf_counter,
+        generator: Kinematic | None = None,
     ):
         self.config = c = config or LiveConfig()
         self.tracker, self.inbox, self.shows = tracker, inbox or Inbox(), list(shows)
@@ -116,14 +123,18 @@ class Live:
         self.commands: deque[dict[str, Any]] = deque(maxlen=COMMANDS)
         self.paused, self.behind, self.steps = False, 0, 0
         self._read: float | None = None
+        self.generator, self._executor = generator, executor
+        self.endless = dict[int, Endless]()
         self._hurry, self._errors = 0, dict[int, np.ndarray]()
+        #: What was read of each character's person in the last steps; None where the goal is another.
+        self.read = [deque[Own | None](maxlen=READ) for _ in range(c.characters)]
         self.recording: Callable[[bool], None] | None = None
         self._rng = np.random.default_rng(c.seed)
         self._latency: deque[float] = deque(maxlen=STEPS)
         self._spent: deque[float] = deque(maxlen=STEPS)
         self._began: deque[float] = deque(maxlen=90)
         self._pulled: dict[int, float] = {}
-        self._was: list[str | None] = [None] * c.characters
+        self._was = list[object]([None] * c.characters)
         self._set_lead()
 
     # --- steps --------------------------------------------------------------------------------
@@ -183,17 +194,31 @@ class Live:
     def _frame(self, k: int, now_s: float) -> Tensor:
         """The newest frame that character k's goal knows."""
         character, person = self.world.characters[k], self.people.of(k)
-        if self._was[k] != self.people.follows[k]:
-            self._was[k] = self.people.follows[k]
+        endless, qpos, own = self.endless.get(k), None, None
+        follows = endless or self.people.follows[k]
+        if self._was[k] != follows:
+            self._was[k] = follows
             character.blend()
-        qpos = None
-        if person is not None and person.ready() and person.onto is not None:
+        if endless is not None:
+            made = endless.next(character.doing in (FALLS, RETURNS))
+            qpos = None if made is None else tensor(self._noisy(k, made))
+        elif person is not None and person.ready() and person.onto is not None:
             pose = person.read(now_s + 1.0 / self.rate_hz)
             if pose is not None:
                 if pose.jumped:
                     character.jump()
                 qpos = tensor(self._noisy(k, person.onto(pose.root_pos, pose.rot)))
-        return character.next(qpos, self.world.body(k), self.world.lead[k])
+                onto = person.onto
+                where = replace(onto.where)
+                own = Own(onto.passage.source, pose.root_pos, pose.rot, where, onto.scale)
+        frame = character.next(qpos, self.world.body(k), self.world.lead[k])
+        self.read[k].append(own if frame is qpos else None)
+        return frame
+
+    def own(self, k: int) -> Own | None:
+        """The person's pose that character k's goal is now; None where it follows something else."""
+        read, back = self.read[k], self.world.lead[k]
+        return read[-back] if len(read) >= back else None
 
     def _noisy(self, k: int, qpos: np.ndarray) -> np.ndarray:
         size = self.config.noise
@@ -213,7 +238,9 @@ class Live:
 
     def _moved(self, k: int, seen: Tensor, to: Tensor) -> None:
         person = self.people.of(k)
-        if person is not None and person.onto is not None:
+        if k in self.endless:
+            self.endless[k].move(seen.numpy(), to.numpy())
+        elif person is not None and person.onto is not None:
             person.onto.move(seen.numpy(), to.numpy())
 
     def _set_lead(self) -> None:
@@ -227,7 +254,7 @@ class Live:
             self._do(self.commands.popleft(), now_s)
         for k in [k for k, t in self._pulled.items() if now_s - t > HOLDS_S]:
             del self._pulled[k]
-            self.world.let_go(k)
+            self.world.hands.let_go(k)
 
     def _do(self, command: dict[str, Any], now_s: float) -> None:
         """A command that was checked, see `poise.live.commands`."""
@@ -236,16 +263,22 @@ class Live:
             return
         if kind == "pull":
             if command["body"] < len(self.world.humanoid.bodies):
-                self.world.pull(k, command["body"], np.array(command["point"]), np.array(command["to"]))
+                self.world.hands.pull(
+                    k, command["body"], np.array(command["point"]), np.array(command["to"])
+                )
                 self._pulled[k] = now_s
         elif kind == "release":
             self._pulled.pop(k, None)
-            self.world.let_go(k)
+            self.world.hands.let_go(k)
         elif kind == "knock":
             angle = self._rng.uniform(0, 2 * np.pi)
-            self.world.blow(k, np.array([np.cos(angle), np.sin(angle), 0.0]))
+            self.world.hands.blow(k, np.array([np.cos(angle), np.sin(angle), 0.0]))
         elif kind == "ball":
             self.world.drop_ball(k)
+        elif kind == "comply":
+            self.world.comply(k, command["level"])
+        elif kind == "dream":
+            self._dream(k, command["on"])
         elif kind == "pause":
             self.paused = command["on"]
         elif kind == "follow":
@@ -254,6 +287,14 @@ class Live:
             self.recording(command["on"])
         elif kind == "set":
             self._set(command)
+
+    def _dream(self, k: int, on: bool) -> None:
+        """A character begins endless motion, or goes back to its person."""
+        if not on:
+            self.endless.pop(k, None)
+        elif self.generator is not None and k not in self.endless:
+            seed = int(self._rng.integers(2**31))
+            self.endless[k] = Endless(self.generator, seed, self._executor)
 
     def _set(self, command: dict[str, Any]) -> None:
         if "buffer" in command:
@@ -269,39 +310,41 @@ class Live:
 
     def figures(self) -> dict[str, Any]:
         """What is shown beside the characters; times in ms, over the last minute."""
-        late = np.array(self._latency) * 1000.0 if self._latency else np.zeros(1)
-        spent = np.array(self._spent) * 1000.0 if self._spent else np.zeros(1)
-        began = self._began
+        late, spent = self._latency, self._spent
+        began, people = self._began, self.people
         span = began[-1] - began[0] if len(began) > 1 else 0.0
-        people = self.people
         return {
             "hz": round((len(began) - 1) / span, 1) if span > 0 else 0.0,
-            "latency_ms": [round(float(np.percentile(late, p)), 1) for p in (50, 99)],
-            "step_ms": [round(float(np.percentile(spent, p)), 1) for p in (50, 99)],
-            "behind": self.behind,
-            "buffer": people.delay_s,
-            "noise": self.config.noise,
-            "lookahead": len(self.world.ahead_of),
-            "looked_ahead": round(self.world.looked / max(1, self.steps), 3),
-            "paused": self.paused,
-            "resets": self.world.resets,
-            "help_n": 0.0,
-            "received": self.inbox.received,
-            "refused": dict(self.inbox.refused),
-            "crowded": self.inbox.crowded,
+            "latency_ms": _percentiles(late), "step_ms": _percentiles(spent), "behind": self.behind,
+            "buffer": people.delay_s, "noise": self.config.noise, "lookahead": len(self.world.ahead_of),
+            "looked_ahead": round(self.world.looked / max(1, self.steps), 3), "paused": self.paused,
+            "resets": self.world.resets, "help_n": 0.0, "received": self.inbox.received,
+            "refused": dict(self.inbox.refused), "crowded": self.inbox.crowded,
             "people": [
                 {"name": p.name, "calibrated": round(p.share, 2), "said": "" if p.onto else p.said}
                 for p in people.known.values()
+            ]
+            + [
+                {"name": name, "calibrated": round(share, 2), "said": STAND}
+                for name, share in list(self.inbox.standing.items())
             ],
-            "characters": [
-                {
-                    "follows": people.follows[k], "doing": c.doing, "lost": c.lost, "falls": c.falls,
-                    "recovered": c.recovered, "off_mm": round(1000.0 * self.world.body(k).off_m),
-                }
-                for k, c in enumerate(self.world.characters)
-            ],
+            "characters": [self._figures(k) for k in range(self.config.characters)],
+        }  # fmt: skip
+
+    def _figures(self, k: int) -> dict[str, Any]:
+        c, world = self.world.characters[k], self.world
+        return {
+            "follows": self.people.follows[k], "doing": c.doing, "lost": c.lost, "falls": c.falls,
+            "recovered": c.recovered, "off_mm": round(1000.0 * world.body(k).off_m),
+            "compliance": round(float(world.yielding.level[k]), 3), "endless": k in self.endless,
         }  # fmt: skip
 
     def close(self) -> None:
         """Frees the simulations."""
         self.world.close()
+
+
+def _percentiles(seconds: deque[float]) -> list[float]:
+    """ms that half of them, and 99 % of them, are below."""
+    kept = np.array(seconds) * 1000.0 if seconds else np.zeros(1)
+    return [round(float(np.percentile(kept, p)), 1) for p in (50, 99)]

@@ -73,11 +73,13 @@ class Inbox:
         received: packets that were taken.
         refused: how many were not, by the reason.
         crowded: packets that a newer one pushed out before the loop came.
+        standing: people of keypoints that are measured yet, and how far that is, 0 to 1.
     """
 
     def __init__(self) -> None:
         self.received, self.crowded = 0, 0
         self.refused: Counter[str] = Counter()
+        self.standing = dict[str, float]()
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[tuple[float, Packet]]] = {}
 

@@ -14,6 +14,9 @@ from poise.live.packet import PEOPLE, Packet
 #: s without a packet after which a person is away, and after which it is forgotten.
 AWAY_S, FORGET_S = 1.0, 20.0
 
+#: What is asked of a person at first.
+STAND = "stand still for 2 s"
+
 #: Makes the calibration of a packet's skeleton from a clip; a sentence where that fails.
 Calibrate = Callable[..., OntoBody | str]
 
@@ -29,7 +32,7 @@ class Person:
     def __init__(self, name: str, delay_s: float):
         self.name, self.buffer = name, JitterBuffer(delay_s)
         self.onto: OntoBody | None = None
-        self.said = "stand still for 2 s"
+        self.said = STAND
         self.arrived_s = -np.inf
         self._first: Packet | None = None
         self._standing = Standing()

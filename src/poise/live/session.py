@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from poise.errors import PoiseError
+from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
 from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Inbox
@@ -16,10 +18,13 @@ from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
 from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
 from poise.live.sinks.record import Recorder
-from poise.live.sinks.vmc import Puppet, VmcSink
+from poise.live.sinks.vmc import OwnPuppet, VmcSink
+from poise.live.sources.door import StreamDoor
 from poise.live.sources.file import FileSource
+from poise.live.sources.points import PointFit
 from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
+from poise.synth.generator import Kinematic
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,7 @@ class Wanted:
 
     Attributes:
         clips: played as people, by their names.
+        keypoints: TCP and UDP port on which keypoints are listened for, None for none.
         vmc: UDP port on which VMC is listened for, None for none.
         vmc_out: HOST:PORT to which the first character is sent as VMC.
         record: where recordings go.
@@ -38,6 +44,7 @@ class Wanted:
     """
 
     clips: Mapping[str, Clip] = field(default_factory=dict)
+    keypoints: int | None = None
     vmc: int | None = None
     vmc_out: str | None = None
     record: Path = Path("live.bvh")
@@ -57,7 +64,8 @@ class Session:
     def __init__(self, tracker: Tracker, config: LiveConfig, wanted: Wanted):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="poise-live")
         self.inbox, clock = Inbox(), time.perf_counter
-        self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock)
+        made = generator_for(tracker)
+        self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock, generator=made)
         world = self.live.world
         self.recorder = Recorder(
             wanted.record, world.humanoid.table, tracker.example, world.count, world.rate_hz
@@ -65,19 +73,28 @@ class Session:
         self.recorded: list[Path] = []
         self.last: dict[str, Any] = {}
         self.live.recording = self._record
-        hello = hello_of(world, {"records": True})
+        hello = hello_of(world, {"records": True, "dreams": made is not None})
+        self.points = PointFit(self.inbox, tracker.example, world.humanoid.table)
         guard = Guard(wanted.host, wanted.port, wanted.token)
         self.server = PageServer(
-            guard, hello, self.inbox, self.live.commands.append, self.figures, clock
+            guard, hello, self.inbox, self.live.commands.append, self.figures, clock, self.points
         )
         self.live.shows += [ShowPage(self.server), ShowRecorder(self.recorder)]
         self.files = FileSource(dict(wanted.clips), self.inbox, clock)
         self.vmc = None if wanted.vmc is None else VmcSource(wanted.host, wanted.vmc, self.inbox, clock)
+        self.door = None
+        if wanted.keypoints is not None:
+            self.door = StreamDoor(
+                wanted.host, wanted.keypoints, self.inbox, self.points, clock, wanted.token
+            )
         self.sink = None
         if wanted.vmc_out is not None:
-            self.sink = VmcSink(wanted.vmc_out, Puppet(world.humanoid.table, tracker.example))
+            self.sink = VmcSink(wanted.vmc_out, OwnPuppet(world.humanoid.table, tracker.example))
             self.live.shows.append(ShowVmc(self.sink))
         self.files.start()
+        self.points.start()
+        if self.door is not None:
+            self.door.start()
         if self.vmc is not None:
             self.vmc.start()
         if wanted.records:
@@ -96,6 +113,9 @@ class Session:
         """Ends everything; the files of the recordings."""
         self.last = self.figures()
         self.files.close()
+        if self.door is not None:
+            self.door.close()
+        self.points.close()
         if self.vmc is not None:
             self.vmc.close()
         if self.sink is not None:
@@ -112,3 +132,14 @@ class Session:
         else:
             # Files are written beside the loop.
             self._pool.submit(lambda: self.recorded.extend(self.recorder.stop()))
+
+
+def generator_for(tracker: Tracker) -> Kinematic | None:
+    """What makes endless motion for a policy's body; None where none comes along for it."""
+    model = load_generator()
+    if model.fps != tracker.config.sim.control_hz:
+        return None
+    try:
+        return model.generator(tracker.humanoid)
+    except PoiseError:
+        return None

@@ -10,6 +10,7 @@ from poise.live.page.frames import as_json, packed
 from poise.live.page.server import PageServer
 from poise.live.sinks.record import Recorder
 from poise.live.sinks.vmc import VmcSink
+from poise.live.vrm import NEEDED, PARENTS
 from poise.live.world import Seen, World
 
 #: What characters do, in the order of the numbers in frames.
@@ -73,4 +74,8 @@ class ShowVmc:
 
     def show(self, seen: Seen, live: Live) -> None:
         """Takes a control step."""
-        self.sink.write(seen.bodies, seen.time_s)
+        own = live.own(self.sink.character)
+        if own is not None and not set(NEEDED) <= set(own.skeleton.names) <= set(PARENTS):
+            # A person that is no VRM model.
+            own = None
+        self.sink.write(seen.bodies, seen.time_s, seen.goals, own)

@@ -11,14 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from poise.control import Compliance
 from poise.env.goals import StreamGoal
 from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.yielding import Yielding
 from poise.errors import PoiseError
 from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.live.character import Body, Character
+from poise.live.hands import Hands
 from poise.plan import LookaheadConfig
 from poise.sim import Character as Actor
 from poise.sim import CharacterRows, Scene, SceneSim, alone
@@ -26,10 +29,8 @@ from poise.sim.props import Ball
 
 #: m between characters at first, and where the ball waits.
 APART_M, AWAY = 2.0, (0.0, 400.0, 0.15)
-#: N/m and N s/m of the hand that drags a body, and N that it exerts at most.
-PULL, DAMP, MOST_N = 400.0, 40.0, 500.0
-#: N s and s of a blow, m/s of the ball when it comes.
-BLOW_NS, BLOW_S, BALL_MPS = 90.0, 0.1, 4.0
+#: m/s of the ball when it comes.
+BALL_MPS = 4.0
 #: Simulated at once where a character looks ahead in real time: candidates, horizon, hold.
 QUICK = LookaheadConfig(candidates=8, horizon=6, hold_steps=3, smoothing=(0.0, 0.7), corrections=(1.0,))
 
@@ -65,6 +66,8 @@ class World:
 
     Attributes:
         characters: what each is to do.
+        hands: what pushes them.
+        yielding: their dials of compliance.
         resets: how often the simulation went bad and all were set down anew.
         hurries: whether there is no time to look ahead; all act at once then.
         looked: control steps in which somebody looked ahead.
@@ -88,7 +91,10 @@ class World:
             )
         self.tracker, self.count = tracker, count
         task = imitation_of(tracker, [place(tracker.example, tracker)]).bare()
-        task = replace(task, task=replace(task.task, help_by="all"))
+        # The dials begin at 0, where nothing gives way.
+        yields = Compliance(level=0.0)
+        own = replace(task.task, help_by="all", compliance=yields, plugins=(Hands,))
+        task = replace(task, task=own)
         body, sim = task.humanoid, task.config.sim
         self.humanoid, self.rate_hz = body, sim.control_hz
         names = ("", *(str(k + 1) for k in range(1, count)))
@@ -98,6 +104,9 @@ class World:
         # Snapshots are of a character alone, so that lookahead can try with it.
         self.rows = CharacterRows(self.scene.backend, places, alone(body, sim), self.scene)
         self.env = task.env(auto_reset=False, help_scale=0.0, guard=False, backend=self.rows)
+        hands, yielding = self.env.plugin(Hands), self.env.plugin(Yielding)
+        assert hands is not None and yielding is not None
+        self.hands, self.yielding = hands, yielding
         self.goal = StreamGoal(body, self.rate_hz, count, seed=seed)
         planner = GetUpPlanner(tracker.recovery_clips, body.table, self.rate_hz)
         wide = int(np.ceil(np.sqrt(count)))
@@ -105,13 +114,11 @@ class World:
         self.characters = [Character(planner, spot, executor) for spot in spots]
         self.substeps, self.resets, self.steps = sim.substeps, 0, 0
         self.lead, self.hurries, self.looked = [1] * count, False, 0
-        self._pulls: dict[int, tuple[int, Tensor, Tensor]] = {}
-        self._blows: list[tuple[int, Tensor, int]] = []
         self._act = tracker.policy.act
         self._ahead = None
         if tracker.value is not None:
             full = imitation_of(tracker, [place(tracker.example, tracker)])
-            full = replace(full, task=replace(full.task, help_by="all"))
+            full = replace(full, task=replace(full.task, help_by="all", compliance=yields))
             self._ahead = look_ahead(tracker, full, QUICK, 1, seed)
             copies = self._ahead.copies
             goal = StreamGoal(body, self.rate_hz, copies.num_envs)
@@ -154,19 +161,9 @@ class World:
 
     # --- what is done to them -----------------------------------------------------------------
 
-    def pull(self, character: int, body: int, point: np.ndarray, to: np.ndarray) -> None:
-        """A hand holds a body at `point (3)` m in its frame and draws it to `to (3)` m in the world."""
-        double = torch.float64
-        self._pulls[character] = body, torch.tensor(point, dtype=double), torch.tensor(to, dtype=double)
-
-    def let_go(self, character: int) -> None:
-        """The hand lets go."""
-        self._pulls.pop(character, None)
-
-    def blow(self, character: int, direction: np.ndarray) -> None:
-        """A blow on the chest along `direction (3)`, `BLOW_NS` N s."""
-        force = torch.tensor(direction / max(float(np.linalg.norm(direction)), 1e-9)) * BLOW_NS / BLOW_S
-        self._blows.append((character, force, max(1, round(BLOW_S * self.rate_hz))))
+    def comply(self, character: int, level: float) -> None:
+        """Turns a character's dial of compliance, 0 to 1."""
+        self.yielding.turn(level, torch.tensor([character]))
 
     def drop_ball(self, character: int) -> None:
         """The ball flies at a character's chest from 2 m before it."""
@@ -204,7 +201,6 @@ class World:
         ahead = self._ahead if self.ahead_of and not self.hurries else None
         self.looked += ahead is not None
         env.drive(self._act(obs) if ahead is None else ahead.act(obs))
-        self._push()
         env.controls.step(env.backend, self.substeps)
         env.renew(env.judge())
         self.steps += 1
@@ -212,34 +208,6 @@ class World:
             self.resets += 1
             self._set_down()
         return self._seen()
-
-    def _push(self) -> None:
-        """What pulls and strikes adds to the drive; the row of the world comes first."""
-        drive, state = self.rows.drive, self.rows.state
-        for k, (body, point, to) in self._pulls.items():
-            pos, quat = state.xpos[k, body + 1].double(), state.xquat[k, body + 1].double()
-            vec, w = quat[1:], quat[0]
-            t = 2.0 * torch.linalg.cross(vec, point)
-            held = pos + point + w * t + torch.linalg.cross(vec, t)
-            force = PULL * (to - held) - DAMP * self._root_velocity(k)
-            size = float(force.norm())
-            force = force * min(1.0, MOST_N / max(size, 1e-9))
-            arm = held - state["xipos"][k, body + 1].double()
-            wrench = torch.cat((force, torch.linalg.cross(arm, force)))
-            drive.xfrc_applied[k, body + 1] += wrench.to(drive.xfrc_applied)
-        left = list[tuple[int, Tensor, int]]()
-        for k, force, steps in self._blows:
-            drive.xfrc_applied[k, self._chest + 1, :3] += force.to(drive.xfrc_applied)
-            if steps > 1:
-                left.append((k, force, steps - 1))
-        self._blows = left
-
-    def _root_velocity(self, k: int) -> Tensor:
-        return self.rows.state.qvel[k, :3].double()
-
-    @property
-    def _chest(self) -> int:
-        return self.humanoid.rows_of("spine")[-1]
 
     def _seen(self) -> Seen:
         pose, goal, state = self.env.pose(), self.env.goal_pose(), self.scene.backend.state

@@ -107,12 +107,20 @@ class PointBody:
         rows = [r.joint for r in self.table.rows]
         return pos[:, rows], quat[:, rows]
 
-    def _performer(self, places: np.ndarray) -> World:
-        """The measured skeleton in every frame."""
+    def performer(self, positions: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Root `(T, 3)` m and local rotations `(T, J, 4)` of the measured skeleton, its joints in the
+        order of `rest`, for keypoints `(T, K, 3)` m without gaps."""
+        return self._solved(np.stack([_mean(positions, k) for k in self.places.values()], 1))
+
+    def _solved(self, places: np.ndarray) -> tuple[Tensor, Tensor]:
         seen = {p: torch.tensor(places[:, k]) for k, p in enumerate(self.places)}
         tracks, _ = trunk_tracks(seen, [], self.share)
         tracks = hold_lengths(tracks, self.bones, LENGTH_ROUNDS)
-        root, rot = Solver(self.rest, tracks, _NO_MEMORY_FPS).run()
+        return Solver(self.rest, tracks, _NO_MEMORY_FPS).run()
+
+    def _performer(self, places: np.ndarray) -> World:
+        """The measured skeleton in every frame."""
+        root, rot = self._solved(places)
         names = list(self.rest.parents)
         parents = tuple(-1 if up is None else names.index(up) for up in self.rest.parents.values())
         offsets = torch.tensor(np.stack([self.rest.offsets[n] for n in names]))

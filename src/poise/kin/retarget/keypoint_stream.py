@@ -103,7 +103,7 @@ class KeypointStream:
             raise PoiseError(f"the control rate must be above 0, got {rate_hz}")
         self.body, self.rate_hz, self.config = body, rate_hz, config or StreamConfig()
         self.latency_s = self.config.lookahead / rate_hz
-        self._gaps = _Gaps(len(body.names), self.config.max_speed)
+        self._gaps = Gaps(len(body.names), self.config.max_speed)
         self._filter = FadingFilter(self.config.smooth_s)
         self._time: float | None = None
         self._last: _Step | None = None
@@ -194,7 +194,7 @@ class KeypointStream:
         return [GoalFrame(back.time_s, back.pos, speed, back.stale_s)]
 
 
-class _Gaps:
+class Gaps:
     """Missing keypoints travel along with those that are seen."""
 
     def __init__(self, count: int, max_speed: float):

@@ -23,7 +23,9 @@ from websockets.http11 import Request, Response
 from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION, command, parse
 from poise.live.packet import Inbox
+from poise.live.page.doorway import WAITING, Doorway, pauses
 from poise.live.page.guard import Bucket, Guard
+from poise.live.sources.points import PointFit
 from poise.live.sources.stream import JsonStream
 
 #: What can be fetched: a fixed list, so that no path leads to a file of the user's.
@@ -46,45 +48,20 @@ TOLD = 50
 
 
 class _Connection(ServerConnection):
-    """A connection that is turned away before anything is read where there are too many."""
+    """A connection that is counted out when it ends."""
 
     guard: Guard
-    address = ""
+    _peer = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         peer = transport.get_extra_info("peername")
-        address = str(peer[0]) if peer else ""
-        why = self.guard.enter(address)
-        if why is None:
-            self.address = address
-            super().connection_made(transport)
-            return
-        assert isinstance(transport, asyncio.Transport)
-        body = (why + "\n").encode()
-        head = f"HTTP/1.1 503 Service Unavailable\r\nContent-Length: {len(body)}\r\n"
-        transport.write((head + "Connection: close\r\n\r\n").encode() + body)
-        transport.close()
+        # One that is gone already has no name.
+        self._peer = str(peer[0]) if peer else ""
+        super().connection_made(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self.address:
-            self.guard.leave(self.address)
-            super().connection_lost(exc)
-
-    def data_received(self, data: bytes) -> None:
-        if self.address:
-            super().data_received(data)
-
-    def eof_received(self) -> None:
-        if self.address:
-            super().eof_received()
-
-    def pause_writing(self) -> None:
-        if self.address:
-            super().pause_writing()
-
-    def resume_writing(self) -> None:
-        if self.address:
-            super().resume_writing()
+        self.guard.leave(self._peer)
+        super().connection_lost(exc)
 
 
 class PageServer:
@@ -97,6 +74,7 @@ class PageServer:
         command: takes a checked command.
         figures: what is shown beside the characters, asked for a few times a second.
         clock: s, by which packets arrive.
+        points: fits keypoints of streams; None takes none.
 
     Raises:
         PoiseError: the address is taken or is none of this machine.
@@ -110,7 +88,9 @@ class PageServer:
         command: Callable[[dict[str, Any]], None],
         figures: Callable[[], dict[str, Any]],
         clock: Callable[[], float],
+        points: PointFit | None = None,
     ):
+        self._points = points
         self.guard, self.inbox, self.clock = guard, inbox, clock
         self._command, self._figures = command, figures
         self._hello = json.dumps({"v": VERSION, "type": "hello", **hello})
@@ -166,9 +146,10 @@ class PageServer:
         )
         guard = self.guard
         kind = type("Connection", (_Connection,), {"guard": guard})
+        self._loop.set_exception_handler(pauses)
         try:
             server: Server = await serve(
-                self._handle, guard.host, guard.port, process_request=self._answer,
+                self._handle, sock=Doorway(guard), backlog=WAITING, process_request=self._answer,
                 create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
                 open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=20,
                 compression=None, server_header=None, logger=_quiet(),
@@ -232,11 +213,14 @@ class PageServer:
             self._programs -= text
 
     async def _send(self, connection: ServerConnection, text: bool) -> None:
-        told = ""
+        told, last = "", self._newest
         try:
             while self._fresh is not None:
-                await self._fresh.wait()
-                frame, words = self._newest
+                # What came while this page was sent the one before is not missed.
+                if self._newest is last:
+                    await self._fresh.wait()
+                last = self._newest
+                frame, words = last
                 if text and words:
                     await connection.send(words)
                 elif not text:
@@ -253,7 +237,7 @@ class PageServer:
         bucket, path = Bucket(), urlsplit(connection.request.path if connection.request else "").path
         self._streams += path == "/stream"
         said = 0
-        stream = JsonStream(self.inbox, f"{self._streams}:") if path == "/stream" else None
+        stream = JsonStream(self.inbox, f"{self._streams}:", self._points) if path == "/stream" else None
         try:
             async for message in connection:
                 if not bucket.takes():

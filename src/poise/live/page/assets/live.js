@@ -49,6 +49,7 @@
     $("ahead").max = hello.characters;
     $("ahead-row").hidden = !hello.looks_ahead;
     $("record").hidden = !hello.records;
+    $("dream").hidden = !hello.dreams;
     choose(0);
     hands();
     say("live", "live");
@@ -121,9 +122,11 @@
     $("help").textContent = message.help_n.toFixed(0);
     $("refused").textContent = Object.values(message.refused).reduce((a, b) => a + b, 0);
     $("pause").setAttribute("aria-pressed", message.paused);
+    $("dream").setAttribute("aria-pressed", c.endless);
     $("record").setAttribute("aria-pressed", Boolean(message.recording));
     document.body.dataset.doing = c.doing;
-    for (const [id, value] of [["buffer", message.buffer], ["noise", message.noise], ["ahead", message.lookahead]])
+    document.body.dataset.compliance = c.compliance;
+    for (const [id, value] of [["buffer", message.buffer], ["noise", message.noise], ["ahead", message.lookahead], ["comply", c.compliance]])
       if (document.activeElement !== $(id)) $(id).value = value;
     told();
     const names = message.people.map((p) => p.name);
@@ -135,12 +138,14 @@
     const waits = message.people.find((p) => p.said && p.name === c.follows);
     const last = message.recorded && message.recorded.length ? `Recorded ${message.recorded.join(", ")}. ` : "";
     $("says").textContent = waits ? `${waits.name}: ${waits.said} (${Math.round(100 * waits.calibrated)} %)`
+      : c.endless ? `The character ${c.doing} endless motion.`
       : c.doing === "at ease" ? "Nobody is here to follow." : `${last}The character ${c.doing}.`;
   }
 
   const told = () => {
     $("buffer-now").textContent = `${Math.round(1000 * $("buffer").value)} ms`;
     $("noise-now").textContent = Number($("noise").value).toFixed(2);
+    $("comply-now").textContent = Number($("comply").value).toFixed(2);
     $("ahead-now").textContent = `${$("ahead").value} of ${hello.characters}`;
   };
   function choose(k) {
@@ -156,8 +161,18 @@
   const acts = {
     knock: () => send({ type: "knock", character: chosen }),
     ball: () => send({ type: "ball", character: chosen }),
+    dream: () => {
+      const on = $("dream").getAttribute("aria-pressed") !== "true";
+      $("dream").setAttribute("aria-pressed", on);
+      send({ type: "dream", character: chosen, on });
+    },
     record: toggle("record"),
     pause: toggle("pause"),
+  };
+  const comply = (level) => {
+    $("comply").value = level;
+    told();
+    send({ type: "comply", character: chosen, level: Number($("comply").value) });
   };
   function pull(now) {
     sent = now;
@@ -168,6 +183,7 @@
     for (const [id, act] of Object.entries(acts)) $(id).onclick = act;
     for (const [id, name] of [["buffer", "buffer"], ["noise", "noise"], ["ahead", "lookahead"]])
       $(id).oninput = () => { told(); send({ type: "set", [name]: Number($(id).value) }); };
+    $("comply").oninput = () => comply($("comply").value);
     $("follow").onchange = () => send({ type: "follow", character: chosen, person: $("follow").value || null });
     const host = $("stage");
     const place = (event) => { const box = host.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
@@ -201,6 +217,8 @@
       else if (key === "k") acts.knock();
       else if (key === "b") acts.ball();
       else if (key === "r" && hello.records) acts.record();
+      else if (key === "e" && hello.dreams) acts.dream();
+      else if (key === "+" || key === "-") comply(Number($("comply").value) + (key === "+" ? 0.05 : -0.05));
       else if (key === " ") acts.pause();
       else if (key === "g") $("ghosts").checked = !$("ghosts").checked;
       else if (key === "c") $("camera").checked = !$("camera").checked;

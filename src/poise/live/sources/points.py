@@ -1,0 +1,183 @@
+"""Keypoints of estimators as packets: people are measured while they stand, then fitted frame by frame.
+
+The fit takes a few milliseconds a frame, in a thread of its own beside the loop; of frames that come
+faster than the body is controlled the newest are fitted.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from typing import NamedTuple
+
+import numpy as np
+
+from poise.body import BodyTable
+from poise.errors import PoiseError
+from poise.kin.retarget.keypoint_body import PointBody
+from poise.kin.retarget.keypoint_stream import Gaps
+from poise.live.calibration import FEWEST, STAND_S, STILL_M
+from poise.live.packet import PEOPLE, Inbox, Packet
+from poise.live.people import FORGET_S
+from poise.motion import Clip
+from poise.motion.keypoints import Keypoints
+from poise.motion.points.fit import fit_clip
+
+#: s between frames that are fitted at least, frames that wait, m/s beyond which a keypoint is missing.
+APART_S, WAIT, MAX_SPEED = 0.024, 64, 25.0
+#: s for which a missing keypoint travels along with the others; longer, and nothing is sent.
+STALE_S = 0.5
+
+
+class Frame(NamedTuple):
+    """Keypoints `(K, 3)` m of a person, Z up, NaN where one is missing, and when they were and came."""
+
+    person: str
+    names: tuple[str, ...]
+    points: np.ndarray
+    time_s: float
+    arrived_s: float
+
+
+class Performer:
+    """One person of keypoints.
+
+    Attributes:
+        share: 0 to 1, how far the measuring is.
+        arrived_s: when its last frame came.
+    """
+
+    def __init__(self, person: str, names: tuple[str, ...], onto: Clip, table: BodyTable):
+        self.person, self.names, self._onto, self._table = person, names, onto, table
+        self._seen = list[Frame]()
+        self._body: PointBody | None = None
+        self._whole: Clip | None = None
+        self._time: float | None = None
+        # Keypoints that were seen while the person stood; others are left out.
+        self._kept = np.arange(len(names))
+        self._gaps = Gaps(len(names), MAX_SPEED)
+        self.share, self.arrived_s = 0.0, -np.inf
+
+    def take(self, frame: Frame) -> Packet | None:
+        """The packet of a frame, None while the person is measured or where too much is missing.
+
+        Raises:
+            PoiseError: keypoints that no body can be measured by.
+        """
+        before = self._time
+        if before is not None and frame.time_s < before - 2.0:
+            # A source that began anew.
+            self._gaps, before = Gaps(len(self._kept), MAX_SPEED), None
+        if before is not None and frame.time_s - before < APART_S:
+            return None
+        self._time = frame.time_s
+        if self._body is None:
+            self._measure(frame)
+            return None
+        dt = 0.0 if before is None else frame.time_s - before
+        whole, stale = self._gaps(frame.points[self._kept], dt)
+        if whole is None or stale > STALE_S:
+            raise PoiseError("keypoints are missing", self.person)
+        root, rot = self._body.performer(whole[None])
+        assert self._whole is not None
+        skeleton = self._whole.skeleton
+        return Packet(self.person, frame.time_s, skeleton, root[0].numpy(), rot[0].numpy(), self._whole)
+
+    def _measure(self, frame: Frame) -> None:
+        seen = self._seen
+        if np.isnan(frame.points).all():
+            raise PoiseError("keypoints are missing", self.person)
+        if seen and np.isfinite(apart := _apart(frame.points, seen[0].points)) and apart > STILL_M:
+            # A step begins it anew.
+            seen.clear()
+        seen.append(frame)
+        long = frame.time_s - seen[0].time_s
+        self.share = min(1.0, long / STAND_S)
+        if long < STAND_S or len(seen) < FEWEST:
+            return
+        stood, self._seen, self.share = seen, [], 0.0
+        every = np.stack([f.points for f in stood])
+        kept = np.flatnonzero(np.isfinite(every).all(-1).mean(0) >= 0.5)
+        if not len(kept):
+            raise PoiseError("keypoints are missing", self.person)
+        names, rate = tuple(self.names[k] for k in kept), (len(stood) - 1) / long
+        points = Keypoints(names, every[:, kept], rate, self.person)
+        try:
+            body = PointBody.calibrate(points, self._onto, self._table)
+            self._whole = fit_clip(points)
+        except PoiseError as problem:
+            raise PoiseError("these keypoints show no body", self.person) from problem
+        self._body, self.share = body, 1.0
+        self._kept, self._gaps = kept, Gaps(len(kept), MAX_SPEED)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    """m between two frames' points, the median."""
+    far = np.linalg.norm(a - b, axis=-1)
+    return float(np.median(far[np.isfinite(far)])) if np.isfinite(far).any() else np.nan
+
+
+class PointFit:
+    """Fits the people of all sources of keypoints, and puts packets into an inbox.
+
+    Args:
+        onto: a clip on the humanoid's skeleton, which shows how it stands.
+        table: the humanoid's bodies.
+    """
+
+    def __init__(self, inbox: Inbox, onto: Clip, table: BodyTable):
+        self.inbox, self._onto, self._table = inbox, onto, table
+        self._people = dict[str, Performer]()
+        self._waiting: queue.Queue[Frame | None] = queue.Queue(WAIT)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        """Begins to fit."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stops."""
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join(2.0)
+
+    def offer(self, frame: Frame) -> None:
+        """Takes a frame; returns at once. Where too many wait it is left out."""
+        try:
+            self._waiting.put_nowait(frame)
+        except queue.Full:
+            self.inbox.refuse("too many keypoints")
+
+    def fit(self, frame: Frame) -> None:
+        """Fits a frame now."""
+        known = self._people.get(frame.person)
+        if known is None or known.names != frame.names:
+            if known is None:
+                self._forget(frame.arrived_s)
+            if known is None and len(self._people) >= PEOPLE:
+                self.inbox.refuse("too many people")
+                return
+            known = Performer(frame.person, frame.names, self._onto, self._table)
+            self._people[frame.person] = known
+        known.arrived_s = frame.arrived_s
+        try:
+            packet = known.take(frame)
+        except PoiseError as problem:
+            self.inbox.refuse(problem.what)
+            packet = None
+        if known.share < 1.0:
+            self.inbox.standing[frame.person] = known.share
+        else:
+            self.inbox.standing.pop(frame.person, None)
+        if packet is not None:
+            self.inbox.offer(packet, frame.arrived_s)
+
+    def _forget(self, now_s: float) -> None:
+        """Forgets people that have been away for long."""
+        for name in [n for n, p in self._people.items() if now_s - p.arrived_s > FORGET_S]:
+            del self._people[name]
+            self.inbox.standing.pop(name, None)
+
+    def _run(self) -> None:
+        while (frame := self._waiting.get()) is not None:
+            self.fit(frame)
