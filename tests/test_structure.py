@@ -41,7 +41,7 @@ EXPLAINED = {
         "env/gym.py:GymEnv", "env/rsl_rl.py:RslRlVecEnv",
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
-        "sim/props/door.py:Door", "sim/props/lift.py:Lift",
+        "sim/props/lift.py:Lift",
         "env/teams.py:Teams",
     ),
     "called by the libraries that they belong to": (

@@ -10,8 +10,10 @@ import pytest
 import torch
 
 from poise.control import Stiffness
-from poise.env.scenes import Hands, Pull, Throws
-from poise.jobs.compliant.play import WORDS, footfalls, play
+from poise.env.scenes import Doorway, Hands, Pull, Throws
+from poise.errors import PoiseError
+from poise.jobs.compliant.play import WORDS, play
+from poise.jobs.compliant.watch import footfalls
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
@@ -54,6 +56,18 @@ def test_a_pull_and_throws_are_seen(tracker: Tracker) -> None:
     thrown = play(Throws(every_s=(0.8, 0.8)), tracker, None, None, 3, seconds=1.6, threads=1)
     assert thrown.figures["force_peak_n"] > 50.0 and len(thrown.movers) == 1
     assert 1.0 < thrown.figures["impulse_ns"] < 10.0
+
+
+def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:
+    made = play(Doorway(1.0), tracker, None, Stiffness(500.0, 0.5), 2, threads=1, name="door")
+    for figures in (made.figures, made.stiff):
+        assert set(figures) == set(made.words) and len(figures) == len(WORDS) + 4
+        assert figures["opened"] == 2.0 and figures["lost"] == 0.0 and figures["angle_rad"] > 0.7
+    assert made.figures["across_n"] < made.stiff["across_n"]
+    page = made.write(tmp_path / "out")["report"].read_text()
+    assert "<title>door, opening" in page and len(made.movers) == 3
+    with pytest.raises(PoiseError, match="the scene has a motion of its own"):
+        play(Doorway(1.0), tracker, read_clip(WALK), count=2, threads=1)
 
 
 def test_steps_by_hand() -> None:

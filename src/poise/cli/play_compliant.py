@@ -32,7 +32,7 @@ class Options:
     compliance, and a table compares both. Writes the motion, figures.json, score.json, report.html."""
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """throws, pull or hands."""
+    """throws, pull, hands or door."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
     """The folder of the results."""
     clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -59,6 +59,8 @@ class Options:
     """hands: how far the partner's hand swings (0.1)."""
     mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
     """throws: of the ball (1)."""
+    width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """door: how wide (1)."""
     seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None
     """throws: of the draws (0)."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
@@ -83,7 +85,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("threads", o.threads, 0)
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
-    from poise.jobs.compliant.play import WORDS, play
+    from poise.jobs.compliant.play import play
     from poise.jobs.open import open_run
 
     scene, given = scene_of(o), given_of(o)
@@ -95,7 +97,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             played = play(scene, tracker, clip, given, o.count, o.duration, o.threads, o.scene)
         with working("writing"):
             paths = played.write(o.out)
-    rows = [(WORDS[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
+    rows = [(played.words[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
     table(f"{o.scene}, {o.count} episodes", ("", "compliant", "without"), rows, left=1)
     say(played.sentence())
     if o.open and not webbrowser.open(paths["report"].absolute().as_uri()):
@@ -133,7 +135,7 @@ def scene_of(options: Options) -> PlayScene:
     kind: Any = SCENES[o.scene]
     stated: dict[str, Any] = {
         "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
-        "sway": o.sway, "mass": o.mass, "seed": o.seed,
+        "sway": o.sway, "mass": o.mass, "width": o.width, "seed": o.seed,
     }  # fmt: skip
     stated = {k: v for k, v in stated.items() if v is not None}
     own = {f.name for f in fields(kind)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -44,18 +45,20 @@ class Poser:
     def live(self, qpos: Tensor, qvel: Tensor) -> Pose:
         """The same poses by MuJoCo, one after another: for the few frames that become known in a step,
         for which torch takes milliseconds. What a frame's pose is does not depend on the others."""
-        model, data = self.humanoid.model, self._data
-        frames, bodies = len(qpos), model.nbody
-        pos, quat, com, cvel = (np.empty((frames, bodies, k)) for k in (3, 4, 3, 6))
+        model, (data, *views) = self.humanoid.model, self._data
+        at_q, at_v, at_pos, at_quat, at_com, at_cvel = views
+        frames, n = len(qpos), model.nbody
+        pos, quat, centres, cvel = (np.empty((frames, *k)) for k in ((n, 3), (n, 4), (3,), (n, 6)))
+        # Attributes of MjData are made anew at every access, which takes longer than the kinematics.
         for i, (q, v) in enumerate(zip(qpos.numpy(), qvel.numpy(), strict=True)):
-            data.qpos, data.qvel = q, v
+            at_q[:], at_v[:] = q, v
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
-            pos[i], quat[i], com[i], cvel[i] = data.xpos, data.xquat, data.subtree_com, data.cvel
+            pos[i], quat[i], centres[i], cvel[i] = at_pos, at_quat, at_com, at_cvel
         turning, moving = cvel[:, 1:, :3], cvel[:, 1:, 3:]
         # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
-        arm, centres = pos[:, 1:] - com[:, model.body_rootid[1:]], com[:, 1]
+        arm = pos[:, 1:] - centres[:, None]
         out = np.concatenate((pos[:, 1:], quat[:, 1:], moving + np.cross(turning, arm), turning), -1)
         at, turned, linvel, angvel = torch.from_numpy(out).float().split((3, 4, 3, 3), -1)
         small = qpos.float()
@@ -72,8 +75,10 @@ class Poser:
         )
 
     @cached_property
-    def _data(self) -> mujoco.MjData:
-        return mujoco.MjData(self.humanoid.model)
+    def _data(self) -> tuple[Any, ...]:
+        """Data of the body's model, and views of what goes in and comes out."""
+        data = mujoco.MjData(self.humanoid.model)
+        return data, data.qpos, data.qvel, data.xpos, data.xquat, data.subtree_com[1], data.cvel
 
     def local(self, qpos: Tensor) -> Tensor:
         """`(F, J, 4)` wxyz local turns of hinged bodies."""

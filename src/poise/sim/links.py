@@ -29,6 +29,9 @@ class Link:
             switched on. For a weld always None.
         on: whether it holds from the beginning.
         measured: whether its force is, see `SceneSim.link`; one of the two must not be a character's.
+        turn_m: m, of a weld, how much its torques count against its forces: a small number holds the
+            place firmly and the turn loosely, as a hand does.
+        touch: whether the two bodies touch one another as well; without, the link carries all.
     """
 
     name: str
@@ -39,6 +42,8 @@ class Link:
     to: tuple[float, float, float] | None = None
     on: bool = False
     measured: bool = False
+    turn_m: float = 1.0
+    touch: bool = True
 
     def __post_init__(self) -> None:
         if self.a == self.b:
@@ -75,8 +80,12 @@ class Link:
             name=self.name, type=kinds[self.kind], objtype=mujoco.mjtObj.mjOBJ_BODY,
             name1=ends[0], name2=ends[1], active=self.on,
         )  # fmt: skip
+        if not self.touch:
+            spec.add_exclude(bodyname1=self.a, bodyname2=self.b)
         # As stiff as the physics rate permits: at 60 Hz a body that hangs by it sinks 1 cm.
         constraint.solimp[:2] = list(STIFF)
+        if self.kind == "weld":
+            constraint.data[10] = self.turn_m
         # Equality data: a weld's anchor (on b) and relative pose; a ball joint's anchor (on a), where
         # both ends are set when it is switched on.
         constraint.data[:3] = list(self.at if self.kind == "weld" else self.to or (0.0, 0.0, 0.0))

@@ -156,9 +156,9 @@ class SceneSim:
             assert self.link_data is not None
             data = self.link_data[to, i].double()
             if link.kind == "weld":
-                # Anchor on b; then b's place and turn as seen from a.
+                # Anchor on b; then the anchor's place and b's turn as seen from a.
                 data[:, :3] = at
-                data[:, 3:6] = quat_rotate(back, pos_b - pos_a)
+                data[:, 3:6] = seen
                 data[:, 6:10] = quat_mul(back, quat_b)
             else:
                 data[:, :3], data[:, 3:6] = wanted, at

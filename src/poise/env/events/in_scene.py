@@ -4,8 +4,8 @@
 # pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -38,6 +38,8 @@ class InScene:
             one by one.
         felt: touches and measured links on single bodies of the characters to which compliance gives
             way, see `touches_of`.
+        felt_part: of a felt touch or link by its name, the part of its force `(N, 3)` N that is felt; by
+            default all of it.
         events: what happens.
         ends: whether episodes end per "character", or for all characters of a "world" at once: where
             one ends, those of the others are cut off like by a time-out.
@@ -47,6 +49,7 @@ class InScene:
     touches: tuple[str, ...] = ()
     metered: tuple[str, ...] = ()
     felt: tuple[str, ...] = ()
+    felt_part: Mapping[str, Callable[[SceneSim, Tensor], Tensor]] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     ends: Literal["character", "world"] = "character"
 
@@ -64,10 +67,11 @@ class ScenePart(Plugin):
 
     Attributes:
         happenings: its events, in order.
+        sim: the worlds.
     """
 
     def __init__(self, given: InScene, rows: CharacterRows, sim: SceneSim, control_hz: float):
-        self.given, self._rows, self._sim = given, rows, sim
+        self.given, self._rows, self.sim = given, rows, sim
         self._many = len(rows.places)
         if OTHERS in given.sees and self._many < 2:
             raise PoiseError("there are no others among these rows", "InScene")
@@ -86,8 +90,8 @@ class ScenePart(Plugin):
     ) -> Start:
         """Events begin anew in worlds where all characters do."""
         if self.happenings:
-            n, k = self._sim.num_envs, self._many
-            every = torch.arange(n, device=self._sim.backend.device)
+            n, k = self.sim.num_envs, self._many
+            every = torch.arange(n, device=self.sim.backend.device)
             worlds = every if ids is None else every[torch.bincount(ids // k, minlength=n) == k]
             for happening in self.happenings if len(worlds) else ():
                 happening.begin(worlds)
@@ -112,14 +116,16 @@ class ScenePart(Plugin):
         """The touches and links on the characters, as the last physics step had them."""
         if not self._feels:
             return None
-        n, k, like = self._sim.num_envs, len(self._feels), self._sim.backend.state.xpos
+        n, k, like = self.sim.num_envs, len(self._feels), self.sim.backend.state.xpos
         body = torch.zeros(n * self._many, k, dtype=torch.long, device=like.device)
         point, force = (like.new_zeros(n * self._many, k, 3) for _ in range(2))
         for i, end in enumerate(self._feels):
             mine = slice(end.character, None, self._many)
-            seen = self._sim.link(end.name) if end.link else self._sim.touch(end.name)
+            seen = self.sim.link(end.name) if end.link else self.sim.touch(end.name)
             body[mine, i], point[mine, i] = end.body, seen.point.to(like)
-            force[mine, i] = end.sign * seen.force.to(like)
+            part = self.given.felt_part.get(end.name)
+            acts = seen.force if part is None else part(self.sim, seen.force)
+            force[mine, i] = end.sign * acts.to(like)
         return Felt(body, point, force, driven=False)
 
     def tick(self) -> None:
@@ -138,7 +144,7 @@ class ScenePart(Plugin):
             return {}
         named = enumerate(self.happenings)
         out = {f"event/{i}/{k}": v for i, h in named for k, v in h.rows().items()}
-        return out if self._sim.link_data is None else {**out, "links": self._sim.link_data}
+        return out if self.sim.link_data is None else {**out, "links": self.sim.link_data}
 
     def state(self) -> dict[str, Tensor]:
         named = enumerate(self.happenings)
@@ -162,17 +168,17 @@ class ScenePart(Plugin):
         for name in self.given.sees:
             if name == OTHERS:
                 for field in _OF_OTHERS:
-                    whole = self._rows.state[field].unflatten(0, (self._sim.num_envs, self._many))
+                    whole = self._rows.state[field].unflatten(0, (self.sim.num_envs, self._many))
                     turned = [whole.roll(-k, 1) for k in range(1, self._many)]
                     self._keep(f"{name}/{field}", torch.stack(turned, 2).flatten(0, 1))
                 continue
-            place, state = self._sim.scene.place(name), self._sim.backend.state
+            place, state = self.sim.scene.place(name), self.sim.backend.state
             self._share(f"{name}/qpos", state.qpos[:, place.qpos])
             self._share(f"{name}/qvel", state.qvel[:, place.dofs])
             self._share(f"{name}/pos", state.xpos[:, place.body])
             self._share(f"{name}/quat", state.xquat[:, place.body])
         for name in self.given.touches:
-            contact = self._sim.touch(name)
+            contact = self.sim.touch(name)
             numbers = contact.contacts.unsqueeze(1), contact.force, contact.torque, contact.point
             self._share(f"touch/{name}", torch.cat(numbers, 1))
 
@@ -217,7 +223,7 @@ class MeteredPart(ScenePart):
 
     def _note(self) -> None:
         for name in self.given.metered:
-            force = self._sim.touch(name).force
+            force = self.sim.touch(name).force
             if self._many > 1:
                 force = force.repeat_interleave(self._many, 0)
             self._sources[f"impulse/{name}"].add_(self._step_s * force)

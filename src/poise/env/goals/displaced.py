@@ -66,15 +66,15 @@ class DisplacedGoal(Goal):
         return self._moved(self.goal.ahead(k, ids), ids)
 
     def window(self, steps: tuple[int, ...], ids: Tensor | None = None) -> Tensor:
-        return torch.stack([self._moved(w, ids) for w in self.goal.window(steps, ids).unbind(1)], 1)
+        return self._moved_all(self.goal.window(steps, ids), ids)
 
     def targets(self) -> tuple[Tensor, Tensor]:
         table, rows = self.goal.targets()
         return table[rows] + self.offset[:, 6:], self._every
 
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
-        now, ahead = self.goal.advance(waited, held)
-        return self._moved(now, None), self._moved(ahead, None)
+        now, ahead = self._moved_all(torch.stack(self.goal.advance(waited, held), 1), None).unbind(1)
+        return now, ahead
 
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
         return self.goal.watch(qpos, pos, linvel)
@@ -107,15 +107,25 @@ class DisplacedGoal(Goal):
         return {**self.goal.rows(), "offset": self.offset, "offset_rate": self.rate}
 
     def _moved(self, packed: Tensor, ids: Tensor | None) -> Tensor:
-        """Packed poses by the offsets of worlds `ids`; those that have none stay as they are."""
+        """Packed poses `(n, W)` by the offsets of worlds `ids`; those that have none stay as they are."""
+        return self._moved_all(packed.unsqueeze(1), ids).squeeze(1)
+
+    def _moved_all(self, packed: Tensor, ids: Tensor | None) -> Tensor:
+        """The same of K poses of each world `(n, K, W)`."""
         offset, rate = (x if ids is None else x[ids] for x in (self.offset, self.rate))
-        off = ((offset != 0) | (rate != 0)).any(-1).nonzero().squeeze(-1)
-        if not len(off):
+        off = ((offset != 0) | (rate != 0)).any(-1)
+        if not bool(off.any()):
             return packed
-        pose = self.layout.unpacked(packed[off])
-        qpos = displaced(pose.qpos.double(), offset[off]).cpu()
-        qvel = (pose.qvel.double() + rate[off]).cpu()
-        place = packed[off][:, -len(self.layout.place(packed)) :]
+        whole, k = bool(off.all()), packed.shape[1]
+        moved, offset, rate = (x if whole else x[off] for x in (packed, offset, rate))
+        rows = moved.flatten(0, 1)
+        pose, place = self.layout.unpacked(rows), rows[:, -len(self.layout.place(rows)) :]
+        many = (x.repeat_interleave(k, 0) for x in (offset, rate))
+        qpos = displaced(pose.qpos.double(), next(many)).cpu()
+        qvel = (pose.qvel.double() + next(many)).cpu()
+        made = self.layout.pack(self._poser.live(qpos, qvel), place.cpu()).to(packed).view_as(moved)
+        if whole:
+            return made
         out = packed.clone()
-        out[off] = self.layout.pack(self._poser.live(qpos, qvel), place.cpu()).to(packed)
+        out[off] = made
         return out

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from poise.body import Humanoid
+from poise.env.frame import ObsTerm, RewardTerm
 from poise.env.goals.goal import Goal
 from poise.env.plugins import Plugin
 from poise.env.reference import Reference
@@ -20,12 +21,17 @@ class Stage(NamedTuple):
     Attributes:
         props, links, touches: see `sim.Scene`; the character's bodies have their own names.
         plugins: of the task; those that tell forces (`Plugin.felt`) are what the character gives way to.
+        obs, rewards: of a policy that learns the scene: the task's state and reward.
+        from_start: whether episodes begin with the motion's first frame, since the scene goes by time.
     """
 
     props: tuple[Prop, ...] = ()
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
+    obs: tuple[ObsTerm, ...] = ()
+    rewards: tuple[RewardTerm, ...] = ()
+    from_start: bool = False
 
 
 class PlayScene(Protocol):

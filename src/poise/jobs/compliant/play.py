@@ -13,20 +13,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import torch
-from torch import Tensor
 
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
-from poise.env.events import ScenePart
-from poise.env.goals import DisplacedGoal
-from poise.env.plugins import Felt, Plugin
 from poise.env.scenes import PlayScene
+from poise.errors import PoiseError
 from poise.eval import run_episodes, write_score
-from poise.eval.rolloutset import RolloutSet, judge
+from poise.eval.rolloutset import RolloutSet
+from poise.jobs.compliant.meters import meter_of, words_of
+from poise.jobs.compliant.motions import motion_of
 from poise.jobs.compliant.standing import standing
+from poise.jobs.compliant.watch import Watch
 from poise.jobs.deliver import make_report, simulated_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation, scored
@@ -34,18 +33,11 @@ from poise.jobs.track import imitation_of
 from poise.jobs.track.controllers import RULE
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.kin import lowest_height
-from poise.metrics import success_rule
 from poise.motion import Clip
 from poise.motion.io import write_clip
 from poise.recipes.imitation import Imitation
-from poise.sim import CharacterRows
-from poise.view import Mover, Shape, write_report
+from poise.view import Mover, write_report
 
-#: N; weaker forces do not count as interaction.
-LEAST_N = 1.0
-#: m; a foot that was higher than the one and is lower than the other has come down: a step.
-UP_M, DOWN_M = 0.05, 0.02
 #: What the figures are, in words.
 WORDS = {
     "force_mean_n": "Interaction force, mean while it acts, N",
@@ -57,10 +49,6 @@ WORDS = {
     "off_m": "Distance from the goal, mean, m",
     "lost": "Episodes lost",
 }
-_KINDS = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere", int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
-    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +57,10 @@ class Played:
 
     Attributes:
         scene: its name.
+        words: what the figures are, by their keys.
         imitation: the task of the compliant character.
         evaluation: its episodes and score.
-        figures, stiff: by the keys of `WORDS`, of the compliant character and of its twin that does not
+        figures, stiff: by the keys of `words`, of the compliant character and of its twin that does not
             give way; means over the episodes, `lost` their count.
         count: of the episodes of each.
         arrows: of each frame of the first episode `(K, 6)`: points, m, and forces felt there, N.
@@ -79,6 +68,7 @@ class Played:
     """
 
     scene: str
+    words: Mapping[str, str]
     imitation: Imitation
     evaluation: Evaluation
     figures: Mapping[str, float]
@@ -115,7 +105,7 @@ class Played:
         report = make_report(self.imitation, self.evaluation, {})
         frames = len(report.reference.pos)
         report = replace(
-            report, title=f"{self.scene}, {report.title}", movers=self.movers,
+            report, title=_title(self.scene, report.title), movers=self.movers,
             pushes=self.arrows if len(self.arrows) == frames else (),
             notes=(self.sentence(), *report.notes),
         )  # fmt: skip
@@ -147,25 +137,33 @@ def play(
         PoiseError: the body cannot do the scene, or the clip cannot be read.
     """
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
+    own_motion = motion_of(scene, tracker)
+    if clip is not None and own_motion is not None:
+        raise PoiseError("the scene has a motion of its own", name or "play", "Leave the clip out")
+    clip = clip or own_motion
     task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
     stage = scene.stage(task.humanoid, task.reference)
     task = replace(task, props=stage.props, links=stage.links, touches=stage.touches)
-    both: list[tuple[Imitation, RolloutSet, _Watch, Evaluation]] = []
+    both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
     for compliance in (given or Compliance(), None):
         own = replace(task.task, plugins=stage.plugins, compliance=compliance, help_by="all")
-        both.append(_episodes(tracker, replace(task, task=own), count, threads))
+        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads))
     (imitation, rollouts, seen, evaluation), (_, others, other, _) = both
     return Played(
-        name or type(scene).__name__.lower(), imitation, evaluation,
+        name or type(scene).__name__.lower(), WORDS | words_of(scene), imitation, evaluation,
         seen.figures(rollouts, task), other.figures(others, task), count,
         tuple(seen.arrows), seen.movers(),
     )  # fmt: skip
 
 
+def _title(scene: str, motion: str) -> str:
+    return motion if scene in motion.split() else f"{scene}, {motion}"
+
+
 def _episodes(
-    tracker: Tracker, task: Imitation, count: int, threads: int
-) -> tuple[Imitation, RolloutSet, _Watch, Evaluation]:
-    zero, watch = torch.zeros(count, dtype=torch.long), _Watch()
+    scene: PlayScene, tracker: Tracker, task: Imitation, count: int, threads: int
+) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
+    zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
 
     def make(worlds: int) -> ImitationEnv:
         env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
@@ -177,112 +175,3 @@ def _episodes(
     )
     card = scored(rollouts, task, tracker.about, RULE, tracker.config.method)
     return task, rollouts, watch, Evaluation(card, rollouts, recordings, False)
-
-
-class _Watch:
-    """What acts on the characters, how hard, and how far their goals gave way."""
-
-    def __init__(self) -> None:
-        self.arrows: list[np.ndarray] = []
-        self._ways: list[np.ndarray] = []
-        self._felt: list[Plugin] = []
-
-    def begin(self, env: ImitationEnv) -> None:
-        """Looks at an environment from now on."""
-        n = env.num_envs
-        self._felt = [p for p in env.plugins if type(p).felt is not Plugin.felt]
-        self._step_s = env.substeps * float(env.backend.model.opt.timestep)
-        names = ("impulse", "sum", "peak", "acts", "torque", "steps", "moved")
-        self._sums = {k: torch.zeros(n, dtype=torch.float64) for k in names}
-        env.backend.state.bind(["qfrc_actuator"])
-        self._shapes = list[tuple[Shape, int]]()
-        rows = env.backend
-        if not isinstance(rows, CharacterRows) or rows.sim is None:
-            return
-        model = rows.sim.scene.model
-        own = range(rows.places[0].geoms.start, rows.places[0].geoms.stop)
-        for g in range(model.ngeom):
-            kind, body = _KINDS.get(int(model.geom_type[g])), int(model.geom_bodyid[g])
-            if g in own or kind is None or body == 0:
-                continue
-            size, pos = (
-                (float(a), float(b), float(c)) for a, b, c in (model.geom_size[g], model.geom_pos[g])
-            )
-            w, x, y, z = (float(v) for v in model.geom_quat[g])
-            self._shapes.append((Shape(0, kind, size, pos, (w, x, y, z)), body))
-
-    def see(self, env: ImitationEnv, step: int) -> bool:
-        """Keeps control step `step`; it never needs more of them."""
-        felt = [f for f in (p.felt() for p in self._felt) if f is not None]
-        force = torch.stack([f.force.norm(dim=-1).sum(1) for f in felt]).sum(0).double()
-        peak, metered = force, env.plugin(ScenePart)
-        if metered is not None and "peak/hit" in metered.sources():
-            # Physics step by physics step, where it is metered.
-            peak = metered.sources()["peak/hit"].double()
-            force = metered.sources()["impulse/hit"].double().norm(dim=-1) / self._step_s
-        s = self._sums
-        acts = peak >= LEAST_N
-        if step:
-            s["acts"] += acts
-            s["sum"] += torch.where(acts, force, 0.0)
-            s["impulse"] += force * self._step_s
-            s["peak"] = torch.maximum(s["peak"], peak)
-            s["torque"] += env.backend.state["qfrc_actuator"][:, 6:].abs().mean(1).double()
-            s["steps"] += 1.0
-        if isinstance(env.goal, DisplacedGoal):
-            was = env.goal.layout.unpacked(env.goal.goal.now()).pos
-            way = (env.goal_pose().pos - was).norm(dim=-1).mean(1).double()
-            s["moved"] = torch.maximum(s["moved"], way)
-        self.arrows.append(_arrows(felt))
-        if self._shapes:
-            assert isinstance(env.backend, CharacterRows)
-            state = env.backend.world.state
-            bodies = [b for _, b in self._shapes]
-            way = torch.cat((state.xpos[0, bodies], state.xquat[0, bodies]), 1)
-            self._ways.append(way.double().cpu().numpy())
-        return True
-
-    def movers(self) -> tuple[Mover, ...]:
-        """What moved in the first world."""
-        if not self._ways:
-            return ()
-        ways = np.stack(self._ways, 1)
-        return tuple(
-            Mover(shape, way[:, :3], way[:, 3:])
-            for (shape, _), way in zip(self._shapes, ways, strict=True)
-        )
-
-    def figures(self, rollouts: RolloutSet, task: Imitation) -> dict[str, float]:
-        """The figures, means over the episodes."""
-        s = self._sums
-        off = (rollouts.pos - rollouts.ref_pos).norm(dim=-1).mean()
-        low = lowest_height(task.humanoid.table, rollouts.pos, rollouts.quat)
-        lost = (judge(rollouts, success_rule(RULE)).failed_at >= 0).sum()
-        found = {
-            "force_mean_n": float((s["sum"] / s["acts"].clamp_min(1.0)).mean()),
-            "force_peak_n": float(s["peak"].mean()),
-            "impulse_ns": float(s["impulse"].mean()),
-            "torque_nm": float((s["torque"] / s["steps"].clamp_min(1.0)).mean()),
-            "goal_moved_m": float(s["moved"].mean()),
-            "steps": float(footfalls(low[..., list(task.humanoid.feet)]).double().mean()),
-            "off_m": float(off),
-            "lost": float(lost),
-        }
-        return {k: round(v, 4) for k, v in found.items()}
-
-
-def footfalls(height: Tensor) -> Tensor:
-    """`(E,)` how often feet come down, of the height of their soles `(E, T, F)` m."""
-    up = torch.zeros_like(height[:, 0], dtype=torch.bool)
-    out = torch.zeros(len(height), dtype=torch.long)
-    for t in range(height.shape[1]):
-        down = up & (height[:, t] < DOWN_M)
-        out += down.sum(1)
-        up = (up & ~down) | (height[:, t] > UP_M)
-    return out
-
-
-def _arrows(felt: list[Felt]) -> np.ndarray:
-    rows = [torch.cat((f.point[0], f.force[0]), 1).double().cpu().numpy() for f in felt]
-    every = np.concatenate(rows) if rows else np.zeros((0, 6))
-    return every[np.linalg.norm(every[:, 3:], axis=1) >= LEAST_N]

@@ -26,6 +26,7 @@ class Door:
         opens: rad, how far to either side.
         damping: N m s/rad, of the hinge.
         friction: N m, of the hinge.
+        knob_up: m, of the knobs above the foot of the hinge.
     """
 
     name: str = "door"
@@ -37,6 +38,12 @@ class Door:
     opens: float = 2.0
     damping: float = 1.0
     friction: float = 0.5
+    knob_up: float = KNOB_UP
+
+    @property
+    def knob(self) -> Vector:
+        """The front knob's centre, m, in the leaf's frame."""
+        return -(self.thickness / 2 + KNOB_R), self.width - KNOB_IN, self.knob_up
 
     def __post_init__(self) -> None:
         sizes = {k: getattr(self, k) for k in ("width", "height", "thickness", "mass", "opens")}
@@ -56,6 +63,6 @@ class Door:
         at = [0.0, self.width / 2, gap + half[2]]
         solid(body, f"{self.name}/leaf", "box", half, pos=at, mass=0.97 * self.mass)
         for side, sign in (("front", -1.0), ("back", 1.0)):
-            at = [sign * (self.thickness / 2 + KNOB_R), self.width - KNOB_IN, KNOB_UP]
+            at = [-sign * self.knob[0], *self.knob[1:]]
             name, share = f"{self.name}/knob_{side}", 0.015 * self.mass
             solid(body, name, "sphere", [KNOB_R], pos=at, mass=share)
