@@ -76,6 +76,11 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     env.backend.write(None, lying, still)
     obs = env.observe()
     assert goal.doing.tolist() == [TRACKS, FALLS] and [w for w, _ in goal.falls] == [1]
+    # Its goal is to rest there, not to be where its motion was.
+    pos = env.pose().pos
+    assert float((goal.layout.unpacked(goal.now()).pos[1] - pos[1]).norm(dim=-1).max()) < 1e-3
+    assert float(goal.layout.unpacked(goal.ahead(9)).linvel[1].norm(dim=-1).max()) < 1e-6
+    assert float((goal.layout.unpacked(goal.ahead(9)).pos[1] - pos[1]).norm(dim=-1).max()) < 1e-3
     shot, done = None, set[int]()
     for _ in range(400):
         obs = env.step(tracker.policy.act(obs)).final_obs
@@ -84,7 +89,8 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
             shot = env.snapshot(), goal.ahead().clone()
         if goal.back:
             break
-    assert done >= {FALLS, RETURNS} and goal.back and goal.back[0][0] == 1
+    # It rests at once, so it is led up in the next step.
+    assert RETURNS in done and goal.back and goal.back[0][0] == 1
     assert goal.doing.tolist() == [TRACKS, TRACKS]
     # It stands where it got up, and the generator goes on from there.
     state = env.backend.state.qpos
@@ -102,6 +108,27 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     again = EndlessGoal(Stands(ease), task.humanoid, 30.0, tracker.recovery_clips, 2, lead=12)
     again.load_state(goal.state())
     assert torch.equal(again.doing, goal.doing) and torch.equal(again.at, goal.at)
+    env.close()
+
+
+def test_after_a_try_in_vain_another_clip_gets_up(tracker: Tracker, task: Imitation) -> None:
+    clips = tracker.recovery_clips
+    assert clips is not None and len(clips.ups) > 1
+    goal = EndlessGoal(Stands(clips.ease.double()), task.humanoid, 30.0, clips, lead=12)
+    env, _ = begun(task, goal)
+    lying, rest = clips.ups[0][0].clone()[None], torch.zeros(1, env.pose().pos.shape[1], 3)
+    taken = list[Tensor]()
+    for _ in range(2):
+        env.backend.write(
+            None, lying.to(env.backend.state.qpos), torch.zeros(1, env.backend.state.qvel.shape[1])
+        )
+        pos = env.pose().pos
+        # It is far from what it is to do, and rests.
+        goal.watch(env.backend.state.qpos, pos + 9.0, rest)
+        goal.watch(env.backend.state.qpos, pos, rest)
+        assert goal.doing.tolist() == [RETURNS]
+        taken.append(goal._ways[:60].clone())
+    assert not torch.allclose(taken[0], taken[1], atol=1e-3)
     env.close()
 
 

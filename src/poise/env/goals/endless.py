@@ -19,8 +19,9 @@ from poise.spatial.directions import facing, heading_angle
 
 
 class EndlessGoal(GeneratorGoal):
-    """Worlds follow a generator. A character that has lost its motion is waited for until it rests; it
-    then follows a recovery motion to standing at ease, and the generator goes on from that as its past.
+    """Worlds follow a generator. A character that has lost its motion is only asked to rest as it lies;
+    it then follows a recovery motion to standing at ease, after each try in vain with another
+    get-up clip, and the generator goes on from that as its past.
 
     Args:
         recovery_clips: of the library that the policy has learned; None never comes back.
@@ -28,6 +29,8 @@ class EndlessGoal(GeneratorGoal):
             tries something for some steps, does without.
         steering: where characters go, chosen among several futures of the generator.
         pasts: `(N, p, 7 + n)` from which worlds begin; by default the generator's own.
+        simulated: the generator sees what characters did, up to now, in place of its own frames (which
+            Algorithm 1, line 11, has it see).
 
     Attributes:
         doing: `(N,)`, `TRACKS`, `FALLS` or `RETURNS`.
@@ -49,6 +52,7 @@ class EndlessGoal(GeneratorGoal):
         plans: bool = True,
         steering: Steering | None = None,
         pasts: Tensor | None = None,
+        simulated: bool = False,
     ):
         super().__init__(generator, humanoid, rate_hz, num_envs, device, seed, lead)
         self.plans, self.recovery_clips = plans, recovery_clips
@@ -68,6 +72,12 @@ class EndlessGoal(GeneratorGoal):
         self._next, self._end = torch.zeros_like(self.at), torch.zeros_like(self.at)
         # The frame with which a recovery motion ends.
         self._until = torch.zeros_like(self.at)
+        # How often each has tried to get up in vain.
+        self._tries = torch.zeros_like(self.at)
+        # What characters did in the last frames, the last one now; how many of them are known.
+        self.simulated = simulated
+        self._did = self.qpos[:, : generator.past].clone()
+        self._known = torch.zeros_like(self.at)
 
     # --- frames -------------------------------------------------------------------------------
 
@@ -77,10 +87,13 @@ class EndlessGoal(GeneratorGoal):
     def draw(self, ids: Tensor) -> None:
         super().draw(ids)
         self.doing[ids], self._since[ids] = TRACKS, 0
-        self._next[ids], self._end[ids] = 0, 0
+        self._next[ids], self._end[ids], self._tries[ids] = 0, 0, 0
+        self._known[ids] = 0
 
     def supply(self, ids: Tensor) -> None:
-        """A recovery motion's frames first, then the generator's, which sees them as its past."""
+        """A recovery motion's frames first, then the generator's, which sees them as its past. Where
+        a character falls nothing is made."""
+        ids = ids[self.doing[ids] != FALLS]
         while True:
             known = self.count[ids] - self.lead
             short = (self.at[ids] + 1 >= known) & (self._next[ids] < self._end[ids])
@@ -97,6 +110,7 @@ class EndlessGoal(GeneratorGoal):
 
     def make(self, past: Tensor, ids: Tensor) -> Tensor:
         """The next frames; where there is somewhere to go, of several futures the best."""
+        past = self._past(past, ids) if self.simulated else past
         propose = getattr(self.generator, "propose", None)
         if propose is None or not self.steering.chooses:
             return super().make(past, ids)
@@ -114,6 +128,17 @@ class EndlessGoal(GeneratorGoal):
             out.append(made[int(cost_of(made[..., :2], target, others).argmin())])
         return torch.stack(out)
 
+    def _past(self, past: Tensor, ids: Tensor) -> Tensor:
+        """Pasts `(n, p, 7 + n)` in which what was done stands as far as it is known; frames that are yet
+        to be done stay."""
+        past, p = past.clone(), past.shape[1]
+        for row, world in enumerate(ids.tolist()):
+            coming = int(self.count[world] - 1 - self.at[world])
+            done = min(p - coming, int(self._known[world]))
+            if done > 0:
+                past[row, p - coming - done : p - coming] = self._did[world, p - done :]
+        return past
+
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
         # A motion waits for a character that falls.
         falling = self.doing == FALLS
@@ -125,19 +150,22 @@ class EndlessGoal(GeneratorGoal):
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:
         """Notes worlds that have lost their motion, and leads those that have come to rest back."""
         self._arrive(qpos)
+        self._see(qpos)
         falling, returning = self.doing == FALLS, self.doing == RETURNS
         ref = self.layout.unpacked(self.now()).pos
         off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
         up = returning & ~off & (self.at >= self._until)
         for i in up.nonzero().squeeze(-1).tolist():
             self.back.append((i, int(self.steps[i])))
-        self.doing[up] = TRACKS
+        self.doing[up], self._tries[up] = TRACKS, 0
+        self._tries[off & returning] += 1
         lost = off & ~falling & ~up
         for i in (lost & ~returning).nonzero().squeeze(-1).tolist():
             if self.plans:
                 self.falls.append((i, int(self.steps[i])))
         self.doing[lost], self._since[lost] = FALLS, 0
         self._since += 1
+        self._lie((falling | lost).nonzero().squeeze(-1), qpos)
         if self.recovery_clips is None:
             # It stays where it fell.
             return bool((falling | lost).any())
@@ -149,6 +177,23 @@ class EndlessGoal(GeneratorGoal):
         for i in rests.nonzero().squeeze(-1).tolist():
             self._lead(i, qpos[i].double().cpu())
         return bool((rests | falling | up).any())
+
+    def _see(self, qpos: Tensor) -> None:
+        """Keeps what characters do while they track their motion."""
+        if not (self.simulated and self.plans):
+            return
+        good = (self.doing == TRACKS) & qpos.isfinite().all(-1)
+        self._did = torch.cat((self._did[:, 1:], qpos[:, None].to(self._did)), 1)
+        self._known = torch.where(good, (self._known + 1).clamp_max(self._did.shape[1]), 0)
+
+    def _lie(self, ids: Tensor, qpos: Tensor) -> None:
+        """Worlds `ids (n,)` are to rest as they lie."""
+        ids = ids[qpos[ids].isfinite().all(-1)]
+        if len(ids):
+            self.clear(ids)
+            self.at[ids], self._next[ids], self._end[ids] = 0, 0, 0
+            self.append(ids, qpos[ids].to(self.qpos))
+            self._stale[ids] = True
 
     def _arrive(self, qpos: Tensor) -> None:
         """Notes characters that have reached their target."""
@@ -166,10 +211,11 @@ class EndlessGoal(GeneratorGoal):
         planner, clips = self.get_up, self.recovery_clips
         assert planner is not None and clips is not None
         low = float(qpos[2]) < DOWN * float(clips.ease[2])
-        end = planner.up(qpos)[-1] if low else qpos
+        tries = int(self._tries[world])
+        end = planner.up(qpos, tries)[-1] if low else qpos
         stand = facing(clips.ease, heading_angle(end[3:7]))
         stand[:2] = end[:2]
-        way = plan_recovery(planner, qpos, stand)
+        way = plan_recovery(planner, qpos, stand, tries=tries)
         way = torch.cat((way, way[-1:].expand(self.generator.past, -1))).to(self._ways)
         # The old table stays what it is in snapshots.
         used = self._next < self._end
@@ -193,7 +239,8 @@ class EndlessGoal(GeneratorGoal):
 
     def rows(self) -> dict[str, Tensor]:
         own = {"doing": self.doing, "since": self._since, "steps": self.steps, "next": self._next,
-               "end": self._end, "until": self._until, "passed": self._passed}  # fmt: skip
+               "end": self._end, "until": self._until, "passed": self._passed,
+               "tries": self._tries, "did": self._did, "known": self._known}  # fmt: skip
         return {**super().rows(), **own}
 
     def state(self) -> dict[str, Tensor]:

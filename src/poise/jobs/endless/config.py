@@ -27,6 +27,8 @@ class Dream:
         controller: the policy looks ahead before it acts, or acts at once.
         lookahead: how it looks ahead; its seed is `seed`.
         recover: a character that has fallen gets up and goes on.
+        past: what the kinematic policy goes on from: its own frames, as the paper has it, or what the
+            character did.
         hold_feet: standing feet are held in place in what is written.
         threads: cores of lookahead, 0 is all of them.
     """
@@ -38,6 +40,7 @@ class Dream:
     controller: Literal["lookahead", "policy"] = "lookahead"
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     recover: bool = True
+    past: Literal["own", "simulated"] = "own"
     hold_feet: bool = True
     threads: int = 0
 

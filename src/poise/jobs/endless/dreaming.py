@@ -17,7 +17,6 @@ from torch import Tensor
 
 from poise.env import Acts, ImitationEnv
 from poise.env.goals import EndlessGoal
-from poise.env.goals.led import TRACKS
 from poise.env.goals.steering import Steering
 from poise.errors import PoiseError
 from poise.eval import simulate
@@ -165,6 +164,7 @@ def _go_about(
             made, tracker.humanoid, tracker.config.sim.control_hz, clips, worlds, seed=config.seed,
             lead=lead, plans=plans, steering=steering,
             pasts=pasts if plans else pasts[:1].expand(worlds, -1, -1),
+            simulated=config.past == "simulated",
         )  # fmt: skip
         own.draw(torch.arange(worlds))
         return own
@@ -195,7 +195,6 @@ def _go_about(
                     f"The simulation went bad at {at:.1f} s ({problem.failures[0].cause}); all began "
                     "anew on their motion."
                 )
-                own.doing[:] = TRACKS
                 env.action[:] = 0
     finally:
         env.close()
