@@ -38,13 +38,14 @@ class Filling:
 
     samples: clips to make; the first is the network's best guess, the others are variants.
     foot_lock: hold feet where the network says that they stand. adaptation: test-time adaptation of each
-    gap.
+    gap. rounds: how often gaps are filled anew in which the doctor finds faults.
     """
 
     samples: int = 1
     foot_lock: bool = True
     adaptation: Adaptation | None = None
     seed: int = 0
+    rounds: int = 3
 
 
 def interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
@@ -73,6 +74,7 @@ class Filler:
         limits: `(J,)` m/s that its joints reach at most.
         aloft: m that each keyframe is off the floor, 0 for those that stand.
         calmed: what each gap was made of to keep to what people reach, by its ends.
+        best: the network's best guess of each gap, which filling it anew needs again.
     """
 
     own: Clip
@@ -84,12 +86,27 @@ class Filler:
     limits: Tensor
     aloft: dict[int, float]
     calmed: dict[Gap, Calmed] = field(default_factory=dict[Gap, Calmed])
+    best: dict[Gap, tuple[Tensor, Tensor, Tensor]] = field(
+        default_factory=dict[Gap, tuple[Tensor, Tensor, Tensor]]
+    )
 
     @torch.no_grad()
-    def fill(self, root: Tensor, rot: Tensor, gap: Gap, noise: torch.Generator | None) -> None:
-        """Fills a gap in place."""
+    def fill(
+        self,
+        root: Tensor,
+        rot: Tensor,
+        gap: Gap,
+        noise: torch.Generator | None,
+        most: float = 1.0,
+    ) -> None:
+        """Fills a gap in place, with the share `most` of the network's motion at most."""
         a, b = gap
-        *made, contact = self._transition(root, rot, gap, noise)
+        if noise is not None:
+            *made, contact = self._transition(root, rot, gap, noise)
+        else:
+            if gap not in self.best:
+                self.best[gap] = self._transition(root, rot, gap, None)
+            *made, contact = self.best[gap]
         plain = straight(root, rot, gap)
         ends = (root[[a, b]], rot[[a, b]])
         made = spread(ends, (made[0], made[1]))
@@ -115,9 +132,13 @@ class Filler:
             whole = tuple(torch.cat((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
             return excess(self.own.skeleton, self.limits, (whole[0], whole[1]), self.own.fps)[0]
 
-        done = calmed(made, plain, finish, over, self.filling.foot_lock)
+        done = calmed(made, plain, finish, over, self.filling.foot_lock, most)
         root[a + 1 : b], rot[a + 1 : b] = done.motion
         self.calmed[gap] = done
+
+    def join(self, root: Tensor, rot: Tensor, gap: Gap) -> None:
+        """Lets the ends of a filled gap meet what lies beside it now, in place."""
+        self._finish(root, rot, gap, torch.zeros(gap.b - gap.a - 1, 0))
 
     def _finish(self, root: Tensor, rot: Tensor, gap: Gap, contact: Tensor) -> None:
         """Holds the feet of a gap and lets its ends meet, in place."""

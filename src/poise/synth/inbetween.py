@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,9 @@ from poise.synth.filler import EACH_GAP, Filler, Filling, interpolated
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
 from poise.synth.limits import ALOFT_M, Calmed, fastest, off_floor, under_floor
 from poise.synth.other_rig import OtherRig
+from poise.synth.rounds import best_of_rounds
+from poise.synth.verdict import GapFault
+from poise.synth.verdict import told as named
 
 __all__ = ["EACH_GAP", "Filled", "Filling", "fill_keyframes", "interpolated", "unlike"]
 
@@ -32,12 +36,14 @@ class Filled:
     """The clips, and what the user should know.
 
     over: by which factor the fastest joint goes beyond what people reach in each gap between keyframes
-    of the last clip, 1 at most where none does.
+    of the last clip, 1 at most where none does. faults: what the doctor finds in the gaps of each clip
+    after all that was tried.
     """
 
     clips: tuple[Clip, ...]
     warnings: tuple[str, ...]
     over: tuple[float, ...] = ()
+    faults: tuple[GapFault, ...] = ()
 
 
 def fill_keyframes(
@@ -89,24 +95,26 @@ def fill_keyframes(
     aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
     filler = Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft)
     clips: list[Clip] = []
-    made = 0
+    faults: list[GapFault] = []
     for sample in range(filling.samples):
-        noise = None
-        if sample:
-            noise = torch.Generator().manual_seed(filling.seed * 100_003 + sample)
-        path = root.clone(), rot.clone()
-        for gap in gaps:
-            filler.fill(*path, gap, noise)
-            made += 1
-            if on_gap is not None:
-                on_gap(made, len(gaps) * filling.samples)
+        told = None
+        if on_gap is not None:
+            told = partial(_counted, on_gap, sample * len(gaps), filling.samples * len(gaps))
+        root_, rot_, found = best_of_rounds(filler, (root, rot), gaps, sample, told)
         name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
-        clips.append(_as_clip(clip, *path, name))
+        clips.append(_as_clip(clip, root_, rot_, name))
+        faults += found
+    if faults:
+        warnings.append(named(faults))
     gaps_over = tuple(
         max((c.over for (x, y), c in filler.calmed.items() if a <= x and y <= b), default=0.0)
         for a, b in pairwise(keys)
     )
-    return Filled(tuple(clips), (*warnings, *_calmings(filler.calmed)), gaps_over)
+    return Filled(tuple(clips), (*warnings, *_calmings(filler.calmed)), gaps_over, tuple(faults))
+
+
+def _counted(on_gap: Callable[[int, int], None], before: int, of: int, made: int) -> None:
+    on_gap(before + made, of)
 
 
 def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
@@ -121,8 +129,8 @@ def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
     out: list[str] = []
     if less:
         out.append(
-            "the network moves joints faster than people do; so much of its motion is kept, the rest "
-            f"interpolated: frames {listed(less)}"
+            "all of the network's motion would be too fast for people or have faults; so much of it is "
+            f"kept, the rest interpolated: frames {listed(less)}"
         )
     if free and len(free) < len(calmed):
         out.append(f"feet are not held where they could not get there in time: frames {listed(free)}")
