@@ -78,7 +78,7 @@ def config_of(args: argparse.Namespace) -> Inbetween:
 
 def shown(stats: BlockStats) -> None:
     """Now and then a line."""
-    if stats.step % 500 < 50 or stats.step == stats.steps:
+    if stats.step % 200 < 50 or stats.step == stats.steps:
         held = {k: round(v, 3) for k, v in stats.parts.items() if k.startswith("validation/l2p")}
         print(f"step {stats.step} of {stats.steps}, {stats.samples_per_s:.0f}/s, {held}", flush=True)
 
@@ -161,6 +161,7 @@ def main() -> None:
     )
     parser.add_argument("--score", action="store_true", help="no training: only figures of --out")
     parser.add_argument("--adaptation", action="store_true", help="figures after it, too")
+    parser.add_argument("--first", type=Path, help="a model that training begins from")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--work", type=Path, default=Path("runs/inbetween-cmu"))
@@ -172,8 +173,9 @@ def main() -> None:
     if args.score:
         model = load_model(args.out)
     else:
+        first = None if args.first is None else load_model(args.first)
         model, _, stopped = train(
-            task, args.work, steps, args.minutes, shown, tensorboard=False, validate_every=1000
+            task, args.work, steps, args.minutes, shown, False, validate_every=200, first=first
         )
         if stopped:
             return

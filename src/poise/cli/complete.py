@@ -135,6 +135,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         "at": list(done.at),
         "met_mm": [round(x, 1) for x in done.met_mm],
         "stages": [s.to_dict() for s in done.stages],
+        "faults": [f.to_dict() for f in done.filled.faults],
         "score": delivered.card.to_dict(),
     }
     word = "lost" if lost else "completed"
@@ -171,7 +172,7 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     )
     result = {
         "outcome": "filled", "keyframes": list(asked), "at": list(keys),
-        "warnings": list(filled.warnings),
+        "warnings": list(filled.warnings), "faults": [f.to_dict() for f in filled.faults],
     }  # fmt: skip
     return Answer(result, {"motion": path}, filled.notes, outcome="filled")
 

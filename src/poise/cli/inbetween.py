@@ -91,7 +91,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.picture is not None:
         draw(clip, filled.clips, keys, o.picture)
         outputs["picture"] = o.picture
-    result = {"frames": clip.frames, "fps": clip.fps, "keyframes": keys, "warnings": filled.warnings}
+    result = {
+        "frames": clip.frames, "fps": clip.fps, "keyframes": keys, "warnings": filled.warnings,
+        "faults": [f.to_dict() for f in filled.faults],
+    }  # fmt: skip
     return Answer(result, outputs, clip.skeleton.source.notes)
 
 

@@ -77,6 +77,7 @@ def calmed(
     finish: Callable[[Motion, bool], Motion],
     over: Callable[[Motion], float],
     hold: bool = True,
+    most: float = 1.0,
 ) -> Calmed:
     """The motion with as much of the network's as keeps every joint within its limit.
 
@@ -87,11 +88,11 @@ def calmed(
         made: what the network makes of a gap. plain: the gap interpolated.
         finish: a gap's frames as they are delivered, with ends met, and feet held or not.
         over: by which factor the fastest joint of finished frames goes beyond its limit.
-        hold: whether feet are to be held.
+        hold: whether feet are to be held. most: the largest share of the network's motion.
     """
     best: Calmed | None = None
     for held in (True, False) if hold else (False,):
-        for share in SHARES:
+        for share in (x for x in SHARES if x <= most):
             part = torch.tensor(share, dtype=made[1].dtype).expand(made[1].shape[:2])
             mixed = torch.lerp(plain[0], made[0], share), slerp(plain[1], made[1], part)
             done = finish(mixed, held)

@@ -18,6 +18,7 @@ from poise.motion import Clip
 from poise.motion.io import home_suffix, write_clip
 from poise.synth.gaps import check_keyframes
 from poise.synth.inbetween import EACH_GAP, Filling, fill_keyframes
+from poise.synth.verdict import GapFault
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -25,7 +26,8 @@ class Inbetweened(Result):
     """What came of filling keyframes; nothing is simulated, so there is no score.
 
     clips: the first is the best guess, the others are variants. source: what came in. keyframes: its
-    frames that stayed. warnings: what is doubtful. over: see `synth.inbetween.Filled`.
+    frames that stayed. warnings: what is doubtful. over: see `synth.inbetween.Filled`. faults: what
+    the doctor finds in the gaps after all that was tried, clip by clip.
     """
 
     clips: tuple[Clip, ...]
@@ -33,6 +35,7 @@ class Inbetweened(Result):
     keyframes: tuple[int, ...]
     warnings: tuple[str, ...]
     over: tuple[float, ...] = ()
+    faults: tuple[GapFault, ...] = ()
     card: None = None
 
     @property
@@ -88,7 +91,7 @@ def inbetween(
     adaptation = replace(EACH_GAP, iterations=adapt) if adapt else None
     filling = Filling(samples, foot_lock, adaptation=adaptation, seed=seed)
     filled = fill_keyframes(source, keys, net, filling, on_gap)
-    return Inbetweened(filled.clips, source, tuple(keys), filled.warnings, filled.over)
+    return Inbetweened(filled.clips, source, tuple(keys), filled.warnings, filled.over, filled.faults)
 
 
 def shipped_model(path: str | Path | None = None) -> Path:

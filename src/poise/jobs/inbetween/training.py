@@ -35,7 +35,7 @@ from poise.learn.frames import FrameData, Sampler
 from poise.learn.inbetween import BlockStats, InbetweenTrainer, Objective, train_inbetween
 from poise.learn.model import MODEL, InbetweenModel, make_net, save_model
 from poise.learn.rtn import RTNObjective, RTNTraining
-from poise.learn.state import make_generator
+from poise.learn.state import load_module, make_generator, prefixed
 from poise.motion import Clip, Skeleton
 from poise.motion.mirror import joined, mirrored
 from poise.motion.pack import pack_clips
@@ -238,16 +238,21 @@ def begin(
 def train(
     task: Task, folder: Path, steps: int, minutes: float | None = None,
     on_block: Callable[[BlockStats], bool | None] | None = None, tensorboard: bool = True,
-    validate_every: int = 1000,
+    validate_every: int = 1000, first: InbetweenModel | None = None,
 ) -> tuple[InbetweenModel, BlockStats | None, bool]:  # fmt: skip
     """Trains, or goes on training, in `folder`; the averaged network is written as a model.
 
-    minutes: of this call; the schedule still is that of all `steps`.
+    minutes: of this call; the schedule still is that of all `steps`. first: the weights that a new
+    training begins from; by default drawn ones.
     """
     c = task.config
     meta = {"config": to_data(c), "clips": len(task.bank.clips)}
+    learned = objective(task, steps)
+    if first is not None:
+        net = learned.modules()["net"]
+        load_module(net, prefixed("net", first.net.state_dict()), "net")
     trainer = InbetweenTrainer(
-        objective(task, steps),
+        learned,
         Sampler(task.data, c.stretch),
         c.seed,
         steps,

@@ -1,0 +1,140 @@
+"""Gaps in which the doctor finds faults are filled anew, and the best that came of each is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from poise.kin.doctor.doctor import heal
+from poise.motion import Clip
+from poise.spatial import slerp
+from poise.synth.filler import Filler
+from poise.synth.gaps import Gap
+from poise.synth.limits import Calmed, Motion, excess
+from poise.synth.verdict import GapFault, judged, weight
+
+#: Shares of the network's motion in the best guess, round by round; the rest is interpolated.
+SHARES = (1.0, 0.5, 0.0)
+#: Seconds beside a keyframe over which what the doctor mends fades in.
+FADE_S = 0.15
+#: Gaps of one clip that are mended so at most: each costs an examination of the whole clip.
+MENDED = 12
+
+
+def best_of_rounds(
+    filler: Filler,
+    path: Motion,
+    gaps: Sequence[Gap],
+    sample: int,
+    on_gap: Callable[[int], None] | None = None,
+) -> tuple[Tensor, Tensor, tuple[GapFault, ...]]:
+    """Root and rotations of one filled clip, and the faults that are left in it.
+
+    In further rounds gaps with faults are filled anew: the best guess (sample 0) with less of the
+    network's motion, a variant with another draw. Then the doctor mends what it can, and keyframes
+    stay. Of all that each gap keeps what had the fewest faults.
+
+    Args:
+        on_gap: is told how many gaps are filled, in the first round.
+    """
+    root, rot = path[0].clone(), path[1].clone()
+    kept: dict[Gap, tuple[tuple[int, int], Motion, Calmed | None, Tensor]] = {}
+    wanting = list(gaps)
+    for round_ in range(max(1, filler.filling.rounds)):
+        noise, most = None, SHARES[min(round_, len(SHARES) - 1)]
+        if sample:
+            most = 1.0
+            seed = (filler.filling.seed * 100_003 + sample) * 1_009 + round_
+            noise = torch.Generator().manual_seed(seed)
+        beside: dict[Gap, Tensor] = {}
+        for made, gap in enumerate(wanting, 1):
+            beside[gap] = rot[max(0, gap.a - 1)].clone()
+            filler.fill(root, rot, gap, noise, most)
+            if on_gap is not None and not round_:
+                on_gap(made)
+        found = judged(_clip(filler, root, rot), gaps, sample)
+        for gap in wanting:
+            bad = weight(found.get(gap, ()))
+            if gap not in kept or bad < kept[gap][0]:
+                kept[gap] = bad, _cut(root, rot, gap), filler.calmed.get(gap), beside[gap]
+        wanting = [gap for gap in wanting if kept[gap][0][0]]
+        if not wanting:
+            break
+    _compose(filler, root, rot, kept)
+    if wanting and filler.filling.rounds > 1:
+        _mend(filler, root, rot, wanting, gaps)
+    left = judged(_clip(filler, root, rot), gaps, sample)
+    return root, rot, tuple(dict.fromkeys(f for faults in left.values() for f in faults))
+
+
+def _compose(
+    filler: Filler,
+    root: Tensor,
+    rot: Tensor,
+    kept: dict[Gap, tuple[tuple[int, int], Motion, Calmed | None, Tensor]],
+) -> None:
+    """The best of each gap, in place, with ends that meet."""
+    for gap, (_, motion, calmed, before) in kept.items():
+        root[gap.a + 1 : gap.b], rot[gap.a + 1 : gap.b] = motion
+        if not torch.equal(before, rot[max(0, gap.a - 1)]):
+            # The gap before it ends in another speed than when this one was filled.
+            filler.join(root, rot, gap)
+        if calmed is not None:
+            filler.calmed[gap] = calmed
+
+
+def _mend(
+    filler: Filler, root: Tensor, rot: Tensor, wanting: Sequence[Gap], gaps: Sequence[Gap]
+) -> None:
+    """What the doctor makes of the gaps with faults, in place, where fewer are left then; it fades in
+    from the keyframes."""
+    before = _clip(filler, root, rot)
+    healed = heal(before)
+    if healed.frames != before.frames:
+        return
+    tried_root, tried_rot = root.clone(), rot.clone()
+    for gap in wanting:
+        rows = slice(gap.a + 1, gap.b)
+        t = torch.arange(1, gap.b - gap.a, dtype=root.dtype)
+        near = torch.minimum(t, gap.b - gap.a - t) / filler.own.fps
+        share = (near / FADE_S).clamp_max(1.0)
+        share = (share * share * (3 - 2 * share))[:, None]
+        tried_root[rows] = torch.lerp(root[rows], torch.tensor(healed.root_pos[rows]), share)
+        other = torch.tensor(healed.rot[rows])
+        tried_rot[rows] = slerp(rot[rows], other, share.expand(other.shape[:2]))
+    fewest = _count(judged(before, gaps))
+    able = [g for g in wanting if _speed(filler, tried_root, tried_rot, g) <= 1.0][:MENDED]
+    # What is mended in one gap may be a fault in the next: all at once, else one by one.
+    for some in (able, *([gap] for gap in able)):
+        was = root.clone(), rot.clone()
+        for gap in some:
+            rows = slice(gap.a + 1, gap.b)
+            root[rows], rot[rows] = tried_root[rows], tried_rot[rows]
+        now = _count(judged(_clip(filler, root, rot), gaps))
+        if now >= fewest:
+            root.copy_(was[0])
+            rot.copy_(was[1])
+        elif some is able:
+            return
+        else:
+            fewest = now
+
+
+def _count(found: Mapping[Gap, Sequence[GapFault]]) -> int:
+    return len({(f.kind, f.joint, f.start) for faults in found.values() for f in faults})
+
+
+def _speed(filler: Filler, root: Tensor, rot: Tensor, gap: Gap) -> float:
+    """The fastest joint of a gap, by its limit."""
+    rows = slice(gap.a, gap.b + 1)
+    return excess(filler.own.skeleton, filler.limits, (root[rows], rot[rows]), filler.own.fps)[0]
+
+
+def _cut(root: Tensor, rot: Tensor, gap: Gap) -> Motion:
+    return root[gap.a + 1 : gap.b].clone(), rot[gap.a + 1 : gap.b].clone()
+
+
+def _clip(filler: Filler, root: Tensor, rot: Tensor) -> Clip:
+    return filler.own.replaced(root_pos=root.numpy(), rot=rot.numpy())
