@@ -3,7 +3,6 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-CLIP := src/poise/data/walk.bvh
 MINUTES ?= 1.2
 # Where the CMU clips of the benchmark lie, as benchmarks/first_light.py describes them.
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
@@ -40,7 +39,7 @@ dev: $(VENV)/.dev
 
 demo: $(VENV)/.installed
 	@rm -rf demo
-	$(BIN)/poise imitate $(CLIP) -o demo --minutes $(MINUTES)
+	$(BIN)/poise demo -o demo --minutes $(MINUTES)
 	@echo "The report:               demo/report.html (open it in a browser)"
 	@echo "The simulated motion:     demo/simulated.bvh"
 	@echo "The score card:           demo/score.json"

@@ -78,6 +78,7 @@ def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str
         "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
         "complete": ["a.bvh", "--keyframes", "0,5", "-o", "out"],
         "dream": ["-o", "out"],
+        "demo": [],
     }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "push", "fleet") else [])])
     code = (
         "import sys, poise.cli.console as c, poise.cli.main as m\n"
