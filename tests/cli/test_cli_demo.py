@@ -38,7 +38,7 @@ def test_force_begins_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         seen.append((options, argv, (tmp_path / "run").exists()))
         return Answer()
 
-    monkeypatch.setattr("poise.cli.imitate.run", imitated)
+    monkeypatch.setattr("poise.cli.demo.run_whole", imitated)
     assert main(["demo", "-o", str(tmp_path), "--minutes", "0.5", "--force"]) == 0
     [(options, argv, there)] = seen
     assert not there and options.training.minutes == 0.5 and options.clip == WALK

@@ -10,9 +10,10 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from poise.cli import imitate
 from poise.cli.answer import Answer
 from poise.cli.console import say
+from poise.cli.imitate import Options as Whole
+from poise.cli.imitate import run as run_whole
 from poise.cli.options import Flag, Training
 from poise.cli.output import may_deliver
 from poise.errors import PoiseError
@@ -49,7 +50,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     """Does what `poise imitate` does with the walk, in a folder that holds nothing else."""
     o = options
     training = Training(minutes=o.minutes, iterations=o.iterations, threads=o.threads)
-    whole = imitate.Options(WALK, o.out, force=o.force, training=training)
+    whole = Whole(WALK, o.out, force=o.force, training=training)
     # Its numbers and those of the whole are refused before anything is removed.
     training.check(whole.recipe_settings)
     held = o.out / "run"
@@ -59,7 +60,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if held.exists():
         _remove(held)
     line = [str(WALK), "-o", str(o.out), "--minutes", f"{o.minutes:g}"]
-    answer = imitate.run(whole, line)
+    answer = run_whole(whole, line)
     if report := answer.outputs.get("report"):
         say(f"Open {report} in a browser. The same with a clip of yours: poise imitate CLIP -o out")
     return answer
