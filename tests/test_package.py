@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -98,3 +99,16 @@ def test_cores_where_the_system_does_not_say_which_may_be_used(monkeypatch: pyte
     assert machine.cores() == (os.cpu_count() or 1)
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert machine.cores() == 1
+
+
+def test_the_image_is_built_from_files_that_are_there() -> None:
+    """What the Dockerfile copies exists and is not ignored, and the build's own files are among it."""
+    copied = re.findall(
+        r"^COPY (?!--from)(.+) \S+$", (ROOT / "Dockerfile").read_text("utf-8"), re.MULTILINE
+    )
+    names = {name for line in copied for name in line.split()}
+    let_in = {x[1:] for x in (ROOT / ".dockerignore").read_text("utf-8").split() if x.startswith("!")}
+    assert names == let_in and all((ROOT / name).exists() for name in names)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    needed = {project["readme"], *project["license-files"], "pyproject.toml", "src"}
+    assert {name.split("/")[0] for name in needed} <= names
