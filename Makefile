@@ -3,7 +3,6 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-CLIP := src/poise/data/walk.bvh
 MINUTES ?= 1.2
 # Where the CMU clips of the benchmark lie, as benchmarks/first_light.py describes them.
 DATA ?= $(or $(POISE_DATA),$(HOME)/.cache/poise/data)
@@ -18,7 +17,7 @@ help:
 	@echo "make check   lint, formatting, types, order of imports"
 	@echo "make format  mend formatting and simple lint"
 	@echo "make bench   measure a walk and a cartwheel again on the CMU clips in DATA=FOLDER"
-	@echo "make docs    check the links of the documents"
+	@echo "make docs    check the links of the documents, build their site into site/"
 	@echo "make clean   remove $(VENV), demo/ and caches"
 
 # The stamps make installing idempotent: it happens again only when what is installed changes.
@@ -40,7 +39,7 @@ dev: $(VENV)/.dev
 
 demo: $(VENV)/.installed
 	@rm -rf demo
-	$(BIN)/poise imitate $(CLIP) -o demo --minutes $(MINUTES)
+	$(BIN)/poise demo -o demo --minutes $(MINUTES)
 	@echo "The report:               demo/report.html (open it in a browser)"
 	@echo "The simulated motion:     demo/simulated.bvh"
 	@echo "The score card:           demo/score.json"
@@ -65,10 +64,20 @@ format: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/first_light.py --data '$(DATA)'
 
+# The links are checked with Python alone. The site is built where its packages can be installed, in an
+# environment of its own; without network it is left out, which is no failure.
+DOCS := $(VENV)/docs
 docs:
 	$(PYTHON) docs/check_links.py
+	@if $(DOCS)/bin/mkdocs --version >/dev/null 2>&1 || { $(PYTHON) -m venv $(DOCS) >/dev/null 2>&1 && \
+	    $(DOCS)/bin/python -m pip install --disable-pip-version-check --quiet --retries 1 --timeout 15 \
+	      -c constraints.txt mkdocs mkdocs-material mkdocstrings-python >/dev/null 2>&1; }; then \
+	  NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet && echo "The site: site/index.html"; \
+	else \
+	  echo "The site was not built: its packages (mkdocs-material, mkdocstrings-python) cannot be installed here."; \
+	fi
 
 clean:
-	rm -rf $(VENV) demo build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) demo site build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	rm -rf src/*.egg-info MUJOCO_LOG.TXT
 	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

@@ -55,6 +55,7 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
         more = ["--adapt", "0", "--controller", "policy", "--policy", policy, "-o", out / "o"]
         return [short, "--keyframes", "0 20", *more], 3
     given: dict[str, list[Any]] = {
+        "demo": ["-o", out / "o", "--iterations", "1", "--threads", "1"],
         "info": [short],
         "convert": [short, out / "o.bvh"],
         "retarget": [short, "--onto", WALK, "-o", out / "o.bvh"],
@@ -75,8 +76,10 @@ def lines(verb: str, short: Path, clip: Path, trained: Path, out: Path) -> tuple
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_answers_in_one_schema(
-    verb: str, short: Path, clip: Path, trained: Path, tmp_path: Path, answered: Callable[..., Any]
-) -> None:
+    verb: str, short: Path, clip: Path, trained: Path, tmp_path: Path, answered: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("poise.cli.demo.WALK", short)
     argv, code = lines(verb, short, clip, trained, tmp_path)
     found = answered(verb, *argv, code=code)
     check(found)
@@ -89,7 +92,7 @@ def test_errors_are_documents_too(verb: str, tmp_path: Path, answered: Callable[
     found = answered(verb, "--no-such-option", code=2)
     check(found)
     assert f"poise {verb} --help" in found["error"]["hint"] and found["result"] is None
-    if verb not in ("train", "inbetween", "complete", "retarget", "doctor", "dream"):
+    if verb not in ("train", "inbetween", "complete", "retarget", "doctor", "dream", "demo"):
         writes = ("imitate", "track", "push", "convert", "fleet")
         more = ["-o", tmp_path / "o.bvh"] if verb in writes else []
         found = answered(verb, tmp_path / "absent.bvh", *more, code=2)

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 from tiny_clips import ASF, amc, bvh, put
 
@@ -78,6 +79,7 @@ def test_a_verb_says_what_it_does_before_it_imports_what_takes_seconds(verb: str
         "inbetween": ["a.bvh", "--keyframes", "0,5", "-o", "out.bvh"],
         "complete": ["a.bvh", "--keyframes", "0,5", "-o", "out"],
         "dream": ["-o", "out"],
+        "demo": [],
     }.get(verb, ["a.bvh", *(["-o", "out"] if verb in ("imitate", "track", "push", "fleet") else [])])
     code = (
         "import sys, poise.cli.console as c, poise.cli.main as m\n"
@@ -185,6 +187,28 @@ def test_body_lists_what_is_trained(clip: Path, capsys: pytest.CaptureFixture[st
     assert facts["mass_kg"] == pytest.approx(50.0) and rows["right_ankle"]["kp"] == 123.0
     assert main(command) == 0
     assert "right_ankle" in capsys.readouterr().out
+
+
+def test_body_is_written_as_mjcf(clip: Path, tmp_path: Path, answered, refused) -> None:
+    import mujoco
+
+    path = tmp_path / "body.xml"
+    found = answered("body", clip, "-o", path)
+    assert found["outputs"] == {"body": str(path)}
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert model.nu == found["result"]["hinges"]
+    refused("body", clip, "-o", path, words=("is there already", "--force"))
+    refused("body", clip, "-o", tmp_path / "body.urdf", words=("MJCF",))
+    assert main(["body", str(clip), "-o", str(path), "--force"]) == 0
+
+
+def test_eval_writes_rollouts(trained: Path, tmp_path: Path, answered, refused) -> None:
+    path = tmp_path / "steps.npz"
+    assert answered("eval", trained, "--rollouts", path)["outputs"] == {"rollouts": str(path)}
+    with np.load(path) as steps:
+        assert len(steps["obs"]) == len(steps["actions"]) > 0
+    refused("eval", trained, "--rollouts", path, words=("is there already", "--force"))
+    refused("eval", trained, "--rollouts", tmp_path / "steps.csv", words=(".npz",))
 
 
 def test_overrides_are_name_and_number() -> None:

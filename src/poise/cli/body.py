@@ -12,6 +12,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import table
 from poise.cli.options import Body, Flag, Reading
+from poise.cli.output import may_write
+from poise.errors import PoiseError
 
 if TYPE_CHECKING:
     from poise.body import BodyConfig
@@ -24,6 +26,10 @@ class Options:
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.xml", help_behavior_hint="")] = None
+    """Write the body as MJCF, which MuJoCo loads: on a floor, with its servos, as it is simulated."""
+    force: Flag = False
+    """Write over a file that is there."""
     json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
@@ -32,8 +38,14 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Fits the body as training would, so that the table is the one that is trained."""
-    config = options.body.config()
+    config, out = options.body.config(), options.out
+    if out is not None:
+        if out.suffix.lower() != ".xml":
+            raise PoiseError("a body is written as MJCF, in a file .xml", out, "Give -o FILE.xml")
+        own = () if options.body.body is None else (options.body.body,)
+        may_write(out, options.force, options.clip, *own)
     from poise.kin import fit_humanoid
+    from poise.sim.mjcf import write_mjcf
 
     clip = options.reading.read(options.clip)
     humanoid, _, report = fit_humanoid(clip, config)
@@ -46,7 +58,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     table(title, columns, [_row(r) for r in rows], left=5)
     facts = {"height_m": humanoid.table.height_m, "mass_kg": humanoid.mass}
     facts |= {"hinges": len(humanoid.hinges), "bodies": rows}
-    return Answer(facts, notes=[*_made(clip, config), *report.sentences()])
+    outputs = {} if out is None else {"body": write_mjcf(humanoid, out)}
+    return Answer(facts, outputs, [*_made(clip, config), *report.sentences()])
 
 
 def _made(clip: Clip, config: BodyConfig) -> list[str]:

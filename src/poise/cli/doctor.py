@@ -26,6 +26,7 @@ from poise.cli.folder import each
 from poise.cli.options import Flag, Reading
 from poise.cli.output import claimed
 from poise.errors import PoiseError
+from poise.machine import cores
 
 State = Literal["ok", "missing", "optional"]
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "firefox")
@@ -97,13 +98,13 @@ def python() -> Check:
 
 def machine() -> Check:
     """The system, the cores this process may use, the memory."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    count = cores()
     memory = ""
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         memory = f", {total / 2**30:.1f} GiB of memory"
     named = f"{platform.system()} {platform.machine()}"
-    return Check("machine", "ok", f"{named}, {cores} core{'' if cores == 1 else 's'}{memory}")
+    return Check("machine", "ok", f"{named}, {count} core{'' if count == 1 else 's'}{memory}")
 
 
 def package(module: str, name: str, todo: str, needed: bool = True) -> Callable[[], Check]:

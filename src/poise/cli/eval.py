@@ -12,7 +12,9 @@ from tyro.conf import Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import print_card
 from poise.cli.options import Device, Flag, Rule, check_device
+from poise.cli.output import may_write
 from poise.cli.progress import working
+from poise.errors import PoiseError
 
 
 @dataclass(frozen=True)
@@ -29,17 +31,29 @@ class Options:
     """Begin every episode N times, its joints about 1 mrad off, and say how far figures spread."""
     help_limit: Annotated[float | None, arg(metavar="NEWTONS", help_behavior_hint="")] = None
     """The help dial: the most residual force, from 0; by default what training has left of it."""
+    rollouts: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
+    """Also write every step of 32 episodes: observations, actions, rewards, ends, names."""
+    force: Flag = False
+    """Write over the file of --rollouts."""
     device: Device = "cpu"
     """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Rebuilds the task from the run folder alone and evaluates the latest policy."""
-    check_device(options.device)
+    o = options
+    check_device(o.device)
+    if o.rollouts is not None:
+        if o.rollouts.suffix != ".npz":
+            raise PoiseError("rollouts are written as .npz", o.rollouts, "Give --rollouts FILE.npz")
+        may_write(o.rollouts, o.force)
     from poise.jobs.open import open_run
 
+    opened, outputs = open_run(o.run), {}
     with working("simulating every start frame"):
-        o = options
-        card = open_run(o.run).score(o.rule, o.help_limit, o.device, o.starts)
+        card = opened.score(o.rule, o.help_limit, o.device, o.starts)
+        if o.rollouts is not None:
+            steps = opened.transitions(help_limit=o.help_limit, device=o.device)
+            outputs["rollouts"] = steps.save(o.rollouts)
     print_card(card)
-    return Answer(card.to_dict())
+    return Answer(card.to_dict(), outputs)

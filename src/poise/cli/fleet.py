@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from poise.cli.output import claimed
 from poise.cli.parse import parse
 from poise.cli.progress import clock
 from poise.errors import PoiseError
+from poise.machine import cores
 
 if TYPE_CHECKING:
     from poise.jobs.fleet import FleetJob, FleetResult, Record
@@ -76,7 +76,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
     with claimed(o.out):
         read_table(o.out)
-        workers = make_workers(o.address, o.workers, len(jobs), len(os.sched_getaffinity(0)))
+        workers = make_workers(o.address, o.workers, len(jobs), cores())
     each = f"{workers.threads} core{'s' if workers.threads > 1 else ''}"
     say(f"{len(jobs)} job{'s' if len(jobs) > 1 else ''}, {workers.slots} at a time, {each} each")
     result = run_fleet(jobs, o.out, workers, on_event=_show)

@@ -21,6 +21,7 @@ from poise.errors import PoiseError, did_you_mean
 
 #: Every verb and what it does; its module is imported only when it runs.
 VERBS = {
+    "demo": "try it: the walk that comes with Poise, imitated in under two minutes",
     "info": "what a motion file holds: joints, rate, unit, height, what was guessed",
     "convert": "write a motion file in another format or at another rate",
     "retarget": "move a clip onto another human skeleton",
@@ -39,6 +40,7 @@ VERBS = {
     "doctor": "what is wrong with a motion, and mend it; without a clip: is this machine ready",
 }
 _FIRST = (
+    ("poise demo", "two minutes, no clip of yours; then open demo/report.html"),
     ("poise info walk.bvh", "what the clip holds"),
     ("poise imitate walk.bvh -o result", "ten minutes of training; then open result/report.html"),
     ("poise play result --open", "watch it"),

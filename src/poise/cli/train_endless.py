@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from poise.cli.train_inbetween import times
 from poise.cli.training import held_already
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
+from poise.machine import cores
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
@@ -43,8 +43,7 @@ def run(
             raise PoiseError(f"the recipe endless has no --{name}", hint=hint)
     if (out / RUN_FILE).exists() and not training.resume:
         raise held_already(out)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    torch.set_num_threads(training.threads or cores)
+    torch.set_num_threads(training.threads or cores())
     if training.iterations is not None:
         from poise.cli.settings import configured
 

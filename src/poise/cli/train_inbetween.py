@@ -17,6 +17,7 @@ from poise.cli.settings import derived
 from poise.cli.training import held_already
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
+from poise.machine import cores
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
@@ -40,8 +41,6 @@ class Network(_Derived):
 
 def run(library: Library, config: Inbetween, out: Path, training: Training, again: str) -> Answer:
     """Trains until the last step or Ctrl-C."""
-    import os
-
     import torch
 
     from poise.jobs.inbetween.training import RUN_FILE, begin, train
@@ -51,8 +50,7 @@ def run(library: Library, config: Inbetween, out: Path, training: Training, agai
         raise PoiseError("the recipe inbetween has no --backwards", hint="Leave it out")
     if (out / RUN_FILE).exists() and not training.resume:
         raise held_already(out)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    torch.set_num_threads(training.threads or cores)
+    torch.set_num_threads(training.threads or cores())
     dropout = config.between_training.dropout
     if not 0 <= dropout < 1:
         raise PoiseError(f"--dropout must be at least 0 and below 1, got {dropout:g}")

@@ -16,6 +16,7 @@ from poise.eval.episodes import (
 from poise.eval.recovery import RecoveryCard, recovery_card, trial_task
 from poise.eval.rolloutset import RolloutSet
 from poise.eval.scorecard import TRACKING, clip_figures, score_rollouts
+from poise.eval.transitions import Transitions, record_transitions
 
 __all__ = [
     "THRESHOLDS",
@@ -32,9 +33,11 @@ __all__ = [
     "Row",
     "ScoreCard",
     "Threshold",
+    "Transitions",
     "clip_figures",
     "perturb",
     "read_score",
+    "record_transitions",
     "recovery_card",
     "run_episodes",
     "run_in_batches",

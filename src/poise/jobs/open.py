@@ -25,7 +25,7 @@ from poise.jobs.run_file import (
     learning_curve,
     run_folder,
 )
-from poise.jobs.runs import Evaluation, evaluate, score, trained_policy
+from poise.jobs.runs import Evaluation, evaluate, score, trained_policy, transitions
 from poise.jobs.tracker import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
 from poise.learn import PolicyBundle, load_checkpoint
 from poise.learn.model import MODEL, InbetweenModel, load_model
@@ -38,7 +38,7 @@ from poise.settings import check_data, from_data
 if TYPE_CHECKING:
     import numpy as np
 
-    from poise.eval import ScoreCard
+    from poise.eval import ScoreCard, Transitions
     from poise.motion import Clip
     from poise.recipes.imitation import Imitation
 
@@ -156,6 +156,23 @@ class Run:
         from poise.jobs.deliver import simulated_clip
 
         return simulated_clip(self.task, self.episode(clip))
+
+    def transitions(
+        self,
+        most: int | None = 32,
+        help_limit: float | None = None,
+        noise: float = 0.0,
+        seed: int = 0,
+        device: str = "cpu",
+    ) -> Transitions:
+        """Every step of episodes: observations, actions, rewards, ends; see `Transitions.save`.
+
+        Args:
+            most: start frames, evenly spread over the clips; None takes all.
+            help_limit: as for `evaluate`.
+            noise, seed: one deviation of what is added to each action, and where it is drawn from.
+        """
+        return transitions(self.task, *self.trained, help_limit, most, noise, seed, device)
 
     @property
     def curve(self) -> dict[str, np.ndarray]:

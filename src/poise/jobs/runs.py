@@ -22,6 +22,8 @@ from poise.eval import (
     Recording,
     RolloutSet,
     ScoreCard,
+    Transitions,
+    record_transitions,
     run_episodes,
     run_in_batches,
     score_rollouts,
@@ -200,6 +202,24 @@ def score(
     nothing = card(Nothing(len(imitation.humanoid.hinges) + extra))
     null = {key: getattr(nothing, key) for key in ("succ", *TRACKING)}
     return replace(card(_on(policy, device)), nothing=null)
+
+
+def transitions(
+    imitation: Imitation,
+    policy: Policy,
+    meta: Mapping[str, Any],
+    help_limit: float | None = None,
+    most: int | None = None,
+    noise: float = 0.0,
+    seed: int = 0,
+    device: str = "cpu",
+) -> Transitions:
+    """Every step of the episodes of `evaluate`, see `record_transitions`."""
+    make, _ = _worlds(imitation, meta, help_limit, device)
+    if most is not None and most < 1:
+        raise PoiseError(f"at least 1 start frame is needed, got {most}", hint="Give 32, for example")
+    starts = start_frames(imitation.reference) if most is None else some_starts(imitation, most)
+    return record_transitions(make, _on(policy, device), *starts, noise, seed)
 
 
 def _worlds(

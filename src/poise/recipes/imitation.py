@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +18,7 @@ from poise.kin import FitReport
 from poise.learn import Amp, AmpConfig, LessonConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
+from poise.machine import cores as machine_cores
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.plan import LookaheadTeacher, TeacherConfig
 from poise.sim import (
@@ -199,7 +199,7 @@ class Imitation:
         if dumps is not None and rank:
             dumps = dumps / f"rank{rank}"
         if not threads and comm.local_size > 1:
-            threads = max(1, len(os.sched_getaffinity(0)) // comm.local_size)
+            threads = max(1, machine_cores() // comm.local_size)
         if env is None:
             own = share_of(self.config.num_envs, comm)
             self.check_memory(own, device)
@@ -208,7 +208,7 @@ class Imitation:
         if isinstance(style, AmpConfig):
             style = Amp(env, env.demos(style.frames), style, self.config.seed, comm)
         # A GPU is fed by one thread.
-        cores = 1 if env.device.type == "cuda" else threads or len(os.sched_getaffinity(0))
+        cores = 1 if env.device.type == "cuda" else threads or machine_cores()
         return Trainer(
             # An EnvStep has the fields of the learner's Step; neither room knows the other.
             cast(VecEnv, env),
