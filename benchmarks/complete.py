@@ -1,20 +1,26 @@
 """From keyframes a second apart to a body, on held-out dances, jumps, walks.
 
-python benchmarks/complete.py --data DIR -o benchmarks/complete.json
+python benchmarks/complete.py --data DIR -o FILE.json [--clips dance001 jump] [--no-speeds]
+
+Written as it goes; a row measured anew takes the place of the one before. Rows name the policy and
+the network that they are of by the first digits of their SHA-256; rows without are of earlier ones.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
+import os
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from poise.jobs.complete import complete
-from poise.jobs.inbetween.fill import inbetween
+from poise.jobs.inbetween.fill import inbetween, shipped_model
 from poise.jobs.open import open_run
 from poise.motion import read_clip, trim
 
@@ -40,7 +46,7 @@ def measure(path: Path, retime: bool) -> dict[str, Any]:
     clip = read_clip(path)
     clip = trim(clip, 0, min(clip.frames, round(SECONDS * clip.fps)) - 1)
     keys = [*range(0, clip.frames - round(0.5 * clip.fps), round(clip.fps)), clip.frames - 1]
-    begun = time.perf_counter()
+    begun, worked = time.perf_counter(), time.process_time()
     done = complete(clip, keys, open_run(None).tracker, threads=1, supports="none", retime=retime)
     took = time.perf_counter() - begun
     speed = float(np.linalg.norm(np.diff(clip.positions(), axis=0), axis=-1).max() * clip.fps)
@@ -50,8 +56,24 @@ def measure(path: Path, retime: bool) -> dict[str, Any]:
         "whole": not done.tracked.failures, "key_mm": round(float(np.mean(done.met_mm)), 1),
         "key_worst_mm": round(max(done.met_mm), 1), "longer": round(done.at[-1] / max(1, keys[-1]), 2),
         "source_fastest": round(speed, 1), "seconds": round(took, 1),
-        "stages": [_rounded(s.to_dict()) for s in done.stages],
+        "seconds_of_clip": round(clip.seconds, 1), "under_load": round(os.getloadavg()[0], 1),
+        "cpu_seconds": round(time.process_time() - worked, 1),
+        "kept_exactly": bool(np.abs(done.filled.clip.positions()[list(done.at)]
+                                    - done.source.positions()[list(done.keyframes)]).max() < 1e-6),
+        "faults": [f.sentence() for f in done.filled.faults],
+        "stages": [_rounded(s.to_dict()) for s in done.stages], **weights(),
     }  # fmt: skip
+
+
+def weights() -> dict[str, str]:
+    """Which policy and network these are."""
+    found = {"policy": shipped(), "network": shipped_model()}
+    return {k: hashlib.sha256(v.read_bytes()).hexdigest()[:8] for k, v in found.items()}
+
+
+def shipped() -> Path:
+    """The file of the policy that comes with Poise."""
+    return Path(str(files("poise"))) / "data" / "tracker.safetensors"
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:
@@ -84,10 +106,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("-o", type=Path, required=True)
+    parser.add_argument("--clips", nargs="*", help="only those with one of these words in their name")
+    parser.add_argument("--no-speeds", action="store_true", help="not the fastest joints of many clips")
     args = parser.parse_args()
-    rows = [measure(args.data / name, retime) for name, retime in CLIPS]
-    out = {"command": "python benchmarks/complete.py", "rows": rows, "speeds": speeds(args.data)}
-    args.o.write_text(json.dumps(out, indent=1) + "\n")
+    found = json.loads(args.o.read_text()) if args.o.exists() else {}
+    found["command"] = "python benchmarks/complete.py"
+    rows = {(r["clip"], r["retimed"]): r for r in found.get("rows", [])}
+
+    def keep() -> None:
+        found["rows"] = list(rows.values())
+        args.o.write_text(json.dumps(found, indent=1) + "\n")
+
+    for name, retime in CLIPS:
+        if args.clips is None or any(word in name for word in args.clips):
+            row = measure(args.data / name, retime)
+            rows[row["clip"], row["retimed"]] = row
+            keep()
+    if not args.no_speeds:
+        found["speeds"] = speeds(args.data)
+        keep()
 
 
 if __name__ == "__main__":

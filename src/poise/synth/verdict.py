@@ -62,7 +62,7 @@ def judged(clip: Clip, gaps: Sequence[Gap], sample: int = 0) -> dict[Gap, tuple[
         for gap in gaps:
             if fault.start < gap.b and fault.stop > gap.a:
                 own = GapFault(
-                    fault.kind, fault.joint, fault.start, fault.stop, fault.size, tuple(gap), sample
+                    fault.kind, fault.joint, fault.start, fault.stop, fault.size, (gap.a, gap.b), sample
                 )
                 out[gap] = (*out.get(gap, ()), own)
     return out
