@@ -1,6 +1,6 @@
 """Tables 1 and 2 of Residual Force Control in spirit: 2 s of future after held-out pasts, by method.
 
-    python benchmarks/endless_tables.py --library FOLDER ... -o endless_tables.json [--seconds 60] [--seeds 0 1]
+    python benchmarks/endless_tables.py --library FOLDER ... -o FILE [--seconds 60] [--seeds 0 1]
 
 Every network learns for the same CPU time of one thread. Cross holds whole subjects out, Mix every fifth
 of the other clips. A method is kinematic, or has a body: then the tracker that comes with Poise does its
@@ -57,7 +57,7 @@ NETS = {
 
 
 class Window(NamedTuple):
-    """A past `(p, 7 + n)`, what followed `(f, 7 + n)`, the class, and whether its subject is held out."""
+    """A past `(p, 7 + n)`, what followed `(f, 7 + n)`, the class, whether its subject is held out."""
 
     past: np.ndarray
     true: np.ndarray
@@ -195,7 +195,8 @@ def main() -> None:
     motions, windows = read(a.library, tracker)
     out: dict[str, Any] = json.loads(a.o.read_text()) if a.o.exists() else {"methods": {}}
     out |= {
-        "command": "python benchmarks/endless_tables.py", "seconds_of_training": a.seconds, "help_n": 0.0,
+        "command": "python benchmarks/endless_tables.py", "seconds_of_training": a.seconds,
+        "help_n": 0.0,
         "samples": SAMPLES, "clips": len(motions.clips), "frames": len(motions.frames.frames),
     }  # fmt: skip
     frames = windows[0].true.shape[0]
