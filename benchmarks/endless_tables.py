@@ -169,11 +169,11 @@ def errors(windows: list[Window], make: Callable[[Tensor], Tensor]) -> dict[str,
     return {name: of(rows) for name, rows in groups.items()}
 
 
-def read(folders: list[Path], tracker: Tracker) -> tuple[Motions, list[Window]]:
+def read(folders: list[Path], hold_out: list[str], tracker: Tracker) -> tuple[Motions, list[Window]]:
     """What is learned from, and the windows that are predicted."""
     how = LibraryConfig(rates=SIXTY, leave_out=TWINS)
     library, _ = library_of(folders, tracker.target, config=how, body=BodyConfig(), tell=print)
-    parts = split(library, HELD_OUT)
+    parts = split(library, hold_out)
     own = sorted(parts.train, key=lambda c: c.name)
     test, train = own[::5], [c for k, c in enumerate(own) if k % 5]
     net = Endless().net
@@ -186,13 +186,14 @@ def main() -> None:
     """Trains and predicts with each method and seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--library", type=Path, nargs="+", required=True)
+    parser.add_argument("--hold-out", nargs="+", default=list(HELD_OUT))
     parser.add_argument("-o", type=Path, required=True)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     a = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
-    motions, windows = read(a.library, tracker)
+    motions, windows = read(a.library, a.hold_out, tracker)
     out: dict[str, Any] = json.loads(a.o.read_text()) if a.o.exists() else {"methods": {}}
     out |= {
         "command": "python benchmarks/endless_tables.py", "seconds_of_training": a.seconds,
