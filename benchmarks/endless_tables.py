@@ -1,6 +1,6 @@
 """Tables 1 and 2 of Residual Force Control in spirit: 2 s of future after held-out pasts, by method.
 
-    python benchmarks/endless_tables.py --library FOLDER ... -o endless_tables.json [--seconds 60] [--seeds 0 1]
+    python benchmarks/endless_tables.py --library FOLDER ... -o FILE [--seconds 60] [--seeds 0 1]
 
 Every network learns for the same CPU time of one thread. Cross holds whole subjects out, Mix every fifth
 of the other clips. A method is kinematic, or has a body: then the tracker that comes with Poise does its
@@ -57,7 +57,7 @@ NETS = {
 
 
 class Window(NamedTuple):
-    """A past `(p, 7 + n)`, what followed `(f, 7 + n)`, the class, and whether its subject is held out."""
+    """A past `(p, 7 + n)`, what followed `(f, 7 + n)`, the class, whether its subject is held out."""
 
     past: np.ndarray
     true: np.ndarray
@@ -169,11 +169,11 @@ def errors(windows: list[Window], make: Callable[[Tensor], Tensor]) -> dict[str,
     return {name: of(rows) for name, rows in groups.items()}
 
 
-def read(folders: list[Path], tracker: Tracker) -> tuple[Motions, list[Window]]:
+def read(folders: list[Path], hold_out: list[str], tracker: Tracker) -> tuple[Motions, list[Window]]:
     """What is learned from, and the windows that are predicted."""
     how = LibraryConfig(rates=SIXTY, leave_out=TWINS)
     library, _ = library_of(folders, tracker.target, config=how, body=BodyConfig(), tell=print)
-    parts = split(library, HELD_OUT)
+    parts = split(library, hold_out)
     own = sorted(parts.train, key=lambda c: c.name)
     test, train = own[::5], [c for k, c in enumerate(own) if k % 5]
     net = Endless().net
@@ -186,16 +186,18 @@ def main() -> None:
     """Trains and predicts with each method and seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--library", type=Path, nargs="+", required=True)
+    parser.add_argument("--hold-out", nargs="+", default=list(HELD_OUT))
     parser.add_argument("-o", type=Path, required=True)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     a = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
-    motions, windows = read(a.library, tracker)
+    motions, windows = read(a.library, a.hold_out, tracker)
     out: dict[str, Any] = json.loads(a.o.read_text()) if a.o.exists() else {"methods": {}}
     out |= {
-        "command": "python benchmarks/endless_tables.py", "seconds_of_training": a.seconds, "help_n": 0.0,
+        "command": "python benchmarks/endless_tables.py", "seconds_of_training": a.seconds,
+        "help_n": 0.0,
         "samples": SAMPLES, "clips": len(motions.clips), "frames": len(motions.frames.frames),
     }  # fmt: skip
     frames = windows[0].true.shape[0]

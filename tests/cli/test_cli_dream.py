@@ -21,8 +21,9 @@ from toy_policy import walk
 def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out.bvh"
     argv = ["dream", "--seconds", "0.5", "--controller", "policy", "--threads", "1", "-o", str(out)]
-    assert main([*argv, "--steer", "5,0", "--json"]) == 0
+    assert main([*argv, "--steer", "5,0", "--past", "simulated", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
+    assert said["result"]["past"] == "simulated"
     assert said["result"]["outcome"] == "dreamt" and said["result"]["falls"] == []
     assert read_clip(out).frames == 15
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"score.json", "report.html"}
@@ -38,6 +39,7 @@ def test_a_character_goes_about(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (["--count", "99"], "1 to 16 characters"),
         (["--temperature", "-1"], "temperature must lie in 0 to 10"),
         (["--generator", "none"], "could not be read"),
+        (["--past", "none"], "--past"),
     ],
 )
 def test_mistakes_are_one_sentence(

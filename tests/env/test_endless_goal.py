@@ -111,6 +111,33 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     env.close()
 
 
+def test_the_generator_may_see_what_was_done(tracker: Tracker, task: Imitation) -> None:
+    assert tracker.recovery_clips is not None
+    ease, seen = tracker.recovery_clips.ease.double(), list[Tensor]()
+
+    class Keeps(Stands):
+        def generate(self, past: Tensor, ids: Tensor, rng: torch.Generator) -> Tensor:
+            seen.append(past.clone())
+            return super().generate(past, ids, rng)
+
+    goal = EndlessGoal(Keeps(ease), task.humanoid, 30.0, None, lead=1, simulated=True)
+    goal.draw(torch.zeros(1, dtype=torch.long))
+    goal.aim(None, None)
+    pos, still = goal.layout.unpacked(goal.now()).pos, torch.zeros(1, len(task.humanoid.bodies), 3)
+    did = list[Tensor]()
+    for step in range(12):
+        goal.advance(None, None)
+        qpos = goal.start(None)[0].clone()
+        qpos[:, 0] += 0.01 * step
+        did.append(qpos[0])
+        goal.watch(qpos, pos, still)
+    # The first past was its own; the second ends with frames that are yet to be done.
+    assert torch.equal(seen[0][0], ease.expand(5, -1)) and len(seen) > 1
+    moved = seen[1][0, :, 0] - float(ease[0])
+    assert float(moved[-1]) == 0 and float(moved[:-2].min()) > 0
+    assert sorted(moved[:-2].tolist()) == moved[:-2].tolist()
+
+
 def test_after_a_try_in_vain_another_clip_gets_up(tracker: Tracker, task: Imitation) -> None:
     clips = tracker.recovery_clips
     assert clips is not None and len(clips.ups) > 1

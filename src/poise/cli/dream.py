@@ -57,6 +57,8 @@ class Options:
     """Simulated control steps of lookahead for each that is made; by default 192."""
     recover: Flag = True
     """Leave a character that has fallen where it lies."""
+    past: Literal["own", "simulated"] = "own"
+    """What the kinematic policy goes on from: its own frames, or what the character did."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of all draws."""
     threads: Annotated[int, arg(metavar="N")] = 0
@@ -90,7 +92,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     config = Dream(
         temperature=o.temperature, count=o.count, targets=targets, seed=o.seed, controller=o.controller,
-        lookahead=ahead, recover=o.recover, hold_feet=o.hold_feet, threads=o.threads,
+        lookahead=ahead, recover=o.recover, past=o.past, hold_feet=o.hold_feet, threads=o.threads,
     )  # fmt: skip
     files = names_of(motion or out / "simulated.bvh", o.count)
     for file in files:

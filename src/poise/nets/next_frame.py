@@ -2,8 +2,8 @@
 
 - ERD (Fragkiadaki et al. 2015, Sec. 3): encoder, two recurrent layers, decoder; inputs with noise.
 - acLSTM (Zhou et al. 2018, Sec. 3): three recurrent layers that see their own output now and then.
-- What Residual Force Control compares with as EgoPose: no kinematic policy, the next frame from the past;
-  here one recurrent layer.
+- What Residual Force Control compares with as EgoPose: no kinematic policy, the next frame from the
+  past; here one recurrent layer.
 
 All predict how a frame changes, in deviations, so that a fresh network stands nearly still.
 """
