@@ -150,7 +150,8 @@ def main() -> None:
     print(json.dumps({"files": counts.total(), "outcomes": dict(sorted(counts.items()))}, indent=1))
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)
-        cases = {hash_of(c[2]): c for some in kept.values() for c in some}
+        small = (c for some in kept.values() for c in some if sum(map(len, c[2].values())) < 50_000)
+        cases = {hash_of(c[2]): c for c in small}
         count = pack(cases.values(), args.keep / f"kept_{args.seed}.tar.xz")
         print(f"{count} files are kept in {args.keep}")
 

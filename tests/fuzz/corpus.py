@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import sys
 import tarfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,3 +42,14 @@ def unpack(path: Path = ARCHIVE) -> list[Case]:
             file = archive.extractfile(info)
             found.setdefault((kind, digest), {})[name] = b"" if file is None else file.read()
     return [(kind, next(iter(files)), files) for (kind, _), files in found.items()]
+
+
+if __name__ == "__main__":
+    known = (
+        {hash_of(files): (kind, name, files) for kind, name, files in unpack()}
+        if ARCHIVE.exists()
+        else {}
+    )
+    for given in sys.argv[1:]:
+        known |= {hash_of(c[2]): c for c in unpack(Path(given))}
+    print(f"{pack(known.values())} files, {ARCHIVE.stat().st_size} bytes")

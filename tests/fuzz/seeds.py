@@ -29,9 +29,8 @@ NATIVE = ("usda", "usdc", "c3d", "mjcf")
 
 def seeds(folder: Path) -> list[Seed]:
     """All seeds; `folder` is worked in."""
-    if str(_TESTS / "motion") not in sys.path:
-        beside = (_TESTS / "motion", _TESTS, _TESTS / "body", _TESTS.parent / "benchmarks")
-        sys.path[:0] = [str(p) for p in beside]
+    beside = (_TESTS / "motion", _TESTS, _TESTS / "body", _TESTS.parent / "benchmarks")
+    sys.path += [str(p) for p in beside if str(p) not in sys.path]
     import handmade_motion_files as motion
     import handmade_numpy_files as arrays
     import test_opensim_files as opensim

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -117,7 +118,7 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
     raw = _drop_rest_frames(raw, notes)
     dropped = whole - len(raw.rot)
     mended = [*raw.mended, *((("rest frame", "", 0, dropped - 1, float(dropped)),) if dropped else ())]
-    rot = unwrap_quats(normalize(torch.tensor(raw.rot, dtype=torch.float64))).numpy()
+    rot = _unwrapped(raw.rot)
     up, unit = _up_and_unit(raw, rot, options)
     notes += [guess.note for guess in (up, unit) if guess.note]
     scale = float(unit.value)  # type: ignore[arg-type]
@@ -150,7 +151,30 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
             extra=raw.extra,
         ),
     )
-    return Clip(skeleton, root_pos, quats_to_z_up(rot, axis), fps, raw.path.stem, raw.cyclic)
+    for part in _parts(rot):
+        part[...] = quats_to_z_up(part, axis)
+    rot.flags.writeable = False
+    return Clip(skeleton, root_pos, rot, fps, raw.path.stem, raw.cyclic)
+
+
+#: Frames that are worked on at once, so that an hour of motion is not held several times over.
+BLOCK = 4096
+
+
+def _parts(rot: np.ndarray) -> Iterator[np.ndarray]:
+    return (rot[at : at + BLOCK] for at in range(0, len(rot), BLOCK))
+
+
+def _unwrapped(rot: np.ndarray) -> np.ndarray:
+    """Unit quaternions `(T, J, 4)`, consecutive ones in one hemisphere."""
+    out = np.array(rot, dtype=np.float64)
+    for at in range(0, len(out), BLOCK):
+        # The frame before is settled and tells on which side the next ones lie.
+        first = max(0, at - 1)
+        part = torch.from_numpy(out[first : at + BLOCK])
+        part[at - first :] = normalize(part[at - first :])
+        part[...] = unwrap_quats(part)
+    return out
 
 
 #: Why a value is what it is, where nothing was guessed.

@@ -12,7 +12,7 @@ import torch
 from poise.motion.clip import Clip
 from poise.motion.io.bvh.file import POSITIONS, BvhFile, parse_bvh
 from poise.motion.io.nodes import RIGID_SHARE, lifted, travel_note
-from poise.motion.io.raw import RawMotion, ReadOptions, assemble
+from poise.motion.io.raw import BLOCK, RawMotion, ReadOptions, assemble
 from poise.motion.io.text import listed
 from poise.motion.skeleton import Channel
 from poise.spatial import euler_to_quat, quat_mul, quat_rotate, quat_rotate_inv
@@ -61,7 +61,6 @@ def _rotations(file: BvhFile) -> np.ndarray:
     """`(T, J, 4)` local rotations; each joint's axes in the order of its rotation channels."""
     out = np.zeros((len(file.values), len(file.joints), 4))
     out[..., 0] = 1.0
-    radians = torch.tensor(np.radians(file.values))
     groups: dict[str, list[tuple[int, list[int]]]] = {}
     column = 0
     for j, joint in enumerate(file.joints):
@@ -72,7 +71,10 @@ def _rotations(file: BvhFile) -> np.ndarray:
             groups.setdefault("".join(t[0] for t in turns), []).append((j, [t[1] for t in turns]))
     for order, members in groups.items():
         columns = torch.tensor([c for _, c in members])
-        out[:, [j for j, _ in members]] = euler_to_quat(radians[:, columns], order).numpy()
+        for at in range(0, len(out), BLOCK):
+            radians = torch.tensor(np.radians(file.values[at : at + BLOCK]))
+            turned = euler_to_quat(radians[:, columns], order).numpy()
+            out[at : at + BLOCK, [j for j, _ in members]] = turned
     return out
 
 
