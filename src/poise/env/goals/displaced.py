@@ -107,7 +107,7 @@ class DisplacedGoal(Goal):
         return {**self.goal.rows(), "offset": self.offset, "offset_rate": self.rate}
 
     def _moved(self, packed: Tensor, ids: Tensor | None) -> Tensor:
-        """Packed poses `(n, W)` by the offsets of worlds `ids`; those that have none stay as they are."""
+        """Packed poses `(n, W)` by the offsets of worlds `ids`; those without any stay as they are."""
         return self._moved_all(packed.unsqueeze(1), ids).squeeze(1)
 
     def _moved_all(self, packed: Tensor, ids: Tensor | None) -> Tensor:
