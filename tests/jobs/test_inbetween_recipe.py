@@ -86,6 +86,17 @@ def test_a_run_is_kept_with_its_settings(run: Path, library: Path) -> None:
         begin(run, library, small(Inbetween(name="toy", seed=5)), 1.0, 4)
 
 
+def test_a_training_may_begin_from_a_model(run: Path, library: Path, tmp_path: Path) -> None:
+    """Its first step is a tiny one, so that the weights are still nearly those of the model."""
+    first, folder = load_model(run), tmp_path / "more"
+    other = replace(small(Inbetween(name="toy", final="old", validation="sad")), seed=9)
+    task, steps = begin(folder, library, other, 1.0, 1)
+    model, stats, _ = train(task, folder, steps, tensorboard=False, first=first)
+    assert stats is not None and stats.step == 1
+    before, after = first.net.state_dict(), model.net.state_dict()
+    assert all(float((before[k] - after[k]).abs().max()) < 1e-3 for k in before)
+
+
 def test_a_run_of_before_a_setting_existed_goes_on(run: Path, library: Path, tmp_path: Path) -> None:
     tensors, meta = load_checkpoint(run / RUN_FILE)
     del meta["config"]["stretch"], meta["config"]["between_training"]["dropout"]
