@@ -1,6 +1,7 @@
 """Live motion: for how long, how late, with how short a buffer, and against strangers.
 
     python benchmarks/live.py endure --minutes 8 --data FOLDER --json benchmarks/live_endure.json
+    python benchmarks/live.py loop --minutes 50 --data FOLDER --json benchmarks/live_loop.json
     python benchmarks/live.py buffers --data FOLDER --clips 24 --json benchmarks/live_buffers.json
     python benchmarks/live.py fuzz --count 100000 --json benchmarks/live_fuzz.json
     python benchmarks/live.py strangers --json benchmarks/live_strangers.json
@@ -22,12 +23,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from live_client import play, watch
+from live_client import Sent, play, watch
 from speed import machine
 
 from poise.jobs.open import open_run
@@ -122,6 +124,62 @@ def endure(
             for c, o in zip(last["characters"], off, strict=True)
         ],
         "unrecovered": sum(c["doing"] in ("falls", "gets up") for c in last["characters"]),
+        "memory_mb": held,
+    }  # fmt: skip
+
+
+def loop(
+    clips: Sequence[Clip], minutes: float, wall: float, seed: int, ahead: int, buffer: float
+) -> dict[str, Any]:
+    """The same four people and faults by a clock of its own, which waits for nobody: the processor's
+    time of each step is that of the loop alone, however busy the machine is."""
+    rng, now, sent = np.random.default_rng(seed), 0.0, Sent()
+    live = Live(
+        open_run(None).tracker,
+        LiveConfig(4, buffer, ahead, seed=seed), clock=lambda: now,
+    )  # fmt: skip
+    loops, quiet = [Loop(clips[k % len(clips)]) for k in range(4)], [0.0] * 4
+    spent, held, ends = list[float](), list[tuple[float, float]](), time.monotonic() + 60 * wall
+    while now < 60 * minutes and time.monotonic() < ends:
+        frame = round(now * 30)
+        for k in range(4):
+            packet = packet_of(f"p{k}", loops[k], round(frame / 30 * loops[k].clip.fps))
+            u = rng.uniform()
+            if now < quiet[k]:
+                continue
+            if u < 1 / 900:
+                quiet[k] = now + rng.uniform(0.1, 3.0)
+                sent.add("drop-outs")
+            elif u < 2 / 900:
+                bad = packet.rot.copy()
+                bad[rng.integers(len(bad))] = np.nan
+                live.inbox.offer(replace(packet, rot=bad), now)
+                sent.add("NaN packets")
+            elif u < 3 / 900:
+                for _ in range(10):
+                    live.inbox.offer(packet, now)
+                sent.add("bursts of 10")
+            elif u < 3.2 / 900:
+                loops[k], loops[k - 1] = loops[k - 1], loops[k]
+                sent.add("swaps")
+            live.inbox.offer(packet, now)
+            sent.add("poses")
+        began = time.process_time()
+        live.step(now)
+        spent.append(1000 * (time.process_time() - began))
+        now += 1 / 30
+        if frame % 900 == 0:
+            held.append((round(now), round(memory_mb(os.getpid()), 1)))
+    last = live.figures()
+    live.close()
+    return {
+        "machine": machine(), "simulated_minutes": round(now / 60, 1), "characters": 4,
+        "lookahead": ahead, "buffer_s": buffer, "sent": sent.counts, "refused": last["refused"],
+        "step_cpu_ms": {f"p{p}": round(float(np.percentile(spent, p)), 1) for p in (50, 90, 99)},
+        "resets": last["resets"],
+        "doing": [
+            {n: c[n] for n in ("doing", "lost", "falls", "recovered")} for c in last["characters"]
+        ],
         "memory_mb": held,
     }  # fmt: skip
 
@@ -338,10 +396,11 @@ def clips_of(folder: Path, most: int, longest_s: float = 30.0) -> list[Clip]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("endure", "buffers", "fuzz", "strangers"))
+    parser.add_argument("what", choices=("endure", "loop", "buffers", "fuzz", "strangers"))
     parser.add_argument("--data", type=Path)
     parser.add_argument("--clips", type=int, default=24)
     parser.add_argument("--minutes", type=float, default=8.0)
+    parser.add_argument("--wall", type=float, default=60.0, help="minutes after which loop ends anyhow")
     parser.add_argument("--lookahead", type=int, default=1)
     parser.add_argument("--buffer", type=float, default=0.3)
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0])
@@ -352,6 +411,8 @@ def main() -> None:
     torch.set_num_threads(1)
     if o.what == "endure":
         found = endure(clips_of(o.data, o.clips), o.minutes, o.seed, o.lookahead, o.buffer)
+    elif o.what == "loop":
+        found = loop(clips_of(o.data, o.clips), o.minutes, o.wall, o.seed, o.lookahead, o.buffer)
     elif o.what == "buffers":
         found = buffers(clips_of(o.data, o.clips), o.noise, o.seed)
     elif o.what == "fuzz":

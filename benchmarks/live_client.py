@@ -44,7 +44,7 @@ def pose_message(person: str, time_s: float, root: np.ndarray, rot: np.ndarray) 
 async def play(url: str, clips: Sequence[Clip], seconds: float, seed: int, faults: bool) -> Sent:
     """Sends each clip as a person at 30 Hz."""
     rng, sent, loops = np.random.default_rng(seed), Sent(), [Loop(c) for c in clips]
-    async with connect(url, max_size=None) as socket:
+    async with connect(url, max_size=None, ping_interval=None) as socket:
         drain = asyncio.create_task(_drain(socket))
         names = [f"p{k}" for k in range(len(clips))]
         for name, clip in zip(names, clips, strict=True):
@@ -93,7 +93,7 @@ async def _drain(socket: Any) -> None:
 async def watch(url: str, seconds: float) -> list[dict[str, Any]]:
     """The figures that pages are told, about four a second."""
     out, end = list[dict[str, Any]](), time.perf_counter() + seconds
-    async with connect(url, max_size=None) as socket:
+    async with connect(url, max_size=None, ping_interval=None) as socket:
         while time.perf_counter() < end:
             try:
                 told = await asyncio.wait_for(socket.recv(), 5.0)

@@ -26,6 +26,9 @@ from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
 from poise.synth.generator import Kinematic
 
+#: Steps that are made at least.
+FEWEST = 3
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -106,8 +109,16 @@ class Session:
         return {**self.live.figures(), **more}
 
     def run(self, until_s: float | None = None) -> None:
-        """Steps in real time, until a moment of `time.perf_counter` where one is given."""
-        self.live.run(lambda: until_s is not None and time.perf_counter() >= until_s)
+        """Steps in real time, until a moment of `time.perf_counter` where one is given; on a machine
+        that is busy, at least so many steps that there is something to record."""
+        live = self.live
+        self.live.run(
+            lambda: (
+                until_s is not None
+                and time.perf_counter() >= until_s
+                and (live.steps >= FEWEST or live.paused)
+            )
+        )
 
     def close(self) -> list[Path]:
         """Ends everything; the files of the recordings."""

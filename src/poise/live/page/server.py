@@ -151,7 +151,7 @@ class PageServer:
             server: Server = await serve(
                 self._handle, sock=Doorway(guard), backlog=WAITING, process_request=self._answer,
                 create_connection=kind, max_size=MOST_BYTES, max_queue=64, write_limit=65_536,
-                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=20,
+                open_timeout=HANDSHAKE_S, close_timeout=1, ping_interval=20, ping_timeout=60,
                 compression=None, server_header=None, logger=_quiet(),
             )  # fmt: skip
         except OSError as problem:
