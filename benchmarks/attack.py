@@ -163,7 +163,7 @@ def _(folder: Path) -> Any:
     row = []
     for n in names.split():
         side = -0.15 if n[0] == "R" else 0.15 if n[0] == "L" else 0.0
-        row += [side, 0.0, at[n.lstrip("RL") if n[0] in "RL" else n]]
+        row += [side, 0.1 if "Wrist" in n else 0.0, at[n.lstrip("RL") if n[0] in "RL" else n]]
     rows = [",".join(map(str, [*row])) for _ in range(8)]
     licence = "".join(f"# line {k} of a long licence text\n" for k in range(1200))
     return read(

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from poise.body import find_anatomy
+from poise.kin.doctor import speeds
 from poise.kin.doctor.speeds import ARM_SPEED, TRUNK_SPEED, limit_speeds, speed_limits
 from poise.motion import Clip
 from poise.spatial import quat_angle, quat_conj, quat_mul
@@ -111,3 +112,21 @@ def test_every_part_has_its_limit(clip):
     assert limit_speeds(twisted(clip, slow), ANATOMY)[1] == ()
     (found,) = limit_speeds(twisted(clip, slow, clip.skeleton.index("LeftFoot")), ANATOMY)[1]
     assert found.joint == "LeftFoot"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_repair_looks_at_its_surroundings_alone(seed, monkeypatch):
+    """Cut to its surroundings a spell is mended as on the whole track, in time of its own length."""
+    clip = swing(4.0, 120.0, speed=1.0)
+    rng = np.random.default_rng(seed)
+    angles = np.zeros(clip.frames)
+    for at in rng.integers(2, clip.frames - 2, 5):
+        angles[at : at + int(rng.integers(1, 12))] += rng.uniform(-3, 3)
+    broken = twisted(clip, angles)
+    cut, found = limit_speeds(broken, ANATOMY)
+    monkeypatch.setattr(speeds, "_around", lambda fps: 10**9)
+    whole, other = limit_speeds(broken, ANATOMY)
+    assert found and [(f.start, f.stop, f.way) for f in found] == [
+        (f.start, f.stop, f.way) for f in other
+    ]
+    assert np.degrees(apart(cut, whole)).max() < 1e-5

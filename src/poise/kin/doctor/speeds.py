@@ -71,19 +71,30 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
         if float(steps.max()) <= limit:
             continue
         for first, last in find_runs(steps.numpy() > limit, round(GAP_S * clip.fps)):
-            old = track.clone()
-            way, (a, b) = _repair(track, first, last + 1, limit, clip.fps)
-            lo, hi = max(a + 1, 0), min(b - 1, len(track) - 1)
-            change = _change(old, track)
+            # What lies farther away bears no part in a repair, so its time is that of the spell.
+            base = max(0, first - _around(clip.fps))
+            part = track[base : last + 2 + _around(clip.fps)]
+            old = part.clone()
+            way, (a, b) = _repair(part, first - base, last + 1 - base, limit, clip.fps)
+            lo, hi = max(a + 1, 0), min(b - 1, len(part) - 1)
+            change = _change(old, part)
             here = slice(max(lo - 1, 0), hi + 1)
-            rot[lo : hi + 1, j] = normalize(track[lo : hi + 1])
-            before, after = float(steps[first : last + 1].max()), float(_steps(track)[here].max())
+            before, after = float(steps[first : last + 1].max()), float(_steps(part)[here].max())
+            rot[base + lo : base + hi + 1, j] = normalize(part[lo : hi + 1])
+            lo, hi = base + lo, base + hi
             found.append(
                 SpeedRepair(
                     clip.skeleton.names[j], lo, hi, way, before, after * clip.fps, math.degrees(change)
                 )
             )
     return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
+
+
+def _around(fps: float) -> int:
+    """Frames beside a spell that its repair looks at: twice the reach of the widest filter, or the
+    longest stretch that is joined."""
+    reach = math.ceil(3 * max(1.0, WIDEST_S * fps)) + 1
+    return max(2 * reach, round((LONGEST_S + MARGIN_S) * fps) + 2) + 2
 
 
 def _steps(track: Tensor) -> Tensor:
