@@ -168,10 +168,11 @@ def test_a_flood_of_connections_is_looked_at_slowly_and_others_still_come_in() -
             with contextlib.suppress(BlockingIOError):
                 one.connect(where)
             made.append(one)
-        time.sleep(0.5)
-        seen = out.guard.refused["too many connections from this address"]
-        # A second or two of them were looked at, as slow as this machine may be.
-        assert 0 < seen <= 2 * A_SECOND - EACH
+        end = time.monotonic() + 30
+        while not (seen := out.guard.refused["too many connections from this address"]):
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        assert seen <= 2 * A_SECOND - EACH
         for one in made:
             one.close()
         end = time.monotonic() + 60
@@ -227,9 +228,9 @@ def test_push_fall_recovery_and_record_in_chromium(tmp_path: Path) -> None:
             page.until("['falls', 'gets up'].includes(document.body.dataset.doing)")
             page.until("document.body.dataset.doing == 'tracks'", 40)
             assert page.js("Number(document.getElementById('recovered').textContent)") >= 1
-            for _ in range(2):
+            for level in ("0.05", "0.1"):
                 page.js(key % "+")
-            page.until("document.body.dataset.compliance == '0.1'")
+                page.until(f"document.body.dataset.compliance == '{level}'")
             page.js("document.getElementById('dream').click()")
             page.until("document.getElementById('dream').ariaPressed == 'true'")
             page.until("document.getElementById('says').textContent.includes('endless motion')")

@@ -20,8 +20,9 @@ from poise.live.character import TRACKS
 from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Inbox, Packet
 from poise.live.passage import world_of
+from poise.live.points import PointFit
 from poise.live.sources.door import StreamDoor
-from poise.live.sources.points import Frame, PointFit
+from poise.live.sources.keypoints import Frame
 from poise.live.sources.stream import JsonStream
 from poise.motion import Clip, read_clip
 from test_docs import ROOT, WALK

@@ -16,12 +16,12 @@ from poise.live.loop import Live, LiveConfig
 from poise.live.packet import Inbox
 from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
+from poise.live.points import PointFit
 from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
 from poise.live.sinks.record import Recorder
 from poise.live.sinks.vmc import OwnPuppet, VmcSink
 from poise.live.sources.door import StreamDoor
 from poise.live.sources.file import FileSource
-from poise.live.sources.points import PointFit
 from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
 from poise.synth.generator import Kinematic

@@ -25,7 +25,7 @@ from poise.live.commands import MOST_BYTES, VERSION, command, parse
 from poise.live.packet import Inbox
 from poise.live.page.doorway import WAITING, Doorway, pauses
 from poise.live.page.guard import Bucket, Guard
-from poise.live.sources.points import PointFit
+from poise.live.sources.keypoints import Fits
 from poise.live.sources.stream import JsonStream
 
 #: What can be fetched: a fixed list, so that no path leads to a file of the user's.
@@ -88,7 +88,7 @@ class PageServer:
         command: Callable[[dict[str, Any]], None],
         figures: Callable[[], dict[str, Any]],
         clock: Callable[[], float],
-        points: PointFit | None = None,
+        points: Fits | None = None,
     ):
         self._points = points
         self.guard, self.inbox, self.clock = guard, inbox, clock

@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION
 from poise.live.packet import Inbox
 from poise.live.page.guard import EACH, Bucket
-from poise.live.sources.points import PointFit
+from poise.live.sources.keypoints import Fits
 from poise.live.sources.stream import JsonStream
 
 #: Connections at once, senders of datagrams that are known, refusals that a connection may cause.
@@ -46,7 +46,7 @@ class StreamDoor:
     """
 
     def __init__(
-        self, host: str, port: int, inbox: Inbox, points: PointFit, clock: Callable[[], float],
+        self, host: str, port: int, inbox: Inbox, points: Fits, clock: Callable[[], float],
         token: str | None = None,
     ):  # fmt: skip
         self.inbox, self.points, self.clock, self._token = inbox, points, clock, token

@@ -18,7 +18,7 @@ from poise.live.commands import (
     vertical,
 )  # fmt: skip
 from poise.live.packet import PEOPLE, Inbox, Packet
-from poise.live.sources.points import Frame, PointFit
+from poise.live.sources.keypoints import Fits, Frame
 from poise.motion import Skeleton
 
 
@@ -31,7 +31,7 @@ class JsonStream:
         points: fits keypoints; None takes none.
     """
 
-    def __init__(self, inbox: Inbox, own: str = "", points: PointFit | None = None):
+    def __init__(self, inbox: Inbox, own: str = "", points: Fits | None = None):
         self.inbox, self._own, self._points = inbox, own, points
         self._labels = dict[str, tuple[str, ...]]()
         self._skeletons: dict[str, tuple[Skeleton, str]] = {}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from poise.kin.retarget.keypoint_stream import Gaps
 from poise.live.calibration import FEWEST, STAND_S, STILL_M
 from poise.live.packet import PEOPLE, Inbox, Packet
 from poise.live.people import FORGET_S
+from poise.live.sources.keypoints import Frame
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.points.fit import fit_clip
@@ -27,16 +27,6 @@ from poise.motion.points.fit import fit_clip
 APART_S, WAIT, MAX_SPEED = 0.024, 64, 25.0
 #: s for which a missing keypoint travels along with the others; longer, and nothing is sent.
 STALE_S = 0.5
-
-
-class Frame(NamedTuple):
-    """Keypoints `(K, 3)` m of a person, Z up, NaN where one is missing, and when they were and came."""
-
-    person: str
-    names: tuple[str, ...]
-    points: np.ndarray
-    time_s: float
-    arrived_s: float
 
 
 class Performer:
