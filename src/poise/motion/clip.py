@@ -46,10 +46,10 @@ def check_poses(frames: int, joints: int, where: str | Path | None = None) -> No
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:
-    held = array if isinstance(array, np.ndarray) else None
-    if held is not None and held.dtype == np.float64 and held.base is None and not held.flags.writeable:
+    own = type(array) is np.ndarray and array.dtype == np.float64 and array.base is None
+    if own and not array.flags.writeable:
         # Nobody can change it: clips share it, since an hour of motion is large.
-        return held
+        return array
     out = np.array(array, dtype=np.float64)
     out.flags.writeable = False
     return out
