@@ -57,12 +57,12 @@ def run_on(path: Path, options: Options) -> Answer:
     facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
     facts["fixed"]["root_moved"] = moved
     _compare(found, left)
-    _written(clip, healed, found, left)
     if moved is not None and moved["max_mm"] >= 10.0:
         say(
             f"The root moved by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and ends "
             f"{moved['end_mm']:.0f} mm from where it ended."
         )
+    _written(clip, healed, found, left)
     return Answer(facts, {"clip": target}, outcome=f"{outcome}, {len(left.faults)} after")
 
 
