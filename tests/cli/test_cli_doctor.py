@@ -69,6 +69,7 @@ def test_fix_shows_before_and_after(broken: Path, tmp_path: Path, capsys) -> Non
     row = next(line for line in text.splitlines() if "teleport, spells" in line)
     assert [c.strip() for c in row.split("│")[3:5]] == ["1", "0"]
     assert "0 after" in text.splitlines()[-2]
+    assert "The root moved by up to 505 mm (frame 46)" in text
 
 
 def test_a_clean_clip_is_written_as_it_was_read(tmp_path: Path, capsys) -> None:

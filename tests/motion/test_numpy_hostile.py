@@ -95,7 +95,8 @@ AMASS: dict[str, tuple[dict[str, Any], str]] = {
     "no motion": (
         {"weights": np.zeros(3)},
         ": its arrays are no motion that is known ('weights'). Known: Poise's own arrays; AMASS and the "
-        "SMPL family (poses, trans); poselib (skeleton_tree, rotation); keypoints (positions, "
+        "SMPL family (poses, trans); motions of Kimodo (posed_joints, "
+        "global_rot_mats); poselib (skeleton_tree, rotation); keypoints (positions, "
         "names, fps); results of the motion diffusion model (motion, lengths); OpenSim coordinates "
         "(q_hip_flexion_r, ...)",
     ),
@@ -185,10 +186,10 @@ def test_cut_and_damaged_archives(tmp_path: Path) -> None:
 
 
 def test_single_arrays_and_robots_are_named(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((20, 22, 3)))
+    np.save(tmp_path / "a.npy", np.zeros((20, 23, 3)))
     assert refusal(tmp_path / "a.npy") == (
-        ": it holds one array of shape (20, 22, 3) without joint names or a frame rate. Save it as npz "
-        "with named arrays"
+        ": it holds one array of shape (20, 23, 3) without joint names or a frame rate. Joints of SMPL "
+        "are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays"
     )
     row = "0,0,0.8,1,0,0,0," + ",".join(["0.1"] * 29)
     assert refusal(put(tmp_path, "a.csv", "\n".join([row] * 5))) == (

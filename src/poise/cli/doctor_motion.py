@@ -53,8 +53,15 @@ def run_on(path: Path, options: Options) -> Answer:
     healed = heal(clip)
     write_clip(healed, target)
     left = examine(healed)
+    moved = _root_moved(clip, healed)
     facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
+    facts["fixed"]["root_moved"] = moved
     _compare(found, left)
+    if moved is not None and moved["max_mm"] >= 10.0:
+        say(
+            f"The root moved by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and ends "
+            f"{moved['end_mm']:.0f} mm from where it ended."
+        )
     _written(clip, healed, found, left)
     return Answer(facts, {"clip": target}, outcome=f"{outcome}, {len(left.faults)} after")
 
@@ -105,6 +112,16 @@ def _compare(found: Examination, left: Examination) -> None:
         values = [e.figures[key] for e in (found, left)]
         rows.append((title, unit, *("-" if v is None else f"{v:,.{digits}f}" for v in values)))
     table("", ("", "", "before", "after"), rows, left=2)
+
+
+def _root_moved(clip: Clip, healed: Clip) -> dict[str, Any] | None:
+    """How far the root is from where it was; None where frames were left out, which move the rest."""
+    if clip.frames != healed.frames:
+        return None
+    import numpy as np
+
+    way = np.linalg.norm(healed.root_pos - clip.root_pos, axis=-1) * 1000
+    return {"max_mm": float(way.max()), "frame": int(way.argmax()), "end_mm": float(way[-1])}
 
 
 def _written(clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:

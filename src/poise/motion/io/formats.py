@@ -88,8 +88,14 @@ READERS = (
     Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
     Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
-    Reader("npz of AMASS, SMPL, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
-    Reader("pickled SMPL, poselib or MDM", (".pkl", ".npy"), looks_like_pickle, read_pickled, asks=True),
+    Reader("npz of AMASS, SMPL, Kimodo, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
+    Reader(
+        "pickled SMPL, poselib or MDM",
+        (".pkl", ".npy"),
+        looks_like_pickle,
+        read_pickled,
+        asks=True,
+    ),
     Reader("TRC keypoints", (".trc",), looks_like_trc, as_clip(trc_points)),
     Reader("C3D markers", (".c3d",), looks_like_c3d, as_clip(c3d_points)),
     Reader("OpenPose", (), looks_like_openpose, refuse_openpose, asks=True),
@@ -105,6 +111,10 @@ _MAGIC = (
     (b"Kaydara FBX", "FBX"),
     (b"PK\x03\x04", "zip"),
     (b"\x89HDF", "HDF5"),
+)
+_TORCH = (
+    "For GVHMR: import numpy, torch; d = torch.load(FILE, weights_only=True)['smpl_params_global']; "
+    "numpy.savez('motion.npz', fps=RATE, **{k: v.numpy() for k, v in d.items()})"
 )
 _NOT_YET = {
     ".fbx": "FBX",
@@ -171,6 +181,8 @@ def _reader_of(path: Path) -> Reader:
             if reader.looks_like(below):
                 return reader
     suffix = path.suffix.lower()
+    if suffix in (".pt", ".pth"):
+        raise PoiseError("files of torch are pickles, which are not read", path, _TORCH)
     other = next((name for magic, name in _MAGIC if head.startswith(magic)), _NOT_YET.get(suffix))
     if other is not None:
         raise PoiseError(f"{other} files are not read yet", path, READABLE)

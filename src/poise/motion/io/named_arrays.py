@@ -10,13 +10,21 @@ from typing import Any
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.angles.opensim import is_opensim, read_loco
-from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header
+from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header, read_npy
+from poise.motion.io.numpy.kimodo import is_kimodo, read_kimodo
 from poise.motion.io.numpy.pickles import load_restricted, loads_restricted
 from poise.motion.io.numpy.poselib import is_poselib, read_poselib
 from poise.motion.io.numpy.smpl import is_smpl, read_smpl
 from poise.motion.io.numpy.smpl_write import is_amass_clip, write_amass
 from poise.motion.io.own.npz import MARK, read_poise_npz, write_poise_npz
-from poise.motion.io.points.arrays import array_points, is_mdm, is_points, mdm_points
+from poise.motion.io.points.arrays import (
+    array_points,
+    is_joints,
+    is_mdm,
+    is_points,
+    joint_points,
+    mdm_points,
+)
 from poise.motion.io.points.raw import as_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.io.refused import is_qpos, refuse_qpos
@@ -35,6 +43,7 @@ class Kind:
 KINDS: tuple[Kind, ...] = (
     Kind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
     Kind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
+    Kind("motions of Kimodo (posed_joints, global_rot_mats)", is_kimodo, read_kimodo),
     Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
     Kind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
     Kind("results of the motion diffusion model (motion, lengths)", is_mdm, as_clip(mdm_points)),
@@ -60,16 +69,19 @@ def read_npz(path: Path, options: ReadOptions) -> Clip:
 
 
 def read_pickled(path: Path, options: ReadOptions) -> Clip:
-    """The clip in a `.pkl` or `.npy` of pickled arrays, which must be asked for."""
+    """The clip in a `.npy` of joints; or in a `.pkl` or `.npy` of pickled arrays, to be asked for."""
     with path.open("rb") as file:
         if file.read(len(NPY_MAGIC)) == NPY_MAGIC:
             file.seek(0)
             header = npy_header(file, path)
+            if is_joints(header.shape, header.dtype):
+                file.seek(0)
+                return as_clip(joint_points)(read_npy(file, path), path, options)
             if not header.dtype.hasobject:
                 raise PoiseError(
                     f"it holds one array of shape {header.shape} without joint names or a frame rate",
                     path,
-                    "Save it as npz with named arrays",
+                    "Joints of SMPL are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays",
                 )
     if not options.allow_pickle:
         raise PoiseError("this is a pickled file", path, ASK)

@@ -38,6 +38,7 @@ _RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "framerate", "fps
 _JOINTS = ("rest_joints", "J", "joints")
 _UNUSED = ("dmpls", "expression", "pose_est_dmpls")
 _AIST_FPS = 60.0
+_HY_FPS = 30.0
 Z_TO_Y_UP = (2**-0.5, -(2**-0.5), 0.0, 0.0)
 """wxyz, the turn of the world from Z up to Y up: -90 degrees about X."""
 
@@ -231,6 +232,9 @@ def _fps(data: Mapping[str, Any], path: Path, notes: list[str]) -> float:
     if "smpl_poses" in data:
         notes.append("The file states no frame rate: 60 frames per second taken, as AIST++ has it")
         return _AIST_FPS
+    if "Rh" in data:
+        notes.append("The file states no frame rate: 30 frames per second taken, as HY-Motion has it")
+        return _HY_FPS
     raise PoiseError(
         f"the file states no frame rate (none of {listed(_RATES)})", path, "State it with --fps F"
     )

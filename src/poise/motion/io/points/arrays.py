@@ -23,6 +23,31 @@ HUMANML3D = (
 )
 """The 22 joints of HumanML3D (Guo et al. 2022), in the order of its arrays."""
 _HUMANML3D_FPS = 20.0
+_HANDS = ("left_hand", "right_hand")
+
+
+def is_joints(shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
+    """Whether one array holds the places of SMPL's joints: `(T, 22, 3)`, or `(T, 24, 3)` with hands."""
+    return dtype.kind == "f" and len(shape) == 3 and shape[1:] in ((22, 3), (24, 3))
+
+
+def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
+    """Places of SMPL's joints in metres; the vertical is guessed unless stated.
+
+    22 joints without a stated rate have HumanML3D's, 20 frames per second; for 24 there is no usual one.
+
+    Raises:
+        PoiseError: 24 joints without a stated rate.
+    """
+    names = HUMANML3D + (_HANDS if array.shape[1] == len(HUMANML3D) + 2 else ())
+    fps, notes = options.fps, []
+    if fps is None:
+        if len(names) != len(HUMANML3D):
+            raise PoiseError("an array of joints states no frame rate", path, "State it with --fps F")
+        fps = _HUMANML3D_FPS
+        notes.append("The file states no frame rate: 20 taken, as HumanML3D has it (--fps F)")
+    positions = numeric({"joints": array}, "joints", (None, len(names), 3), path)
+    return RawPoints("joints", path, names, positions, fps, 1.0, None, notes=tuple(notes))
 
 
 def is_points(data: Mapping[str, Any]) -> bool:
