@@ -197,7 +197,7 @@ def write_card(runs: Mapping[str, Any], a: argparse.Namespace) -> None:
     drawn = "curves" in runs[name]
     if drawn:
         draw(name, runs[name]["curves"], image)
-    card = model_card(runs[name], _licences(a.licence), image.name if drawn else "")
+    card = model_card(runs[name], _licences(a.licence), image.name if drawn else "", title=a.title)
     write_atomic(a.card, card.encode())
     say(str(a.card))
 
@@ -226,6 +226,7 @@ def arguments() -> argparse.ArgumentParser:
     p.add_argument("-o", "--out", type=Path, default=Path(__file__).with_name("perpetual.json"))
     p.add_argument("--card", type=Path, metavar="FILE", help="write a model card, too")
     p.add_argument("--card-of", default="", metavar="NAME", help="of this run; the first by default")
+    p.add_argument("--title", default="Tracker", help="of the model card")
     p.add_argument("--licence", nargs="*", default=[], metavar="DATA=TEXT", help="for the model card")
     return p
 

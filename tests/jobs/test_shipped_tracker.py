@@ -17,19 +17,20 @@ from poise.jobs.perpetual.evaluation import try_recovery
 from poise.jobs.track import TrackConfig, imitation_of, track
 from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.placement import place
-from poise.jobs.tracker import SHIPPED, Tracker
+from poise.jobs.tracker import POLICIES, SHIPPED, Tracker
 from poise.motion import read_clip
 from toy_human import human, swing, turn
 from toy_policy import WALK
 
 
-@pytest.fixture(scope="module")
-def tracker() -> Tracker:
-    return open_run().tracker
+@pytest.fixture(scope="module", params=[None, *POLICIES], ids=["rotations", *POLICIES])
+def tracker(request: pytest.FixtureRequest) -> Tracker:
+    return open_run(request.param).tracker
 
 
 def test_it_is_small_and_says_what_it_learned(tracker: Tracker) -> None:
     assert SHIPPED.stat().st_size < 5_000_000
+    assert all(file.stat().st_size < 5_000_000 for file in POLICIES.values())
     about = tracker.about
     assert about["help_n"] == 0.0 and about["samples"] > 50_000_000 and about["finished"]
     learned = {subject_of(name) for name in about["clips"]}

@@ -45,8 +45,8 @@ class Options:
     retime: Flag = False
     """Give gaps that no body does in their time more of it; the new times are said."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
-    Poise."""
+    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
+    along and is told places alone; by default the one for rotations that comes with Poise."""
     model: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """A trained in-betweening network; by default the one that comes with Poise."""
     controller: Literal["auto", "policy", "lookahead", "search"] = "auto"

@@ -29,7 +29,8 @@ class Options:
     clips: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE ...", help_behavior_hint="")] = ()
     """Motion files that are played again and again, each as one person; by default a walk."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, or the folder of a run; by default the one that comes with Poise."""
+    """A policy file, the folder of a run, or keypoints, the policy that comes along and is told places
+    alone; by default the one for rotations that comes with Poise."""
     characters: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Characters in one world, 1 to 16; by default one for each file."""
     buffer: Annotated[float, arg(metavar="SECONDS")] = 0.1

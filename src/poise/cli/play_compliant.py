@@ -64,8 +64,8 @@ class Options:
     seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None
     """throws: of the draws (0)."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
-    Poise."""
+    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
+    along and is told places alone; by default the one for rotations that comes with Poise."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores; 0 is all."""
     open: Flag = False

@@ -51,8 +51,8 @@ class Options:
     law: Literal["eq8", "algorithm1"] = "eq8"
     """How the level acts: by the paper's Eq. 8, or by its Algorithm 1 as printed."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
-    Poise."""
+    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
+    along and is told places alone; by default the one for rotations that comes with Poise."""
     controller: Literal["lookahead", "policy"] = "lookahead"
     """lookahead tries in copies of the character before it acts, without knowing of the push before it
     begins; policy acts alone, at once."""

@@ -45,8 +45,8 @@ class Options:
     ] = ()
     """Motion files: clips of any human skeleton, or keypoints; or one folder, each file on its own."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
-    """A policy file, or the folder of a run of poise train perpetual; by default the one that comes with
-    Poise."""
+    """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
+    along and is told places alone; by default the one for rotations that comes with Poise."""
     controller: Literal["auto", "policy", "lookahead", "search"] = "auto"
     """policy acts alone, at once; lookahead tries in copies of the character before it acts, which is
     nearer to the motion and cleaner; search lets many characters try the whole motion at once. auto

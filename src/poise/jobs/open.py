@@ -26,7 +26,14 @@ from poise.jobs.run_file import (
     run_folder,
 )
 from poise.jobs.runs import Evaluation, evaluate, score, trained_policy, transitions
-from poise.jobs.tracker import SHIPPED, Tracker, check_policy_file, load_tracker, policy_of_run
+from poise.jobs.tracker import (
+    POLICIES,
+    SHIPPED,
+    Tracker,
+    check_policy_file,
+    load_tracker,
+    policy_of_run,
+)
 from poise.learn import PolicyBundle, load_checkpoint
 from poise.learn.model import MODEL, InbetweenModel, load_model
 from poise.recipes.perpetual.config import config_of as perpetual_config
@@ -184,16 +191,19 @@ def open_run(path: Path | str | None = None) -> Run:
     """What was trained in a folder or a file; without a path the policy that comes with Poise.
 
     Args:
-        path: a run folder, a result folder with one in it, a policy file, or an in-betweening network.
+        path: a run folder, a result folder with one in it, a policy file, or an in-betweening network;
+            or "keypoints", the policy that is told places alone, where no file has that name.
 
     Raises:
         PoiseError: there is nothing, it is damaged, or it is something else.
     """
-    path = SHIPPED if path is None else Path(path)
+    named, path = None if path is None else str(path), SHIPPED if path is None else Path(path)
+    if named in POLICIES and not path.exists():
+        path = POLICIES[named]
     if path.is_dir() and not (path / RUN_FILE).exists() and (path / MODEL).exists():
         path = path / MODEL
     if not path.exists():
-        hint = "Give the folder of a run or a result, or a policy file"
+        hint = f"Give the folder of a run or a result, a policy file, or {', '.join(POLICIES)}"
         raise PoiseError("there is no such file or folder", path, hint)
     if path.is_dir():
         return _folder(run_folder(path))

@@ -56,8 +56,11 @@ class TrackerMeta(PolicyMeta):
 
 #: What a policy file calls itself, and the version of what stands in it.
 KIND, VERSION = "tracker", 1
+_DATA = Path(__file__).parents[1] / "data"
 #: The policy that comes with Poise.
-SHIPPED = Path(__file__).parents[1] / "data/tracker.safetensors"
+SHIPPED = _DATA / "tracker.safetensors"
+#: Those that come along by a name: one that is told places of joints alone.
+POLICIES = {"keypoints": _DATA / "keypoints.safetensors"}
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300
 #: The largest number of half precision.

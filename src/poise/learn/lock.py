@@ -55,7 +55,7 @@ def only_writer(folder: Path) -> Generator[None]:
 
 
 def alone(train: Callable[Concatenate[T, Path, P], R]) -> Callable[Concatenate[T, Path, P], R]:
-    """A training whose second argument is its folder, as that folder's only writer."""
+    """A training that takes its folder as second argument, as that folder's only writer."""
 
     @functools.wraps(train)
     def held(what: T, folder: Path, *args: P.args, **kwargs: P.kwargs) -> R:

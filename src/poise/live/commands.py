@@ -17,7 +17,7 @@ from poise.motion import Skeleton
 #: Version of the protocol; bytes and depth of a message; joints of a skeleton.
 VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
 _MOST = 1e6
-#: Verticals; -Y is that of cameras, whose x is to the right and z into the picture.
+#: Verticals; -Y is that of cameras, with x to the right and z into the picture.
 UPS = ("Y", "Z", "-Y")
 
 

@@ -70,7 +70,7 @@ class World:
         yielding: their dials of compliance.
         resets: how often the simulation went bad and all were set down anew.
         hurries: whether there is no time to look ahead; all act at once then.
-        looked: control steps in which somebody looked ahead.
+        looked: control steps in which a character looked ahead.
 
     Raises:
         PoiseError: a policy that cannot get up, or has no critic though it is to look ahead.

@@ -48,7 +48,7 @@ def check_poses(frames: int, joints: int, where: str | Path | None = None) -> No
 def _frozen(array: np.ndarray) -> np.ndarray:
     own = type(array) is np.ndarray and array.dtype == np.float64 and array.base is None
     if own and not array.flags.writeable:
-        # Nobody can change it: clips share it, since an hour of motion is large.
+        # It cannot be changed: clips share it, since an hour of motion is large.
         return array
     out = np.array(array, dtype=np.float64)
     out.flags.writeable = False

@@ -41,9 +41,9 @@ class GapFault:
     def sentence(self) -> str:
         """In words, without a full stop."""
         kind = KINDS[self.kind]
-        who = f"{self.joint}: " if self.joint else ""
+        at = f"{self.joint}: " if self.joint else ""
         size = f"{self.size:.3g} {kind.unit}"
-        return f"{who}{kind.title} ({size}), frames {self.start} to {self.stop}"
+        return f"{at}{kind.title} ({size}), frames {self.start} to {self.stop}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, with the unit of the size."""
