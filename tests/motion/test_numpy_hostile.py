@@ -95,9 +95,8 @@ AMASS: dict[str, tuple[dict[str, Any], str]] = {
     "no motion": (
         {"weights": np.zeros(3)},
         ": its arrays are no motion that is known ('weights'). Known: Poise's own arrays; AMASS and the "
-        "SMPL family (poses, trans); motions of Kimodo (posed_joints, "
-        "global_rot_mats); poselib (skeleton_tree, rotation); keypoints (positions, "
-        "names, fps); results of the motion diffusion model (motion, lengths); OpenSim coordinates "
+        "SMPL family (poses, trans); Kimodo (posed_joints); poselib (skeleton_tree, rotation); "
+        "keypoints (positions, names, fps); MDM results (motion, lengths); OpenSim coordinates "
         "(q_hip_flexion_r, ...)",
     ),
     "robot": (

@@ -43,10 +43,10 @@ class Kind:
 KINDS: tuple[Kind, ...] = (
     Kind("Poise's own arrays", lambda data: MARK in data, read_poise_npz),
     Kind("AMASS and the SMPL family (poses, trans)", is_smpl, read_smpl),
-    Kind("motions of Kimodo (posed_joints, global_rot_mats)", is_kimodo, read_kimodo),
+    Kind("Kimodo (posed_joints)", is_kimodo, read_kimodo),
     Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
     Kind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
-    Kind("results of the motion diffusion model (motion, lengths)", is_mdm, as_clip(mdm_points)),
+    Kind("MDM results (motion, lengths)", is_mdm, as_clip(mdm_points)),
     Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
     Kind("a robot's joint angles", is_qpos, refuse_qpos),
 )
