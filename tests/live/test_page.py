@@ -225,12 +225,12 @@ def test_push_fall_recovery_and_record_in_chromium(tmp_path: Path) -> None:
             page.mouse("mouseReleased", x + 40, y - 20)
             key = "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: '%s', bubbles: true}))"
             page.js(key % "k")
-            page.until("['falls', 'gets up'].includes(document.body.dataset.doing)")
-            page.until("document.body.dataset.doing == 'tracks'", 40)
-            assert page.js("Number(document.getElementById('recovered').textContent)") >= 1
+            # A page that draws seldom may miss the fall itself.
+            page.until("Number(document.getElementById('recovered').textContent) >= 1", 60)
+            page.until("document.body.dataset.doing == 'tracks'", 60)
             for level in ("0.05", "0.1"):
                 page.js(key % "+")
-                page.until(f"document.body.dataset.compliance == '{level}'")
+                page.until(f"document.body.dataset.compliance == '{level}'", 60)
             page.js("document.getElementById('dream').click()")
             page.until("document.getElementById('dream').ariaPressed == 'true'")
             page.until("document.getElementById('says').textContent.includes('endless motion')")
