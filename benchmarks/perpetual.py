@@ -162,7 +162,8 @@ def main(argv: list[str] | None = None) -> None:
 
     def save() -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+        text = json.dumps(shortened(result), indent=1, allow_nan=False)
+        write_atomic(path, f"{text}\n".encode())
         write_atomic(path.with_suffix(".md"), report(result).encode())
 
     for text in a.runs:
@@ -185,6 +186,15 @@ def main(argv: list[str] | None = None) -> None:
     if a.card is not None:
         write_card(result["runs"], a)
     say(str(path.with_suffix(".md")))
+
+
+def shortened(value: Any) -> Any:
+    """The same with numbers of six digits."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {key: shortened(x) for key, x in value.items()}
+    return [shortened(x) for x in value] if isinstance(value, list | tuple) else value
 
 
 def write_card(runs: Mapping[str, Any], a: argparse.Namespace) -> None:

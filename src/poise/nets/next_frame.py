@@ -110,8 +110,8 @@ class NextFrame(nn.Module):
         self, frames: Tensor, state: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """What follows each of scaled `frames (N, T, D)`, and the state to go on with."""
-        out, state = self.recurrent(self.encoder(frames), state)
-        return frames + _CHANGE * self.decoder(out), state
+        out, last = self.recurrent(self.encoder(frames), state)
+        return frames + _CHANGE * self.decoder(out), last
 
     def trained(self, frames: Tensor, rng: torch.Generator) -> Tensor:
         """What follows each of scaled `frames (N, T, D)`, seen as in training `(N, T, D)`."""

@@ -150,7 +150,7 @@ def play(
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads))
     (imitation, rollouts, seen, evaluation), (_, others, other, _) = both
     return Played(
-        name or type(scene).__name__.lower(), WORDS | words_of(scene), imitation, evaluation,
+        name or type(scene).__name__.lower(), {**WORDS, **words_of(scene)}, imitation, evaluation,
         seen.figures(rollouts, task), other.figures(others, task), count,
         tuple(seen.arrows), seen.movers(),
     )  # fmt: skip
