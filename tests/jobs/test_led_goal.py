@@ -77,38 +77,6 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
     env.close()
 
 
-def test_a_character_that_fell_is_to_rest_as_it_lies(made: Imitation) -> None:
-    env, own = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False), made.reference
-    clip = torch.tensor([own.names.index("walk")])
-    env.reset_to(clip, torch.zeros_like(clip))
-    assert made.recovery_clips is not None
-    goal = LedGoal(env.goal.clips, made.recovery_clips)
-    env.set_goal(goal)
-    qpos = env.backend.state.qpos.clone()
-    qpos[:, 0] += 4.0
-    moving = torch.ones_like(env.backend.state.qvel)
-    for step in range(3):
-        qpos[:, 1] += step
-        env.backend.write(None, qpos, moving)
-        env.observe()
-        assert goal.doing.tolist() == [FALLS]
-        for k in (0, 1, 9):
-            asked = goal.layout.unpacked(goal.ahead(k))
-            assert float((asked.pos - env.pose().pos).norm(dim=-1).max()) < 1e-3
-            assert float(asked.linvel.abs().max()) < 1e-6
-        hinges, rows = goal.targets()
-        torch.testing.assert_close(hinges[rows], qpos[:, 7:].to(hinges))
-    # What it lies as is part of a snapshot.
-    shot = env.snapshot()
-    qpos[:, 0] += 1.0
-    env.backend.write(None, qpos, moving)
-    env.observe()
-    far = goal.ahead().clone()
-    env.restore(shot)
-    assert not torch.equal(goal.ahead(), far)
-    env.close()
-
-
 def begun(made: Imitation) -> tuple[ImitationEnv, Tensor, RecoveryClips]:
     """One world at the start of the first clip, its row, and the recovery clips."""
     env = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False)

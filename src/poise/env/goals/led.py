@@ -16,7 +16,6 @@ from torch import Tensor
 
 from poise.env.goals.clip import ClipGoal
 from poise.env.goals.goal import Goal
-from poise.env.goals.lying import Lying
 from poise.env.plugins import Start
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.get_up import GetUpPlanner, Poses
@@ -41,10 +40,9 @@ TRACKS, FALLS, RETURNS = 0, 1, 2
 class LedGoal(Goal):
     """Worlds follow their clips, and recovery motions back to them where they are lost.
 
-    The clip waits for a character that has lost it (`LOST`); its goal meanwhile is to rest as it lies.
-    Once it has come to rest it follows a recovery motion to a frame of its clip in which it hardly moves
-    and nearly stands, and goes on from there. A character that loses the recovery motion gets another
-    one, with another get-up clip.
+    The clip waits for a character that has lost it (`LOST`). Once the character has come to rest it
+    follows a recovery motion to a frame of its clip in which it hardly moves and nearly stands, and goes
+    on from there. A character that loses the recovery motion gets another one.
 
     Args:
         goal: the clips.
@@ -83,9 +81,6 @@ class LedGoal(Goal):
         self._on, self.at = torch.zeros_like(goal.clip, dtype=torch.bool), goal.frame.clone()
         self._first, self._length = torch.zeros_like(goal.clip), torch.ones_like(goal.clip)
         self._packed, self._qpos = self.reference.packed(goal.clip[:0]), self.reference.qpos[:0]
-        # How they lie, and how often they have tried to get up in vain.
-        self._lying = Lying(self.humanoid, self.layout, goal.start(None)[0])
-        self._tries = torch.zeros_like(goal.clip)
         self._aimed = self._coordinates(0)
 
     def local(self, qpos: Tensor) -> Tensor:
@@ -108,7 +103,6 @@ class LedGoal(Goal):
     def _begin(self, ids: Tensor) -> None:
         self.frame[ids] = self.at[ids] = self.goal.frame[ids]
         self.doing[ids], self._since[ids], self._on[ids] = TRACKS, 0, False
-        self._tries[ids] = 0
 
     def start(self, ids: Tensor | None) -> Start:
         ids = torch.arange(self.num_envs, device=self.device) if ids is None else ids
@@ -123,8 +117,7 @@ class LedGoal(Goal):
         on = self._on.nonzero().squeeze(-1)
         if len(on):
             qpos[on] = self._qpos[self._row(on, k)]
-        falls = self.doing == FALLS
-        return torch.where(falls.unsqueeze(-1), self._lying.qpos.to(qpos), qpos)
+        return qpos
 
     def aim(self, ids: Tensor | None, held: Tensor | None) -> None:
         """Nothing is looked up beforehand."""
@@ -143,9 +136,6 @@ class LedGoal(Goal):
         on = self._on[ids].nonzero().squeeze(-1)
         if len(on):
             packed[on] = self._packed[self._row(ids[on], k)]
-        falls = (self.doing[ids] == FALLS).nonzero().squeeze(-1)
-        if len(falls):
-            self._lying.laid(packed, ids, falls)
         return packed
 
     def _row(self, ids: Tensor, k: int) -> Tensor:
@@ -155,13 +145,11 @@ class LedGoal(Goal):
     def targets(self) -> tuple[Tensor, Tensor]:
         every = torch.arange(self.num_envs, device=self.device)
         rows = self.reference.rows(self.goal.clip, self.at + 1)
-        falls = self.doing == FALLS
-        if not bool((self._on | falls).any()):
+        if not bool(self._on.any()):
             return self.reference.hinges, rows
         hinges = self.reference.hinges[rows]
         on = self._on.nonzero().squeeze(-1)
         hinges[on] = self._qpos[self._row(on, 1)][:, 7:]
-        hinges[falls] = self._lying.qpos[falls, 7:].to(hinges)
         return hinges, every
 
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -183,8 +171,6 @@ class LedGoal(Goal):
         ends = torch.where(self._on, self._length, self.reference.length[self.goal.clip]) - 1
         back = returns & ~lost & (self.at >= ends)
         self.doing[back], self._on[back], self.at[back] = TRACKS, False, self.frame[back]
-        self._tries[back] = 0
-        self._tries[lost & returns] += 1
         more = self.goal.clip < len(self.reference.length) - 1
         over = tracks & ~lost & (self.at >= ends) & more & (self.chained and self.plans)
         self.goal.clip[over] += 1
@@ -202,7 +188,6 @@ class LedGoal(Goal):
         )
         if bool(rests.any()):
             self.lead(rests.nonzero().squeeze(-1), qpos, linvel[:, 0])
-        self._lying.hold((self.doing == FALLS).nonzero().squeeze(-1), qpos)
         self.goal.frame.copy_(self.frame)
         return bool((rests | back | falls | over).any())
 
@@ -221,13 +206,11 @@ class LedGoal(Goal):
             self._qpos = torch.cat((self._qpos, motion.qpos))
         self._on[worlds], self.at[worlds], self.doing[worlds] = True, 0, RETURNS
 
-    def leave(self, worlds: Tensor, qpos: Tensor) -> None:
-        """Worlds `(n,)` leave their clips, and are led to the first frames of the next ones from where
-        they are, `qpos (N, 7 + n)` of all."""
+    def leave(self, worlds: Tensor) -> None:
+        """Worlds `(n,)` leave their clips, and are led to the first frames of the next ones."""
         self.goal.clip[worlds] += 1
         self.frame[worlds] = self.at[worlds] = 0
         self.doing[worlds], self._since[worlds], self._on[worlds] = FALLS, 0, False
-        self._lying.hold(worlds, qpos)
         self.goal.frame.copy_(self.frame)
 
     def _tidy(self) -> None:
@@ -248,7 +231,7 @@ class LedGoal(Goal):
         self.frame[world] = self._entry(int(self.goal.clip[world]), int(self.frame[world]))
         place, velocity = own.coordinates(self.goal.clip[one], self.frame[one])
         into = run_up(self.get_up, place[0].cpu(), velocity[0].cpu())
-        way = plan_recovery(self.get_up, qpos, into[0], moves=moves, tries=int(self._tries[world]))
+        way = plan_recovery(self.get_up, qpos, into[0], moves=moves)
         way = way[: len(way) - round((STAY_S - CALM_S) * self.rate_hz)]
         way = torch.cat((way[:-1], self.get_up.blend(way[-1], into[0]), into[1:]))
         found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"recovery {world}"])
@@ -287,7 +270,6 @@ class LedGoal(Goal):
         return {
             "own_frame": self.frame, "doing": self.doing, "since": self._since, "on": self._on,
             "at": self.at, "first": self._first, "length": self._length,
-            "lies": self._lying.qpos, "lying": self._lying.packs, "tries": self._tries,
         }  # fmt: skip
 
     def rows(self) -> dict[str, Tensor]:

@@ -184,7 +184,7 @@ class _Led:
         # Once for each: a character that does not come to the next clip either ends.
         if not self.goal.chained or self._clip == len(self.last) - 1 or not self._losses:
             return True
-        self.goal.leave(torch.zeros(1, dtype=torch.long), env.backend.state.qpos)
+        self.goal.leave(torch.zeros(1, dtype=torch.long))
         self.given_up.append(now)
         self._here, self._left, self._losses = False, now, 0
         self._clip, self._frame = int(self.goal.clips.clip), 0
