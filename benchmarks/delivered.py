@@ -19,6 +19,7 @@ import statistics
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +175,8 @@ def main() -> None:
     command = (
         "python benchmarks/delivered.py --data FOLDER --clips LIBRARY --json benchmarks/delivered.json"
     )
-    with ProcessPoolExecutor(a.workers) as pool:
+    # A forked child may wait for threads that it does not have.
+    with ProcessPoolExecutor(a.workers, get_context("spawn")) as pool:
         running = []
         for name in a.set:
             key = name if a.budget == LookaheadConfig().budget else f"{name}, budget {a.budget:g}"

@@ -25,6 +25,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,7 +116,8 @@ def main(argv: list[str] | None = None) -> None:
     results.commands += [] if command in results.commands else [command]
     print(f"{len(jobs)} to measure, {len(results.rows)} rows are there", flush=True)
     running: dict[Future[dict[str, Any]], Job] = {}
-    with ProcessPoolExecutor(a.workers) as pool:
+    # A forked child may wait for threads that it does not have.
+    with ProcessPoolExecutor(a.workers, get_context("spawn")) as pool:
         for job in jobs:
             _, clip, controller, _, condition, starts = job.key
             what = (clip, job.source, controller, job.config, CONDITIONS[condition], starts)
