@@ -44,7 +44,7 @@ def brief(error: PoiseError, path: Path) -> PoiseError:
     path: the file; where the error names another place, it stands before it or in it.
     """
     where, rest = str(path), error.where or ""
-    if rest.startswith(str(path.parent)):
+    if rest.startswith((where, str(path.parent))):
         # Another file in the same folder, such as a skeleton, or a place within this one.
         known = where if rest.startswith(where) else str(path.parent)
         where, rest = known, rest.removeprefix(known)

@@ -342,3 +342,12 @@ def test_endless_lines_and_huge_files_are_refused_at_once(tmp_path: Path) -> Non
         file.truncate(limits.MAX_FILE_BYTES)
     assert refusal(path) == ", line 2: binary data in a text file"
     assert time.perf_counter() - start < 5.0
+
+
+def test_a_file_in_the_present_folder_is_named_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cut.bvh").write_text("HIERARCHY\nROOT Hips\n{\n OFFSET 0 0")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PoiseError, match=r"^cut\.bvh, line 4: "):
+        read_clip(Path("cut.bvh"))
