@@ -5,8 +5,6 @@ library (`env.recovery.clips`) a recovery motion is planned for any start:
 
     lying -> blended (`env.recovery.get_up`) -> a clip that gets up -> the walk, steered -> at ease
 
-Before a walk to a place farther than `NEAR` the character stands at ease, too.
-
 It is a reference, not physics: blends float and sink, and feet slide in turns. A policy that learns to
 track such motions (`jobs.perpetual.demonstrations`) finds what physics allows.
 
@@ -36,7 +34,7 @@ TURN, HERE, FACING = 2.0, 0.08, 0.1
 FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
 #: Share of the root's height at ease; a character with its root below must get up.
 DOWN = 0.6
-#: m: what is no farther is come to at once. Cosine: backwards, where it is no more ahead.
+#: m: what is no farther and behind is come to backwards. Cosine: of what is behind.
 NEAR, BEHIND = 1.2, -0.6
 #: s: at ease at the end.
 STAY_S = 1.0
@@ -80,9 +78,6 @@ def plan_recovery(
         walk = _walk(get_up, stand, place, which, phase, pace)
         return get_up.out_of(body[-1], walk, moves)
     walk = _walk(get_up, stand, place, which, phase)
-    if float((place[:2] - stand[:2]).norm()) > NEAR:
-        # Stand first before a long walk: characters that set off while getting up fall more often.
-        return torch.cat((body[:-1], get_up.blend(body[-1], stand)[:-1], walk))
     return torch.cat((body[:-1], get_up.out_of(body[-1], walk)))
 
 
