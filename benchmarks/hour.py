@@ -5,7 +5,7 @@
 All clips of the folders, in an order drawn by the seed, one after another and without help: a recovery
 motion leads from the end of each to the start of the next, and back to a clip that was lost. Where they
 are shorter than `--minutes` their mirror images follow. A clip that is lost nine times, or not come back
-to within half a minute, is given up; a character that does not come to the next one either has fallen
+to within half a minute, is given up; a character that does not come to three clips in a row has fallen
 for good, and the measurement ends there.
 """
 
@@ -77,9 +77,10 @@ def main() -> None:
         "losses": len(lost), "came_back": len(back),
         "away_s": {"mean": round(float(away.mean()), 2), "most": round(float(away.max()), 2)},
         "clips_given_up": len(losses.given_up) if losses else 0,
-        "unrecovered": int(len(back) < len(lost)),
+        "unrecovered": int(not parts[-1].done and parts[-1].begins is None),
         "given_up": [p.clip for p in parts if p.begins is not None and not p.done],
-        "not_reached": sum(p.begins is None for p in parts), "notes": notes,
+        "not_reached": sum(p.begins is None for p in parts),
+        "cut_or_left_out": sum(": cut to " in n or ": left out" in n for n in notes),
     }  # fmt: skip
     said = json.loads(a.json.read_text()) if a.json.exists() else {"rows": {}}
     told = {"command": "benchmarks/hour.py", "machine": machine(), "seed": a.seed}

@@ -6,11 +6,15 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
+import torch
 
-from poise.env import Reference
+from poise.env import ImitationEnv, Reference
+from poise.env.goals.led import RETURNS, TRACKS, LedGoal
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import recovering, track, write
@@ -137,6 +141,41 @@ def test_a_clip_that_is_given_up_is_left_for_the_next(
     # What follows is no part of it.
     assert int(tracked.evaluation.rollouts.lengths[0]) > second.begins * 30
     assert tracked.card.per_clip[0]["frames"] <= second.begins * 30 + 1
+
+
+def test_clips_that_are_not_come_to_are_left_three_in_a_row_at_most() -> None:
+    goal, left = SimpleNamespace(), list[int]()
+    goal.reference = SimpleNamespace(length=torch.tensor([2] * 9))
+    goal.rate_hz, goal.chained, goal.lost, goal.doing = 1.0, True, [], torch.tensor([TRACKS])
+    goal.clips, goal.frame = SimpleNamespace(clip=torch.tensor([0])), torch.tensor([0])
+    goal.aimed = lambda: torch.zeros(1, 7)
+
+    def leave(_: object) -> None:
+        left.append(int(goal.clips.clip))
+        goal.clips.clip, goal.frame = goal.clips.clip + 1, torch.tensor([0])
+
+    goal.leave = leave
+    led = recovering._Led(cast("LedGoal", goal), torch.zeros(1, 7))
+    env = SimpleNamespace(given=torch.zeros(1, 1))
+    away, step = math.ceil(recovering.AWAY_S) + 1, 0
+
+    def go_on(steps: int) -> bool:
+        nonlocal step
+        ends = False
+        for _ in range(steps):
+            ends = led.see(cast("ImitationEnv", env), step)
+            step += 1
+        return ends
+
+    go_on(1)
+    goal.clips.clip, goal.doing = torch.tensor([1]), torch.tensor([RETURNS])
+    assert not go_on(2 * away + 2) and left == [1, 2]
+    # One that is come to counts anew.
+    goal.doing = torch.tensor([TRACKS])
+    assert not go_on(1) and led.spans[3][0] is not None
+    goal.clips.clip, goal.doing = torch.tensor([4]), torch.tensor([RETURNS])
+    assert not go_on(2 * away + 2) and left == [1, 2, 4, 5]
+    assert go_on(away) and led.spans[6] == (None, None)
 
 
 def test_clips_of_other_skeletons_come_onto_the_first_ones(tracker: Tracker) -> None:

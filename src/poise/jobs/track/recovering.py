@@ -25,8 +25,9 @@ from poise.plan import Lookahead, SamplingConfig, SamplingControl, SamplingResul
 from poise.recipes.imitation import Imitation
 from poise.spatial import slerp
 
-#: A clip that is lost more often is given up, and so is one that the character has left for so many s.
-LOSSES, AWAY_S = 8, 30.0
+#: A clip that is lost more often is given up, and so is one that the character has left for so many s;
+#: so many of them one after another that it does not even come to end the motion.
+LOSSES, AWAY_S, VAIN = 8, 30.0, 3
 
 
 @dataclass(frozen=True)
@@ -151,8 +152,9 @@ class _Led:
         self.lost, self.back, self.given_up = list[float](), list[float](), list[float]()
         self.spans: list[tuple[int | None, int | None]] = [(None, None)] * len(self.last)
         # Whether it is on a motion, on which, and at which frame of it, before the next step; the s at
-        # which it left the last one, and how often it lost this one.
+        # which it left the last one, how often it lost this one, and how many it did not come to since.
         self._here, self._clip, self._frame, self._left, self._losses = True, 0, 0, 0.0, 0
+        self._vain = 0
 
     def see(self, env: ImitationEnv, step: int) -> bool:
         """Keeps what the step aimed at; True: the motions are over, or the last one is given up."""
@@ -172,8 +174,10 @@ class _Led:
         self._clip, self._frame = int(self.goal.clips.clip), int(self.goal.frame)
         self._losses = self._losses if self._clip == clip else 0
         self._left = now if was and not self._here else self._left
-        if self._here and self.spans[self._clip][0] is None:
-            self.spans[self._clip] = step, None
+        if self._here:
+            self._vain = 0
+            if self.spans[self._clip][0] is None:
+                self.spans[self._clip] = step, None
         if len(self.goal.lost) > len(self.lost):
             self.lost.append(now)
             self._losses += 1
@@ -181,8 +185,9 @@ class _Led:
             self.back.append(now)
         if self._losses <= LOSSES and (self._here or now <= self._left + AWAY_S):
             return False
-        # Once for each: a character that does not come to the next clip either ends.
-        if not self.goal.chained or self._clip == len(self.last) - 1 or not self._losses:
+        # A clip that begins in full flight is hard to come to; what has fallen for good comes to none.
+        self._vain += not self._losses
+        if not self.goal.chained or self._clip == len(self.last) - 1 or self._vain >= VAIN:
             return True
         self.goal.leave(torch.zeros(1, dtype=torch.long))
         self.given_up.append(now)
