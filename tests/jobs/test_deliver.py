@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from poise.eval import Recording
-from poise.jobs.deliver import deliver, finished, floor_of, simulated_clip
+from poise.jobs.deliver import deliver, finished, floor_of, lost_at, simulated_clip
 from poise.jobs.runs import Evaluation, evaluate
 from poise.motion import Clip, ClipLibrary, ground_shift, read_clip
 from poise.recipes import ResidualForce, build
@@ -110,6 +110,12 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     done = deliver(imitation, evaluation, tmp_path / "held", {})
     (figures,) = json.loads((tmp_path / "held/score.json").read_text())["delivered"]
     assert figures["delivered"]["penetration_mm"] <= figures["simulated"]["penetration_mm"] + 0.1
+    # It is on its motion for so short a time; where it is taken away from there, that is told.
+    r = evaluation.rollouts
+    away = r.pos.clone()
+    away[evaluation.recordings[0].row, 9:] += 1.0
+    assert lost_at(evaluation) == ()
+    assert lost_at(replace(evaluation, rollouts=replace(r, pos=away))) == (9 / r.fps,)
     assert set(figures) == {
         "clip", "held_mean_mm", "held_max_mm", "source", "simulated", "delivered"
     }  # fmt: skip

@@ -12,6 +12,7 @@ import torch
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
 from poise.kin import hold_feet, lowest_height, qpos_to_clip
+from poise.metrics import success
 from poise.motion import Clip, ground_shift, resample
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
@@ -104,6 +105,7 @@ def deliver(
     source: Clip | None = None,
     said: tuple[str, ...] = (),
     keys: tuple[int, ...] = (),
+    lost: tuple[float, ...] | None = None,
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`.
 
@@ -119,6 +121,7 @@ def deliver(
         source: see `make_report`.
         said: sentences that the report begins with.
         keys: frames of the source that stay visible in the report.
+        lost: s, when the first clip was lost; by default as the score's rule judges its episode.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
@@ -132,6 +135,7 @@ def deliver(
     report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
     frames = tuple(round(k / (source or imitation.library.clips[0]).fps * report.fps) for k in keys)
     report = replace(report, notes=(*said, *report.notes, *done.notes), keys=frames)
+    report = report if lost is None else replace(report, lost=lost)
     write_report(report, paths["report"])
     return replace(done, paths=paths)
 
@@ -236,6 +240,7 @@ def make_report(
             for other in (evaluation.recordings[1:] if evaluation.together else ())
         ),
         pushed=pushed,
+        lost=lost_at(evaluation),
         pushes=recording.contacts if len(recording.contacts) == frames else (),
         things=tuple(
             Shape(0, "box", (p.size[0] / 2, p.size[1] / 2, p.size[2] / 2), p.pos, p.quat)
@@ -243,6 +248,22 @@ def make_report(
             if isinstance(p, Box)
         ),
     )
+
+
+def lost_at(evaluation: Evaluation, index: int = 0) -> tuple[float, ...]:
+    """When an episode that is kept whole left its motion by the score's rule, or ended before it, s; ()
+    where it did not."""
+    r, recording = evaluation.rollouts, evaluation.recordings[index]
+    row, frames = recording.row, len(recording.qpos)
+    least = None if r.ref_min_height is None else r.ref_min_height[row : row + 1]
+    found = success(
+        r.pos[row : row + 1, :frames], r.ref_pos[row : row + 1, :frames], torch.tensor([frames]),
+        evaluation.card.succ_rule, root=r.root, ref_min_height=least, bodies=r.rule_bodies,
+    )  # fmt: skip
+    first = int(found.first_fail[0])
+    if first < 0 and not bool(r.reached_end[row]):
+        first = frames - 1
+    return () if first < 0 else (first / r.fps,)
 
 
 def _helps(rollouts: RolloutSet, row: int, frames: int) -> tuple[np.ndarray, ...]:

@@ -150,7 +150,9 @@ def write(
     )
     said += tuple(p.sentence() for p in t.parts) or failures
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
-    done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys)
+    done = deliver(
+        t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s
+    )
     (out / FILE).unlink(missing_ok=True)
     if t.simulation is not None:
         t.simulation.save(out / FILE)
