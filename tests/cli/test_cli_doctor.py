@@ -34,6 +34,14 @@ def said(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
     return out
 
 
+def test_a_rest_pose_for_other_tools(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    target = tmp_path / "rested.bvh"
+    facts = json.loads(said(capsys, "doctor", WALK, "--rest-pose", "-o", target, "--json"))["result"]
+    assert "The rest pose is a T-pose now" in facts["fixed"]["rest_pose"]
+    assert facts["fixed"]["frames"] == facts["frames"]
+    assert "rest pose: T-pose" in said(capsys, "info", target)
+
+
 def test_a_clean_clip_is_told_to_be_clean(capsys: pytest.CaptureFixture[str]) -> None:
     assert said(capsys, "doctor", WALK) == f"{WALK}: nothing wrong was found.\n"
 
@@ -83,6 +91,7 @@ def test_a_clean_clip_is_written_as_it_was_read(tmp_path: Path, capsys) -> None:
 def test_mistakes_are_refused(refused, broken: Path, tmp_path: Path) -> None:
     refused("doctor", broken, "--fix", words=("--fix needs -o OUT",))
     refused("doctor", broken, "-o", "x.bvh", words=("-o OUT needs --fix",))
+    refused("doctor", broken, "--rest-pose", words=("--rest-pose needs -o OUT",))
     refused("doctor", "--fix", words=("no clip was given",))
     refused("doctor", broken, "--fix", "-o", broken, words=("over itself",))
     refused("doctor", broken, "--fix", "-o", tmp_path / "a.xyz", words=("'.xyz'", ".bvh"))

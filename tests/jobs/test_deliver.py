@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,9 @@ import pytest
 import torch
 
 from poise.eval import Recording
-from poise.jobs.deliver import deliver, simulated_clip
+from poise.jobs.deliver import deliver, finished, floor_of, lost_at, simulated_clip
 from poise.jobs.runs import Evaluation, evaluate
-from poise.motion import Clip, ClipLibrary, read_clip
+from poise.motion import Clip, ClipLibrary, ground_shift, read_clip
 from poise.recipes import ResidualForce, build
 from toy_human import swing
 
@@ -55,6 +56,23 @@ def test_a_library_and_a_cycle_are_delivered_clip_by_clip():
     assert [(o.name, o.frames) for o in outs] == [("walk", 61), ("once", 31)]
 
 
+@dataclass(frozen=True)
+class Card:
+    delivered: tuple = ()
+
+
+@pytest.mark.parametrize("height", [0.0, 0.07, -0.4])
+def test_the_written_motion_is_as_high_as_its_source(height: float):
+    low, high = swing(0.5, 60.0, name="low"), ground_shift(swing(0.5, 60.0, name="high"), height)
+    imitation, evaluation = played(low, high)
+    done = finished(imitation, replace(evaluation, card=Card()), hold=False)  # type: ignore[arg-type]
+    for source in (low, high):
+        out = done.clips[f"simulated_{source.name}"]
+        assert np.abs(out.positions() - source.positions()).max() < 0.02
+    told = [note for note in done.notes if note.startswith("high") and "as high as the source" in note]
+    assert len(told) == 1 and f"{round(1000 * floor_of(imitation, 1)):+d} mm" in told[0]
+
+
 class Nothing:
     """A policy that asks for nothing."""
 
@@ -86,11 +104,18 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     evaluation = evaluate(imitation, policy, {})  # type: ignore[arg-type]
     raw = simulated_clip(imitation, evaluation)
     done = deliver(imitation, evaluation, tmp_path / "raw", {}, tmp_path / "raw.npz", hold=False)
-    assert done.card.delivered == () and done.notes == ()
-    assert np.abs(read_clip(tmp_path / "raw.npz").positions() - raw.positions()).max() < 1e-9
+    assert done.card.delivered == () and not any("held" in note for note in done.notes)
+    off = read_clip(tmp_path / "raw.npz").positions() - raw.positions()
+    assert np.abs(off - [0, 0, floor_of(imitation)]).max() < 1e-9
     done = deliver(imitation, evaluation, tmp_path / "held", {})
     (figures,) = json.loads((tmp_path / "held/score.json").read_text())["delivered"]
     assert figures["delivered"]["penetration_mm"] <= figures["simulated"]["penetration_mm"] + 0.1
+    # It is on its motion for so short a time; where it is taken away from there, that is told.
+    r = evaluation.rollouts
+    away = r.pos.clone()
+    away[evaluation.recordings[0].row, 9:] += 1.0
+    assert lost_at(evaluation) == ()
+    assert lost_at(replace(evaluation, rollouts=replace(r, pos=away))) == (9 / r.fps,)
     assert set(figures) == {
         "clip", "held_mean_mm", "held_max_mm", "source", "simulated", "delivered"
     }  # fmt: skip

@@ -22,7 +22,7 @@ from poise.jobs.track.placement import home, place
 from poise.jobs.track.points import points_of
 from poise.jobs.tracker import Tracker
 from poise.kin.hinges import within_turns
-from poise.motion import Clip, Skeleton, read_clip
+from poise.motion import Clip, Skeleton, ground_shift, read_clip
 from poise.motion.io.raw import ReadOptions as Options
 from poise.motion.joint_map import map_joints
 from poise.motion.keypoints import Keypoints
@@ -130,6 +130,15 @@ def test_the_reference_on_the_body_comes_home_as_it_was(tracker: Tracker, tmp_pa
     assert off.mean() < 0.05
     # A joint that the body lacks moves as in the source.
     assert np.ptp(back.root_pos[:, 0]) == pytest.approx(np.ptp(source.root_pos[:, 0]), rel=0.05)
+
+
+def test_what_is_delivered_is_as_high_as_its_source(tracker: Tracker, tmp_path: Path) -> None:
+    source = ground_shift(swing(0.5, 60.0, scale=1.1), 0.3)
+    tracked = track(source, tracker, controller="policy")
+    # The character begins as the motion does.
+    for out in (tracked.delivered(hold=False), tracked.clip):
+        assert abs(float(out.root_pos[0, 2] - source.root_pos[0, 2])) < 0.03
+    assert tracked.motion().root_pos[0, 2] < source.root_pos[0, 2] - 0.1
 
 
 def test_another_skeleton_gets_its_own_back(tracker: Tracker, tmp_path: Path) -> None:

@@ -27,6 +27,8 @@ _FLAGS = (
     "--disable-component-update", "--disable-sync", "--virtual-time-budget=4000", "--dump-dom",
 )  # fmt: skip
 
+_BOX = (Shape(0, "box", (0.2, 0.2, 0.2), (1.0, 0.0, 0.2)),)
+
 # Pauses, seeks by a click in the middle of the strip, steps two frames on, overlays, and notes it.
 _PROBE = """<script>
 addEventListener("load", () => setTimeout(() => {
@@ -46,6 +48,8 @@ addEventListener("load", () => setTimeout(() => {
   note("now-frame");
   key("o");
   note("over", "aria-pressed");
+  key("l");
+  note("now-frame");
   document.documentElement.dataset.seen = seen.join("|");
 }, 300));
 </script></body>"""
@@ -55,7 +59,12 @@ addEventListener("load", () => setTimeout(() => {
 @pytest.mark.parametrize(
     ("view", "extra", "suffix", "changes"),
     [
-        ("webgl", (), "", {"things": (Shape(0, "box", (0.2, 0.2, 0.2), (1.0, 0.0, 0.2)),)}),
+        (
+            "webgl",
+            (),
+            "",
+            {"things": (Shape(0, "box", (0.2, 0.2, 0.2), (1.0, 0.0, 0.2)),), "lost": (1.2,)},
+        ),
         ("2d", ("--disable-3d-apis",), "", {}),
         (
             "2d",
@@ -67,7 +76,7 @@ addEventListener("load", () => setTimeout(() => {
                 "contacts": None,
                 "score": {},
                 "curve": {},
-                "things": (Shape(0, "box", (0.2, 0.2, 0.2), (1.0, 0.0, 0.2)),),
+                "things": _BOX,
             },
         ),
     ],
@@ -90,4 +99,6 @@ def test_page_runs_in_chromium(
     assert f'data-view="{view}"' in root[0]
     over = "false" if "overlaid" in suffix else "true"
     seen = re.search(r'data-seen="([^"]*)"', root[0])
-    assert seen and seen[1] == f"Play|21 / 41|23 / 41|{over}", root[0]
+    # A second before the loss, or where it was.
+    at = "7 / 41" if "lost" in changes else "23 / 41"
+    assert seen and seen[1] == f"Play|21 / 41|23 / 41|{over}|{at}", root[0]

@@ -52,6 +52,15 @@ def test_page_has_every_section_and_figure():
     assert "{{" not in re.sub(r"<script>.*?</script>", "", page, flags=re.S)
 
 
+def test_where_a_motion_is_lost_is_said_and_marked():
+    page = render(make_report(41, lost=(0.5, 1.2, 9.0)))
+    assert '<span class="lost">Lost at 0.5 s, 1.2 s.</span>' in page
+    assert '"lost":[0.5,1.2]' in page and "where it is lost" in page
+    page = render(make_report(400, lost=tuple(k / 10 for k in range(1, 11))))
+    assert "0.8 s and 2 more times." in page
+    assert '<span class="lost">' not in render(make_report(41))
+
+
 def test_forces_at_their_points_and_others_in_the_world():
     plain = make_report(FRAMES)
     rows = tuple(np.arange(6.0 * k).reshape(k, 6) for k in (0, 2, 1))

@@ -51,6 +51,9 @@ class Options:
     """A motion file or a folder of them: sliding, floating, penetration, jumps, flips, jitter, bones."""
     fix: Flag = False
     """Mend what kinematics can mend, and write the result to OUT."""
+    rest_pose: Flag = False
+    """Write it with a rest pose that other tools understand: a T-pose with all rotations at zero. The
+    motion stays; without --fix nothing else is changed."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """The mended motion on the same skeleton; its suffix names the format. For a folder a folder."""
     force: Flag = False
@@ -74,7 +77,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
         with contextlib.nullcontext() if folder is None else claimed(folder):
             return each("doctor", (options.clip,), folder, one)
-    if options.fix or options.out is not None:
+    if options.fix or options.rest_pose or options.out is not None:
         raise PoiseError("no clip was given", hint="Write poise doctor CLIP --fix -o OUT")
     checks = [check() for check in CHECKS]
     ready = all(c.state != "missing" for c in checks)

@@ -32,13 +32,14 @@ ROWS = 6
 
 def run_on(path: Path, options: Options) -> Answer:
     """Examines, mends and writes where asked to; exit code 0 whatever was found."""
-    fix, target = options.fix, options.out
+    fix, rest, target = options.fix, options.rest_pose, options.out
     from poise.kin import examine, heal
     from poise.motion.io import check_writable, write_clip
 
-    if fix != (target is not None):
-        hint = f"Write poise doctor {path} --fix -o OUT"
-        raise PoiseError("--fix needs -o OUT" if fix else "-o OUT needs --fix", hint=hint)
+    if (fix or rest) != (target is not None):
+        asked = "--fix" if fix or not rest else "--rest-pose"
+        hint = f"Write poise doctor {path} {asked} -o OUT"
+        raise PoiseError(f"{asked} needs -o OUT" if fix or rest else "-o OUT needs --fix", hint=hint)
     if target is not None:
         check_writable(target)
         may_write(target, options.force, path)
@@ -50,12 +51,24 @@ def run_on(path: Path, options: Options) -> Answer:
     outcome = f"{len(found.faults)} faults"
     if target is None:
         return Answer(facts, outcome=outcome)
-    healed = heal(clip)
-    write_clip(healed, target)
+    healed = heal(clip) if fix else clip
+    written, said = healed, ""
+    if rest:
+        from poise.kin import with_rest_pose
+
+        written, found_from, turned = with_rest_pose(healed)
+        frames = f"joints' frames turned by {turned:.0f} degrees"
+        said = f"The rest pose is a T-pose now ({found_from}); {frames}."
+    write_clip(written, target)
     left = examine(healed)
     moved = _root_moved(clip, healed)
     facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
     facts["fixed"]["root_moved"] = moved
+    if rest:
+        facts["fixed"]["rest_pose"] = said
+        say(said)
+    if not fix:
+        return Answer(facts, {"clip": target}, outcome=outcome)
     _compare(found, left)
     if moved is not None and moved["max_mm"] >= 10.0:
         say(

@@ -12,7 +12,8 @@ import torch
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
 from poise.kin import hold_feet, lowest_height, qpos_to_clip
-from poise.motion import Clip, resample
+from poise.metrics import success
+from poise.motion import Clip, ground_shift, resample
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
 from poise.sim.props import Box
@@ -24,7 +25,7 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
     """The simulated motion of clip `index` on its own skeleton, at the clip's own frame rate.
 
     The simulation runs at the control rate; the clip is resampled to the source's rate so that it
-    drops into the place of the original, at the same height above the floor.
+    drops into the place of the original. Its floor is at z = 0, see `as_high_as_source`.
     """
     recording = evaluation.recordings[index]
     source = imitation.library.clips[recording.clip]
@@ -48,6 +49,17 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
     return out.replaced(root_pos=out.root_pos[tail], rot=out.rot[tail])
 
 
+def floor_of(imitation: Imitation, index: int = 0) -> float:
+    """z (m) of the floor that clip `index` stands on in its own file, as it was found."""
+    fits = imitation.report.clips
+    return -fits[index].ground.lift_m if index < len(fits) else 0.0
+
+
+def as_high_as_source(clip: Clip, imitation: Imitation, index: int = 0) -> Clip:
+    """A simulated motion, which stands on z = 0, at the height of clip `index` in its own file."""
+    return ground_shift(clip, floor_of(imitation, index))
+
+
 @dataclass(frozen=True, eq=False)
 class Delivery:
     """What an evaluation gives a user.
@@ -66,7 +78,8 @@ class Delivery:
 
 
 def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) -> Delivery:
-    """The simulated motion of every clip, its standing feet held to the spot; see `deliver`."""
+    """The simulated motion of every clip, its standing feet held to the spot, as high as its source; see
+    `deliver`."""
     clips: dict[str, Clip] = {}
     figures, notes = [], []
     for k, recording in enumerate(evaluation.recordings):
@@ -77,7 +90,8 @@ def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) ->
             clip, found = _held(imitation, evaluation, recording.clip, clip)
             figures.append(found)
             notes += _sentences(found)
-        clips[name] = clip
+        clips[name] = as_high_as_source(clip, imitation, recording.clip)
+        notes += _floor_told(imitation, recording.clip)
     return Delivery(clips, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
 
 
@@ -91,6 +105,7 @@ def deliver(
     source: Clip | None = None,
     said: tuple[str, ...] = (),
     keys: tuple[int, ...] = (),
+    lost: tuple[float, ...] | None = None,
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`.
 
@@ -106,6 +121,7 @@ def deliver(
         source: see `make_report`.
         said: sentences that the report begins with.
         keys: frames of the source that stay visible in the report.
+        lost: s, when the first clip was lost; by default as the score's rule judges its episode.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
@@ -119,6 +135,7 @@ def deliver(
     report = make_report(imitation, replace(evaluation, card=done.card), curve, source)
     frames = tuple(round(k / (source or imitation.library.clips[0]).fps * report.fps) for k in keys)
     report = replace(report, notes=(*said, *report.notes, *done.notes), keys=frames)
+    report = report if lost is None else replace(report, lost=lost)
     write_report(report, paths["report"])
     return replace(done, paths=paths)
 
@@ -137,10 +154,20 @@ def _held(
     found: dict[str, Any] = {"clip": source.name}
     found |= {"held_mean_mm": moved.mean_mm, "held_max_mm": moved.max_mm}
     if r.shapes is not None and r.feet:
-        ground = -imitation.report.clips[index].ground.lift_m
+        ground = floor_of(imitation, index)
         of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
         found |= {name: clip_figures(c, joints, r.shapes, r.feet, floor) for name, c, floor in of}
     return held, found
+
+
+def _floor_told(imitation: Imitation, index: int) -> list[str]:
+    floor = round(floor_of(imitation, index) * 1000)
+    if not floor:
+        return []
+    return [
+        f"{imitation.library.clips[index].name}: the written motion stands as high as the source, on a "
+        f"floor at {floor:+d} mm. Reading it with --ground auto puts that floor at 0."
+    ]
 
 
 def _sentences(found: dict[str, Any]) -> list[str]:
@@ -213,6 +240,7 @@ def make_report(
             for other in (evaluation.recordings[1:] if evaluation.together else ())
         ),
         pushed=pushed,
+        lost=lost_at(evaluation),
         pushes=recording.contacts if len(recording.contacts) == frames else (),
         things=tuple(
             Shape(0, "box", (p.size[0] / 2, p.size[1] / 2, p.size[2] / 2), p.pos, p.quat)
@@ -220,6 +248,22 @@ def make_report(
             if isinstance(p, Box)
         ),
     )
+
+
+def lost_at(evaluation: Evaluation, index: int = 0) -> tuple[float, ...]:
+    """When an episode that is kept whole left its motion by the score's rule, or ended before it, s; ()
+    where it did not."""
+    r, recording = evaluation.rollouts, evaluation.recordings[index]
+    row, frames = recording.row, len(recording.qpos)
+    least = None if r.ref_min_height is None else r.ref_min_height[row : row + 1]
+    found = success(
+        r.pos[row : row + 1, :frames], r.ref_pos[row : row + 1, :frames], torch.tensor([frames]),
+        evaluation.card.succ_rule, root=r.root, ref_min_height=least, bodies=r.rule_bodies,
+    )  # fmt: skip
+    first = int(found.first_fail[0])
+    if first < 0 and not bool(r.reached_end[row]):
+        first = frames - 1
+    return () if first < 0 else (first / r.fps,)
 
 
 def _helps(rollouts: RolloutSet, row: int, frames: int) -> tuple[np.ndarray, ...]:

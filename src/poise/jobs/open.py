@@ -159,10 +159,13 @@ class Run:
         return evaluate(self.task, *self.trained, starts=starts)
 
     def clip(self, clip: int | str = 0) -> Clip:
-        """The simulated motion of one of the run's clips on the skeleton that it came on."""
-        from poise.jobs.deliver import simulated_clip
+        """The simulated motion of one of the run's clips on the skeleton that it came on, as high as
+        there."""
+        from poise.jobs.deliver import as_high_as_source, simulated_clip
 
-        return simulated_clip(self.task, self.episode(clip))
+        episode = self.episode(clip)
+        made = simulated_clip(self.task, episode)
+        return as_high_as_source(made, self.task, episode.recordings[0].clip)
 
     def transitions(
         self,

@@ -23,6 +23,7 @@ from poise.kin.limbs import limb_of, match_positions, two_bone
 from poise.kin.place import place_on_body
 from poise.kin.retarget.own_body import onto_own, own_body
 from poise.kin.retarget.report import RetargetReport
+from poise.kin.retarget.rest_pose import Rested, with_rest_pose
 from poise.kin.retarget.transfer import RetargetConfig, retarget
 from poise.kin.solids import lowest_height
 
@@ -34,6 +35,7 @@ __all__ = [
     "IkBody",
     "IkConfig",
     "Kinematics",
+    "Rested",
     "RetargetConfig",
     "RetargetReport",
     "analytic_ik",
@@ -71,4 +73,5 @@ __all__ = [
     "support_of",
     "swap_sides",
     "two_bone",
+    "with_rest_pose",
 ]

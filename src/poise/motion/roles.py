@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -118,10 +119,11 @@ def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> R
 
     Names say most; of names that can be read in several ways ("LeftShoulder" is a clavicle for Mixamo
     and an upper arm for Xsens) the reading is taken that makes most of the whole limb. What carries both
-    legs is the pelvis, what lies between it and the arms the spine.
+    legs is the pelvis, what lies between it and the arms the spine. A file that states the parts of its
+    joints, as VRM does, is believed.
 
     Args:
-        stated: roles known beforehand, by joint name; they overrule all guesses.
+        stated: roles known beforehand, by joint name; they overrule all guesses, and the file.
 
     Returns:
         all roles that were found; a skeleton may lack any of them (see `Roles.require`).
@@ -137,13 +139,26 @@ def find_roles(skeleton: Skeleton, stated: Mapping[str, str] | None = None) -> R
                 f"both '{taken[role]}' and '{skeleton.names[joint]}' were stated to be {role}"
             )
         taken[role] = skeleton.names[joint]
-    finder = _Finder(skeleton, fixed)
+    written = {
+        joint: role
+        for joint, role in _written(skeleton).items()
+        if joint not in fixed and role not in taken
+    }
+    finder = _Finder(skeleton, fixed, written)
     finder.find()
     maker, count = convention_of(skeleton.names)
     evidence = f"{count} of {len(skeleton)} joints bear the names of {maker}" if maker else ""
     return Roles(
         skeleton, finder.rows(), maker, evidence or "the names follow no convention that is known"
     )
+
+
+def _written(skeleton: Skeleton) -> dict[int, str]:
+    """Roles that the file states, by joint; such of joints that are gone are left out."""
+    text = dict(skeleton.source.extra).get("roles")
+    stated: dict[str, str] = json.loads(text) if text else {}
+    at = {name: j for j, name in enumerate(skeleton.names)}
+    return {at[name]: role for name, role in stated.items() if name in at}
 
 
 #: A score, and (kind of part, joint) pairs.
@@ -153,8 +168,8 @@ _Reading = tuple[float, tuple[tuple[str, int], ...]]
 class _Finder:
     """Collects roles; limbs first, since what they hang on tells pelvis and chest."""
 
-    def __init__(self, skeleton: Skeleton, fixed: Mapping[int, str]) -> None:
-        self.skeleton, self.fixed = skeleton, fixed
+    def __init__(self, skeleton: Skeleton, said: Mapping[int, str], written: Mapping[int, str]) -> None:
+        self.skeleton, self.said, self.fixed = skeleton, said, {**written, **said}
         self.words = [name_words(name) for name in skeleton.names]
         self.lengths = np.linalg.norm(skeleton.offsets, axis=-1)
         self.found: dict[str, Role] = {}
@@ -162,7 +177,8 @@ class _Finder:
 
     def find(self) -> None:
         for joint, role in self.fixed.items():
-            self._add(role, joint, 1.0, "you said so")
+            who = "you said so" if joint in self.said else "the file's VRM bones say so"
+            self._add(role, joint, 1.0, who)
         limbs = {(side, kinds): self._limb(side, kinds) for side in SIDES for kinds in (LEG, ARM)}
         for (side, _), limb in limbs.items():
             for kind, joint in limb.items():

@@ -102,6 +102,7 @@ class Report:
             are drawn in place of `force`, which is their sum. () where the root alone is helped.
         others: other characters of the same body in the simulation's world.
         keys: frames of the reference that stay visible, such as keyframes.
+        lost: s, when the motion was lost; the replay marks it and leads there.
     """
 
     title: str
@@ -127,6 +128,7 @@ class Report:
     helps: tuple[np.ndarray, ...] = ()
     others: tuple[Track, ...] = ()
     keys: tuple[int, ...] = ()
+    lost: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fps) and self.fps > 0):
@@ -287,6 +289,7 @@ def payload(report: Report) -> dict[str, Any]:
         "pushes": _pushes(report.pushes),
         "pushed": report.pushed,
         "helps": _pushes(report.helps),
+        "lost": [t for t in report.lost if 0 <= t * report.fps < len(report.reference.pos)],
         "keys": [k for k in report.keys if 0 <= k < len(report.reference.pos)],
         "others": [encode_track(track) for track in report.others],
         "feet": foot_bodies(report.bodies),

@@ -14,6 +14,8 @@ from poise.view.verdict import grades, overall, sentence
 
 __all__ = ["Report", "Shape", "Track", "render", "write_report"]
 
+#: Losses that are named one by one.
+NAMED = 8
 _WORDS = {"good": "Good", "fair": "Fair", "poor": "Poor", "unknown": "Not fully judged"}
 
 
@@ -34,6 +36,8 @@ def render(report: Report) -> str:
         word=_WORDS[level],
         sentence=sentence(report.score),
         grades=grades(report.score),
+        lost=", ".join(f"{t:.1f} s" for t in data["lost"][:NAMED]),
+        more=max(0, len(data["lost"]) - NAMED),
         figures=figures(report),
         score=score_rows(report.score),
         notes=notes(report, data["reference"]["held"], data["simulated"]["held"]),

@@ -57,13 +57,15 @@ def supported(imitation: Imitation, supports: Sequence[Support]) -> Imitation:
 
 def on_body(supports: Sequence[Support], placed: Placed) -> tuple[Support, ...]:
     """Supports that were stated beside the motion that came in, in the world of the body, which is as
-    much larger as the body, about where the motion begins."""
-    return _scaled(supports, placed, placed.moved.scale if placed.moved else 1.0)
+    much larger as the body, about where the motion begins, and has its floor at z = 0."""
+    scaled = _scaled(supports, placed, placed.moved.scale if placed.moved else 1.0)
+    return _raised(scaled, placed.report.clips[0].ground.lift_m)
 
 
 def at_home(supports: Sequence[Support], placed: Placed) -> tuple[Support, ...]:
     """Supports beside the motion on the skeleton that came in."""
-    return _scaled(supports, placed, 1.0 / placed.moved.scale if placed.moved else 1.0)
+    lowered = _raised(supports, -placed.report.clips[0].ground.lift_m)
+    return _scaled(lowered, placed, 1.0 / placed.moved.scale if placed.moved else 1.0)
 
 
 def write_supports(supports: Sequence[Support], clip: Clip, out: Path, motion: Path) -> dict[str, Path]:
@@ -89,6 +91,10 @@ def _scaled(supports: Sequence[Support], placed: Placed, scale: float) -> tuple[
         )
         for s in supports
     )
+
+
+def _raised(supports: Sequence[Support], height: float) -> tuple[Support, ...]:
+    return tuple(replace(s, pos=(s.pos[0], s.pos[1], s.pos[2] + height)) for s in supports)
 
 
 def _check_start(imitation: Imitation) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.eval import ScoreCard
-from poise.jobs.deliver import Delivery, deliver, finished, simulated_clip
+from poise.jobs.deliver import Delivery, as_high_as_source, deliver, finished, simulated_clip
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
 from poise.jobs.track.missing import shortfalls
@@ -99,10 +99,12 @@ class Tracked(Result):
         return self.delivered()
 
     def delivered(self, character: int = 0, hold: bool = True) -> Clip:
-        """A character's motion on the skeleton that came in. hold: standing feet are held."""
+        """A character's motion on the skeleton that came in, as high as there. hold: standing feet are
+        held."""
         made = self.motion(character)
         if hold:
             made = hold_feet(made, self.imitation.humanoid.table)[0]
+        made = as_high_as_source(made, self.imitation)
         if self.placed.moved is not None:
             made = home(made, self.placed, self.tracker).replaced(name=made.name)
         return pinned(made, self.pins) if hold and self.pins else made
@@ -114,7 +116,7 @@ class Tracked(Result):
         return write(self, folder).paths
 
     def motion(self, character: int = 0) -> Clip:
-        """The simulated motion on the body's skeleton, as it was simulated."""
+        """The simulated motion on the body's skeleton, as it was simulated, on the floor z = 0."""
         return simulated_clip(self.imitation, self.evaluation, character)
 
 
@@ -148,7 +150,9 @@ def write(
     )
     said += tuple(p.sentence() for p in t.parts) or failures
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
-    done = deliver(t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys)
+    done = deliver(
+        t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s
+    )
     (out / FILE).unlink(missing_ok=True)
     if t.simulation is not None:
         t.simulation.save(out / FILE)

@@ -90,7 +90,7 @@ def _rate(clip: Clip, support: Support | None, why: str) -> Guess:
 
 
 def _rest(clip: Clip, anatomy: Anatomy) -> Guess:
-    override = "none: body and reach come from bone lengths and the motion"
+    override = "nothing needs it; for other tools poise doctor CLIP --rest-pose -o OUT makes a T-pose"
     dropped = next((n for n in clip.skeleton.source.notes if "rest pose that was put" in n), "")
     more = f"; {dropped[0].lower()}{dropped[1:]}" if dropped else ""
     if not anatomy.parts:

@@ -85,7 +85,7 @@ READERS = (
     Reader("BVH", (".bvh",), _looks_like_bvh, read_bvh),
     Reader("ASF", (".asf",), looks_like_asf, refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
-    Reader("glTF", (".glb", ".gltf"), _looks_like_gltf, read_gltf),
+    Reader("glTF", (".glb", ".gltf", ".vrm", ".vrma"), _looks_like_gltf, read_gltf),
     Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL, Kimodo, keypoints or Poise", (".npz",), looks_like_npz, read_npz),

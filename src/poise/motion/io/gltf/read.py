@@ -13,6 +13,7 @@ from poise.motion.clip import Clip, check_poses
 from poise.motion.io.gltf.file import GltfFile, load_gltf
 from poise.motion.io.gltf.tracks import Take, Track, choose_take
 from poise.motion.io.gltf.tree import Tree, choose_joints, read_tree
+from poise.motion.io.gltf.vrm import humanoid_of
 from poise.motion.io.nodes import base_of, checked_unit, even, rigid_bones, unique_names
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_VALUE
@@ -88,6 +89,8 @@ def _raw_motion(
         notes,
     )
     own = take.extras
+    stated = {names[j]: role for j, role in humanoid_of(file, tree, joints).items()}
+    extra = (("roles", json.dumps(stated)),) if stated else ()
     kept = {
         "above": [
             [tree.names[n], place[n][0].tolist(), turn[n][0].tolist(), scale[n].tolist()] for n in above
@@ -117,7 +120,7 @@ def _raw_motion(
         cyclic=own.get("cyclic") is True,
         notes=tuple(notes),
         strays=bones.strays,
-        extra=(("gltf", json.dumps(kept)),),
+        extra=(("gltf", json.dumps(kept)), *extra),
         whole="fps" in own,
     )
 

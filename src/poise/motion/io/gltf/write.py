@@ -62,7 +62,8 @@ def write_gltf(clip: Clip, path: str | Path, boxes: Sequence[SceneBox] = ()) -> 
     A clip that came from glTF gets back its nodes above the root, scales, rest pose, unit and the
     name of its animation; any other is in metres. Always Y up. A skin binds a figure of slim
     octahedra to the joints, so that viewers show the motion at once. Keys stand at the clip's own
-    frames; bone tips, the exact frame rate and `cyclic` are kept in `extras`.
+    frames; bone tips, the exact frame rate and `cyclic` are kept in `extras`. The figure hangs on the
+    joint that travels, so that viewers, which know its bounds in one frame alone, do not lose it.
 
     Args:
         boxes: what stands beside the motion, each a node with a mesh.
@@ -170,7 +171,7 @@ def _document(clip: Clip, plan: _Plan, boxes: Sequence[SceneBox]) -> tuple[dict[
     _add_nodes(out.doc["nodes"], clip, plan)
     _add_figure(out, clip, plan)
     _add_animation(out, clip, plan)
-    tops = [0, len(out.doc["nodes"]) - 1]
+    tops = [0]
     for box in boxes:
         tops.append(len(out.doc["nodes"]))
         _add_box(out, box, plan)
@@ -268,7 +269,11 @@ def _add_figure(out: _Document, clip: Clip, plan: _Plan) -> None:
     out.doc["skins"] = [skin]
     out.doc["materials"] = [{"name": "Poise", "pbrMetallicRoughness": look}]
     out.doc["meshes"] = [{"name": "Figure", "primitives": [primitive]}]
-    out.doc["nodes"].append({"name": "Figure", "mesh": 0, "skin": 0})
+    nodes = out.doc["nodes"]
+    nodes.append({"name": "Figure", "mesh": 0, "skin": 0})
+    # The transforms above a skinned mesh do not move its vertices, only where viewers look for it.
+    travels = max(plan.paths, key=lambda j: float(np.ptp(plan.paths[j], axis=0).max()))
+    nodes[first + travels].setdefault("children", []).append(len(nodes) - 1)
 
 
 def _add_box(out: _Document, box: SceneBox, plan: _Plan) -> None:
