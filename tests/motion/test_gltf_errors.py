@@ -365,3 +365,9 @@ def test_damaged_files(tmp_path: Path) -> None:
             assert all(c.isprintable() for c in message), message
         assert time.perf_counter() - start < 5.0
     assert 20 < read < 380
+
+
+def test_an_address_too_long_for_any_file_is_refused(tmp_path: Path) -> None:
+    file = changed(lambda d: d["buffers"][0].update(uri="x" * 5000))
+    (tmp_path / "a.gltf").write_text(json.dumps(file.doc))
+    assert "buffer 0" in refusal(tmp_path / "a.gltf")
