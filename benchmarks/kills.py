@@ -1,10 +1,11 @@
 """Trainings that are killed (-9) at random moments and gone on with: do they end as ones that were not?
 
-python benchmarks/kills.py --kills 50 --json benchmarks/kills.json
+python benchmarks/kills.py --kills 50 --minutes 10 --seed 1 --json benchmarks/kills.json
 
 Each recipe trains a miniature once without a kill. Then the same command is started, killed after a
 random time and started again with --resume, up to three times a run, and goes on to its end. Every file
-that a run leaves is compared bit for bit; only clocks may differ.
+that a run leaves is compared bit for bit; only clocks may differ. Another call with another seed adds to
+the figures.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ WALK = Path(poise.__file__).parent / "data/walk.bvh"
 MOST = 3
 #: Where a state keeps its clock: the tensor, and the number in it.
 CLOCKS = {"trainer/counters": 2, "counters": 1}
+
+#: Names in JSON of clocks and of sums over them. "begun" is when a stage began, in samples and seconds.
+_CLOCKS = ("seconds", "crc32", "minutes", "begun")
 
 
 def miniature(folder: Path) -> None:
@@ -145,7 +149,7 @@ def end_of(out: Path) -> dict[str, Any]:
 def timeless(data: Any) -> Any:
     """JSON without clocks, and without the sum over the tensors, which hold one."""
     if isinstance(data, dict):
-        kept = {k: v for k, v in data.items() if k not in ("seconds", "crc32", "minutes")}
+        kept = {k: v for k, v in data.items() if k not in _CLOCKS}
         return {k: timeless(v) for k, v in kept.items()}
     return [timeless(v) for v in data] if isinstance(data, list) else data
 
@@ -177,24 +181,29 @@ def killed(argv: list[str], out: Path, log: Path, seconds: float, rng: random.Ra
     return count
 
 
-def measure(recipe: str, kills: int, seed: int, save: Callable[[dict[str, Any]], None]) -> None:
-    """Runs of one recipe until so many kills were made."""
+def measure(
+    recipe: str, kills: int, seed: int, end: float, known: dict[str, Any], save: Callable[[], None]
+) -> None:
+    """Runs of one recipe until so many kills were made or the time is over; adds to what is known."""
     with tempfile.TemporaryDirectory() as folder:
         here, rng = Path(folder), random.Random(f"{recipe} {seed}")
         miniature(here)
         log, whole = here / "log.txt", here / "whole"
-        seconds = finished(command(recipe, here, whole), log, 600)
-        expected, done, runs, same, other = end_of(whole), 0, 0, 0, dict[str, int]()
-        while done < kills:
+        seconds = finished(command(recipe, here, whole), log, 900)
+        expected, done = end_of(whole), 0
+        known |= {"seconds_of_a_run": round(seconds, 1), "files": len(expected)}
+        while done < kills and time.monotonic() < end:
             out = here / "killed"
-            done += killed(command(recipe, here, out), out, log, seconds, rng)
+            count = killed(command(recipe, here, out), out, log, seconds, rng)
             differ = differences(expected, end_of(out))
             left = [p.name for p in out.rglob("*.partial")]
-            runs, same = runs + 1, same + (not differ and not left)
+            done += count
+            known["kills"] += count
+            known["runs"] += 1
+            known["same"] += not differ and not left
             for key in [*differ, *left]:
-                other[key] = other.get(key, 0) + 1
-            save({"kills": done, "runs": runs, "same": same, "seconds_of_a_run": round(seconds, 1),
-                  "files": len(expected), "differ": other})  # fmt: skip
+                known["differ"][key] = known["differ"].get(key, 0) + 1
+            save()
             shutil.rmtree(out)
 
 
@@ -203,20 +212,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--recipes", nargs="+", default=["imitate", "perpetual", "inbetween", "endless"])
     parser.add_argument("--kills", type=int, default=50, help="of each recipe, at least")
+    parser.add_argument("--minutes", type=float, default=600.0, help="of each recipe, at most")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    found: dict[str, Any] = {"seed": args.seed, "recipes": {}}
+    found: dict[str, Any] = {"seeds": [], "recipes": {}}
+    if args.json is not None and args.json.exists():
+        found = json.loads(args.json.read_text())
+    found["seeds"] = sorted({*found["seeds"], args.seed})
+
+    def save() -> None:
+        print(json.dumps(found["recipes"]), flush=True)
+        if args.json is not None:
+            args.json.write_text(json.dumps(found, indent=1) + "\n")
+
     for recipe in args.recipes:
-
-        def save(row: dict[str, Any], recipe: str = recipe) -> None:
-            found["recipes"][recipe] = row
-            print(recipe, json.dumps(row), flush=True)
-            if args.json is not None:
-                args.json.write_text(json.dumps(found, indent=1) + "\n")
-
-        measure(recipe, args.kills, args.seed, save)
+        row = found["recipes"].setdefault(recipe, {"kills": 0, "runs": 0, "same": 0, "differ": {}})
+        end = time.monotonic() + 60 * args.minutes
+        measure(recipe, args.kills, args.seed, end, row, save)
 
 
 if __name__ == "__main__":

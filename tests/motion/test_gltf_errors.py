@@ -365,3 +365,10 @@ def test_damaged_files(tmp_path: Path) -> None:
             assert all(c.isprintable() for c in message), message
         assert time.perf_counter() - start < 5.0
     assert 20 < read < 380
+
+
+def test_an_address_too_long_for_any_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.gltf").write_text(walker()[0].gltf("x" * 5000))
+    assert "buffer" in refusal(tmp_path / "a.gltf")
+    (tmp_path / "a.gltf").write_text(walker()[0].gltf("x" * 300))
+    assert "buffer" in refusal(tmp_path / "a.gltf")

@@ -174,7 +174,7 @@ class Training:
     device: Device = "cpu"
     """Where it runs: cpu, or cuda for an NVIDIA GPU (needs poise-motion[gpu])."""
     iterations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Stop after so many iterations as well; for tests."""
+    """Stop after so many iterations as well, and plan by them, not by the clock; for tests."""
     resume: Flag = False
     """Go on with the run that is in the folder."""
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None

@@ -17,7 +17,7 @@ A network with recovery is the same one as before, which goes on learning.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from poise.eval import ClipResults, RecoveryCard
@@ -186,3 +186,18 @@ def share_of(until: Until, iterations: int, samples: int, seconds: float) -> flo
         (seconds / 60, until.minutes), (iterations, until.iterations), (samples, until.samples)
     )  # fmt: skip
     return min(1.0, max(a / b if b else 1.0 for a, b in used if b is not None))
+
+
+def done_of(until: Until, iterations: int, samples: int, seconds: float) -> float:
+    """How much of the training is done, 0 to 1, by which its stages and what anneals are planned.
+
+    Where iterations or samples have a limit they alone are counted, so that no clock decides what is
+    learned: the same command, killed and resumed or not, ends with the same policy. Time then only ends
+    the training.
+    """
+    counts = (until.iterations, until.samples)
+    if until.minutes is None or counts == (None, None):
+        return share_of(until, iterations, samples, seconds)
+    if seconds >= 60 * until.minutes:
+        return 1.0
+    return share_of(replace(until, minutes=None), iterations, samples, seconds)

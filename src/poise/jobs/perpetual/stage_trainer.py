@@ -31,6 +31,7 @@ from poise.jobs.perpetual.stage_initialisation import (
 from poise.jobs.perpetual.stage_order import (
     Progress,
     Stage,
+    done_of,
     ends,
     first_recovers,
     following,
@@ -38,7 +39,6 @@ from poise.jobs.perpetual.stage_order import (
     lasts,
     most_help,
     primitives,
-    share_of,
 )
 from poise.jobs.perpetual.stage_record import StageRecord
 from poise.jobs.warm_start import TrainingCallbacks
@@ -135,7 +135,7 @@ class StageTrainer:
     @property
     def share(self) -> float:
         """How much of the whole training is done, 0 to 1."""
-        return share_of(self.until, self.iteration, self.trainer.samples, self.trainer.seconds)
+        return done_of(self.until, self.iteration, self.trainer.samples, self.trainer.seconds)
 
     @property
     def help(self) -> float:
@@ -163,7 +163,7 @@ class StageTrainer:
     @property
     def began(self) -> float:
         """The share of the whole training at which this stage began."""
-        return share_of(self.until, self.before, *self.begun)
+        return done_of(self.until, self.before, *self.begun)
 
     def policy(self) -> PolicyBundle:
         """The stage's policy that did best, or the present one before any was evaluated."""

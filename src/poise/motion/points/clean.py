@@ -10,6 +10,8 @@ SPIKE_M, SPIKE_TIMES, SPIKE_ACCELERATION = 0.05, 9.0, 100.0
 """A spike deviates from the median of its five frames by more than 5 cm, nine times the median deviation
 of the second around it, and what 100 m/s^2 would explain."""
 _HALF_WINDOW = 2
+#: Numbers in the windows of one piece of a running median.
+_PIECE = 2_000_000
 
 
 def drop_spikes(positions: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
@@ -23,17 +25,17 @@ def drop_spikes(positions: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarr
     if frames < 2 * _HALF_WINDOW + 1:
         return positions, spikes
     explained = 0.5 * SPIKE_ACCELERATION * (_HALF_WINDOW / fps) ** 2
-    for k in range(positions.shape[1]):
-        off = np.linalg.norm(positions[:, k] - _running_median(positions[:, k], _HALF_WINDOW), axis=-1)
-        usual = _running_median(off[:, None], max(_HALF_WINDOW, round(0.5 * fps)))[:, 0]
-        limit = np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
-        found = off > limit
-        # At the ends nothing tells a spike from a step.
-        found[:_HALF_WINDOW] = found[-_HALF_WINDOW:] = False
-        if found.any():
-            # In fast motion a spike bends the median beside it; what lies on the path of the rest stays.
-            path = fill(np.where(found[:, None], np.nan, positions[:, k]))
-            spikes[:, k] = found & (np.linalg.norm(positions[:, k] - path, axis=-1) > limit)
+    path = _running_median(positions.reshape(frames, -1), _HALF_WINDOW).reshape(positions.shape)
+    off = np.linalg.norm(positions - path, axis=-1)
+    usual = _running_median(off, max(_HALF_WINDOW, round(0.5 * fps)))
+    limit = np.maximum(max(SPIKE_M, explained), SPIKE_TIMES * usual)
+    found = off > limit
+    # At the ends nothing tells a spike from a step.
+    found[:_HALF_WINDOW] = found[-_HALF_WINDOW:] = False
+    for k in np.flatnonzero(found.any(0)):
+        # In fast motion a spike bends the median beside it; what lies on the path of the rest stays.
+        rest = fill(np.where(found[:, k, None], np.nan, positions[:, k]))
+        spikes[:, k] = found[:, k] & (np.linalg.norm(positions[:, k] - rest, axis=-1) > limit[:, k])
     out = positions.copy()
     out[spikes] = np.nan
     return out, spikes
@@ -45,13 +47,18 @@ def _running_median(x: np.ndarray, half: int) -> np.ndarray:
     padded = np.pad(x, ((half, half), (0, 0)), constant_values=np.nan)
     out = np.full_like(x, np.nan)
     # Long recordings go in pieces, so that the windows of one piece fit into little memory.
-    for start in range(0, len(x), 4096):
-        stop = min(start + 4096, len(x))
+    piece = max(1, _PIECE // (x.shape[1] * (2 * half + 1)))
+    for start in range(0, len(x), piece):
+        stop = min(start + piece, len(x))
         windows = np.lib.stride_tricks.sliding_window_view(
             padded[start : stop + 2 * half], 2 * half + 1, 0
         )
-        some = ~np.isnan(windows).all(-1)
-        out[start:stop][some] = np.nanmedian(windows[some], axis=-1)
+        # NaN is sorted to the end, so the known values of a window are its first `count`.
+        ordered = np.sort(windows, axis=-1)
+        count = (~np.isnan(windows)).sum(-1, keepdims=True)
+        low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, -1)
+        high = np.take_along_axis(ordered, np.minimum(count // 2, 2 * half), -1)
+        out[start:stop] = ((low + high) / 2)[..., 0]
     return out
 
 

@@ -190,7 +190,7 @@ def _beside(uri: str, index: int, path: Path) -> Path:
     folder = path.parent.resolve()
     try:
         target = (folder / name.replace("\\", "/")).resolve()
-        inside = target.is_relative_to(folder)
+        inside, there = target.is_relative_to(folder), target.exists()
     except (OSError, ValueError, RuntimeError):
         raise PoiseError(f"the address of buffer {index} names no file", path) from None
     if not inside:
@@ -199,7 +199,7 @@ def _beside(uri: str, index: int, path: Path) -> Path:
             path,
             "Put the buffer beside the file",
         )
-    if not target.exists():
+    if not there:
         raise PoiseError(
             f"its buffer file {shown(name)} is missing", path, "Put the buffer beside the file"
         )
