@@ -1,13 +1,12 @@
-"""Live motion: for how long, how late, with how short a buffer, and against strangers.
+"""Live motion: for how long, how late, and against strangers.
 
     python benchmarks/live.py endure --minutes 8 --data FOLDER --json benchmarks/live_endure.json
     python benchmarks/live.py loop --minutes 50 --data FOLDER --json benchmarks/live_loop.json
-    python benchmarks/live.py buffers --data FOLDER --clips 24 --json benchmarks/live_buffers.json
-    python benchmarks/live.py fuzz --count 100000 --json benchmarks/live_fuzz.json
     python benchmarks/live.py strangers --json benchmarks/live_strangers.json
 
-FOLDER holds motion files of persons (CMU for the first, Bandai for the second). Times are of the machine
-as it was: where others work on it they are upper bounds.
+FOLDER holds motion files of persons. Success by the length of the buffer, and torn messages:
+`live_buffers.py` and `live_fuzz.py`. Times are of the machine as it was: where others work on it they
+are upper bounds.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,23 +33,11 @@ from live_client import Sent, play, watch
 from speed import machine
 
 from poise.jobs.open import open_run
-from poise.live.commands import command, parse
-from poise.live.loop import Live, LiveConfig
-from poise.live.packet import Inbox
-from poise.live.sinks.vmc import datagram
+from poise.live.character import FALLS, RETURNS
+from poise.live.config import LiveConfig
+from poise.live.loop import Live
 from poise.live.sources.file import Loop, packet_of
-from poise.live.sources.stream import JsonStream
-from poise.live.sources.vmc import VmcSource
-from poise.live.vrm import standard
-from poise.metrics import success_rule
 from poise.motion import Clip, read_clip
-from poise.sim import difference
-
-BUFFERS = (0.0, 0.033, 0.1, 0.2, 0.4)
-#: s by which packets come late (deviation), and share of them that never come.
-LATE_S, LOST = 0.01, 0.02
-#: s of a clip that have come before its character is set down.
-FIRST_S = 0.5
 
 
 def serve(*argv: str) -> tuple[subprocess.Popen[str], str]:
@@ -129,18 +117,40 @@ def endure(
 
 
 def loop(
-    clips: Sequence[Clip], minutes: float, wall: float, seed: int, ahead: int, buffer: float
+    clips: Sequence[Clip], minutes: float, wall: float, seed: int, ahead: int, buffer: float, out: Path
 ) -> dict[str, Any]:
     """The same four people and faults by a clock of its own, which waits for nobody: the processor's
-    time of each step is that of the loop alone, however busy the machine is."""
+    time of each step is that of the loop alone, however busy the machine is. What it has come to is
+    written every simulated minute."""
     rng, now, sent = np.random.default_rng(seed), 0.0, Sent()
+    pool, began = ThreadPoolExecutor(1), time.monotonic()
     live = Live(
         open_run(None).tracker,
-        LiveConfig(4, buffer, ahead, seed=seed), clock=lambda: now,
+        LiveConfig(4, buffer, ahead, seed=seed), executor=pool, clock=lambda: now,
     )  # fmt: skip
     loops, quiet = [Loop(clips[k % len(clips)]) for k in range(4)], [0.0] * 4
-    spent, held, ends = list[float](), list[tuple[float, float]](), time.monotonic() + 60 * wall
-    while now < 60 * minutes and time.monotonic() < ends:
+    spent, held = list[float](), list[tuple[float, float]]()
+    since, longest = [0.0] * 4, 0.0
+
+    def told() -> dict[str, Any]:
+        last = live.figures()
+        return {
+            "machine": machine(), "simulated_minutes": round(now / 60, 1), "characters": 4, "seed": seed,
+            "wall_minutes": round((time.monotonic() - began) / 60, 1),
+            "clips": [loops[k].clip.name for k in range(4)],
+            "lookahead": ahead, "looked_ahead": last["looked_ahead"], "buffer_s": buffer,
+            "sent": sent.counts, "refused": last["refused"],
+            "step_cpu_ms": {
+                f"p{p}": round(float(np.percentile(spent, p)), 1) for p in (50, 90, 99, 99.9)
+            },
+            "resets": last["resets"], "longest_s_until_it_was_back": round(longest, 1),
+            "doing": [
+                {n: c[n] for n in ("doing", "lost", "falls", "recovered")} for c in last["characters"]
+            ],
+            "memory_mb": held,
+        }  # fmt: skip
+
+    while now < 60 * minutes and time.monotonic() - began < 60 * wall:
         frame = round(now * 30)
         for k in range(4):
             packet = packet_of(f"p{k}", loops[k], round(frame / 30 * loops[k].clip.fps))
@@ -164,160 +174,21 @@ def loop(
                 sent.add("swaps")
             live.inbox.offer(packet, now)
             sent.add("poses")
-        began = time.process_time()
+        step = time.thread_time()
         live.step(now)
-        spent.append(1000 * (time.process_time() - began))
+        spent.append(1000 * (time.thread_time() - step))
         now += 1 / 30
+        for k, character in enumerate(live.world.characters):
+            since[k] = since[k] + 1 / 30 if character.doing in (FALLS, RETURNS) else 0.0
+            longest = max(longest, since[k])
         if frame % 900 == 0:
             held.append((round(now), round(memory_mb(os.getpid()), 1)))
-    last = live.figures()
+        if frame % 1800 == 1799:
+            out.write_text(json.dumps(told(), indent=1) + "\n")
+    last = told()
     live.close()
-    return {
-        "machine": machine(), "simulated_minutes": round(now / 60, 1), "characters": 4,
-        "lookahead": ahead, "buffer_s": buffer, "sent": sent.counts, "refused": last["refused"],
-        "step_cpu_ms": {f"p{p}": round(float(np.percentile(spent, p)), 1) for p in (50, 90, 99)},
-        "resets": last["resets"],
-        "doing": [
-            {n: c[n] for n in ("doing", "lost", "falls", "recovered")} for c in last["characters"]
-        ],
-        "memory_mb": held,
-    }  # fmt: skip
-
-
-def streamed(live: Live, clip: Clip, seed: int) -> tuple[float | None, float]:
-    """The s at which a clip that is streamed is lost, None if it is not, and the mean error, mm."""
-    rng, loop, rate = np.random.default_rng(seed), Loop(clip), live.rate_hz
-    live.people.known.clear()
-    live.people.follows[0] = None
-    world, character = live.world, live.world.characters[0]
-    # The packets by when they come.
-    coming = sorted(
-        (k / clip.fps + abs(rng.normal(0.0, LATE_S)), k)
-        for k in range(clip.frames) if k < 2 or rng.uniform() > LOST
-    )  # fmt: skip
-    now, at, off = FIRST_S, 0, list[float]()
-    while at < len(coming) and coming[at][0] <= now:
-        live.inbox.offer(packet_of("x", loop, coming[at][1]), coming[at][0])
-        at += 1
-    live.people.add(live.inbox.take())
-    person = live.people.of(0)
-    if person is None or not person.ready() or person.onto is None:
-        raise SystemExit(f"{clip.name} cannot be followed")
-    # Set down where the goal is, moving as it does, with what is known ahead of it.
-    frames = list[torch.Tensor]()
-    for k in range(world.lead[0], -1, -1):
-        pose = person.buffer.read(now - (k - 1) / rate)
-        assert pose is not None
-        frames.append(torch.from_numpy(person.onto(pose.root_pos, pose.rot)))
-    world.set_on(frames[0][None], difference(frames[1][None], frames[0][None]) * rate)
-    for frame in frames[1:]:
-        world.goal.push(frame[None])
-    character.follow(frames[-1])
-    before = character.lost
-    while now < clip.seconds:
-        now += 1 / rate
-        while at < len(coming) and coming[at][0] <= now:
-            live.inbox.offer(packet_of("x", loop, coming[at][1]), coming[at][0])
-            at += 1
-        seen = live.step(now)
-        assert seen is not None
-        off.append(float(seen.off_m[0]) * 1000.0)
-        if character.lost > before or off[-1] > success_rule("phc").limit_m * 1000.0:
-            return now, float(np.mean(off))
-    return None, float(np.mean(off))
-
-
-def buffers(clips: Sequence[Clip], noises: Sequence[float], seed: int) -> dict[str, Any]:
-    """Success by the length of the buffer, the policy alone, without help."""
-    tracker, rows = open_run(None).tracker, list[dict[str, Any]]()
-    for noise in noises:
-        for length in BUFFERS:
-            clock = _Clock()
-            live = Live(tracker, LiveConfig(buffer_s=length, noise=noise, seed=seed), clock=clock)
-            done = [streamed(live, clip, seed + k) for k, clip in enumerate(clips)]
-            live.close()
-            won = [lost is None for lost, _ in done]
-            rows.append({
-                "buffer_ms": round(1000 * length), "noise": noise, "clips": len(clips),
-                "success": round(float(np.mean(won)), 3),
-                "off_mm": round(float(np.mean([e for lost, e in done if lost is None] or [0])), 1),
-                "lost": [c.name for c, w in zip(clips, won, strict=True) if not w],
-            })  # fmt: skip
-            print(rows[-1], flush=True)
-    how = f"30 Hz, packets {1000 * LATE_S:.0f} ms late (deviation), {100 * LOST:.0f} % lost"
-    return {"stream": how, "seed": seed, "clips": [c.name for c in clips], "rows": rows}
-
-
-class _Clock:
-    """A clock for times that nothing depends on."""
-
-    def __call__(self) -> float:
-        return 0.0
-
-
-def fuzz(count: int, seed: int) -> dict[str, Any]:
-    """Messages that are torn, swapped and made up, at each door; what is left must be a pose."""
-    rng, out = np.random.default_rng(seed), {}
-    skeleton = standard()
-    rot = np.tile([1.0, 0, 0, 0], (len(skeleton), 1))
-    whole = datagram(skeleton, np.array([0.0, 0, 0.8]), rot, 1.0)
-    told = {
-        "v": 1,
-        "type": "pose",
-        "person": "a",
-        "time": 1.0,
-        "root": [0, 0, 0.8],
-        "rotations": rot.tolist(),
-    }
-    pose = json.dumps(told).encode()
-    push = json.dumps(
-        {"v": 1, "type": "pull", "character": 0, "body": 1, "point": [0, 0, 0], "to": [0, 0, 1]}
-    )
-    doors = {"vmc": whole, "stream": pose, "commands": push.encode()}
-    for door, like in doors.items():
-        box = Inbox()
-        vmc = VmcSource("127.0.0.1", 0, box, lambda: 0.0) if door == "vmc" else None
-        stream = JsonStream(box)
-        s = skeleton
-        stream.receive(json.dumps({
-            "v": 1, "type": "skeleton", "person": "a", "names": s.names, "parents": s.parents,
-            "offsets": s.offsets.tolist(),
-        }), 0.0)  # fmt: skip
-        refused, began = 0, time.perf_counter()
-        for _ in range(count):
-            data = _torn(like, rng)
-            if vmc is not None:
-                vmc.receive(data, ("x", int(rng.integers(3))))
-            elif door == "stream":
-                stream.receive(data, 0.0)
-            else:
-                try:
-                    command(parse(data))
-                except Exception as problem:
-                    if type(problem).__name__ != "PoiseError":
-                        raise
-                    refused += 1
-            for line in box.take().values():
-                for _, packet in line:
-                    assert np.isfinite(packet.root_pos).all() and np.isfinite(packet.rot).all()
-        if vmc is not None:
-            vmc.close()
-        out[door] = {
-            "messages": count, "refused": refused or sum(box.refused.values()), "taken": box.received,
-            "reasons": dict(box.refused.most_common(8)),
-            "seconds": round(time.perf_counter() - began, 1),
-        }  # fmt: skip
-    return out
-
-
-def _torn(data: bytes, rng: np.random.Generator) -> bytes:
-    kind = rng.integers(4)
-    if kind == 0:
-        return rng.bytes(int(rng.integers(0, 200)))
-    out = bytearray(data if kind < 3 else data[: rng.integers(1, len(data))])
-    for at in rng.integers(0, len(out), rng.integers(0, 4)):
-        out[at] = rng.integers(256)
-    return bytes(out)
+    pool.shutdown()
+    return last
 
 
 def strangers() -> dict[str, Any]:
@@ -396,15 +267,13 @@ def clips_of(folder: Path, most: int, longest_s: float = 30.0) -> list[Clip]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("endure", "loop", "buffers", "fuzz", "strangers"))
+    parser.add_argument("what", choices=("endure", "loop", "strangers"))
     parser.add_argument("--data", type=Path)
     parser.add_argument("--clips", type=int, default=24)
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--wall", type=float, default=60.0, help="minutes after which loop ends anyhow")
     parser.add_argument("--lookahead", type=int, default=1)
     parser.add_argument("--buffer", type=float, default=0.3)
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.0])
-    parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True)
     o = parser.parse_args()
@@ -412,11 +281,8 @@ def main() -> None:
     if o.what == "endure":
         found = endure(clips_of(o.data, o.clips), o.minutes, o.seed, o.lookahead, o.buffer)
     elif o.what == "loop":
-        found = loop(clips_of(o.data, o.clips), o.minutes, o.wall, o.seed, o.lookahead, o.buffer)
-    elif o.what == "buffers":
-        found = buffers(clips_of(o.data, o.clips), o.noise, o.seed)
-    elif o.what == "fuzz":
-        found = fuzz(o.count, o.seed)
+        clips = clips_of(o.data, o.clips)
+        found = loop(clips, o.minutes, o.wall, o.seed, o.lookahead, o.buffer, o.json)
     else:
         found = strangers()
     o.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live.character import EASE, FALLS, RETURNS, TRACKS
-from poise.live.loop import Live, LiveConfig
+from poise.live.config import LiveConfig
+from poise.live.loop import Live
 from poise.live.packet import Packet
 from poise.live.session import generator_for
 from poise.live.sources.file import Loop, packet_of
@@ -131,7 +134,7 @@ def test_buffer_noise_and_pause_are_set_while_it_runs(tracker: Tracker, walk: Cl
     assert live.world.lead == [1]
     live.commands.append({"type": "set", "buffer": 0.4, "noise": 0.5, "lookahead": 1})
     played.run(0.5)
-    assert live.world.lead == [11] and live.config.noise == 0.5 and live.world.ahead_of == (0,)
+    assert live.world.lead == [11] and live.aims.noise == 0.5 and live.world.ahead_of == (0,)
     steps = live.steps
     live.commands.append({"type": "pause", "on": True})
     played.run(0.3)
@@ -159,7 +162,7 @@ def test_a_dial_lets_a_character_give_way(tracker: Tracker, walk: Clip) -> None:
     for c in range(2):
         at = world.rows.state.xpos[c, row + 1].double().numpy()
         world.hands.pull(c, row, np.zeros(3), at + np.array([0.3, 0, 0]))
-        live._pulled[c] = 0.3
+        live.orders.pulled[c] = 0.3
     for k in range(12):
         live.step(0.3 + k * STEP)
     moved = world.yielding.goal.offset.abs().amax(1)
@@ -190,7 +193,7 @@ def test_endless_motion_begins_and_ends(tracker: Tracker) -> None:
     live.commands.append({"type": "dream", "character": 0, "on": False})
     for k in range(5):
         live.step(3.0 + k * STEP)
-    assert not live.endless and character.doing != TRACKS
+    assert not live.aims.endless and character.doing != TRACKS
     live.close()
 
 
@@ -203,7 +206,7 @@ def test_a_pull_is_a_spring(tracker: Tracker, walk: Clip) -> None:
         live.step(k * STEP)
     before = place[0, chest + 1].clone()
     live.world.hands.pull(0, chest, np.zeros(3), before.double().numpy() + np.array([0.25, 0, 0]))
-    live._pulled[0] = 0.0
+    live.orders.pulled[0] = 0.0
     for k in range(15):
         live.step(0.3 + k * STEP)
     moved = float(place[0, chest + 1, 0] - before[0])
@@ -223,7 +226,7 @@ def test_a_slow_machine_makes_slow_motion_and_no_falls(tracker: Tracker, walk: C
         played.live.step(played.now)
     played.run(3.0)
     assert played.live.world.characters[0].lost == 0
-    assert played.live._read is not None and played.now - played.live._read < 1.3
+    assert played.live.aims.read_s is not None and played.now - played.live.aims.read_s < 1.3
     played.live.close()
 
 
@@ -243,3 +246,24 @@ def test_a_clip_is_played_on_without_a_jump(walk: Clip) -> None:
     assert np.linalg.norm(loop(3 * walk.frames)[0][:2] - loop(0)[0][:2]) > 2.2 * np.linalg.norm(
         walk.root_pos[-1, :2] - walk.root_pos[0, :2]
     )
+
+
+def test_characters_take_the_proportions_of_an_avatar(tracker: Tracker, walk: Clip) -> None:
+    """`poise live --bones FILE`: lengths and masses are the avatar's, and it is still tracked."""
+    skeleton = replace(walk.skeleton, offsets=0.7 * walk.skeleton.offsets)
+    small = walk.replaced(skeleton=skeleton, root_pos=0.7 * walk.root_pos)
+    own = tracker.with_bones_of(small)
+    mass, less = (float(t.humanoid.model.body_mass.sum()) for t in (tracker, own))
+    assert less < 0.7 * mass
+    played = Played(own, small, LiveConfig())
+    live, rows = played.live, own.humanoid.table.rows
+    played.run(0.3)
+    seen = live.step(played.now)
+    assert seen is not None and bool(live.world.rows.state.qpos.isfinite().all())
+    parents = np.array([r.parent for r in rows[1:]])
+    for bodies in (seen.bodies[0], seen.goals[0]):
+        long = np.linalg.norm(bodies[1:, :3] - bodies[parents, :3], axis=-1)
+        whole = np.linalg.norm([r.pos for r in tracker.humanoid.table.rows[1:]], axis=-1)
+        assert np.allclose(long, np.linalg.norm([r.pos for r in rows[1:]], axis=-1), atol=2e-3)
+        assert long.sum() < 0.85 * whole.sum()
+    live.close()

@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.live.commands import MOST_BYTES
-from poise.live.loop import LiveConfig
+from poise.live.config import LiveConfig
 from poise.live.packet import Inbox
 from poise.live.page.doorway import A_SECOND
 from poise.live.page.frames import HEAD, as_json, packed

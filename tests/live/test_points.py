@@ -12,12 +12,15 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
+from poise.env.goals import StreamGoal
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live import quats as q
 from poise.live.character import TRACKS
-from poise.live.loop import Live, LiveConfig
+from poise.live.config import LiveConfig
+from poise.live.loop import Live
 from poise.live.packet import Inbox, Packet
 from poise.live.passage import world_of
 from poise.live.points import PointFit
@@ -26,6 +29,8 @@ from poise.live.sources.keypoints import Frame
 from poise.live.sources.stream import JsonStream
 from poise.motion import Clip, read_clip
 from test_docs import ROOT, WALK
+
+STEP = 1 / 30
 
 
 @pytest.fixture(scope="module")
@@ -242,3 +247,66 @@ def test_the_webcam_example_speaks_the_format(tracker: Tracker, walk: Clip) -> N
     (line,) = fit.inbox.take().values()
     last = joints(line[-1][1])
     assert last["LeftFoot"][2] < 0.15 and last["Hips"][2] > 0.6 and not fit.inbox.refused
+
+
+def test_a_policy_of_keypoints_is_told_the_points_and_another_one_the_fit(walk: Clip) -> None:
+    """The goal's places are those that the keypoints alone give; the fit goes on beside them."""
+    tracker = open_run("keypoints").tracker
+    assert tracker.config.goal == "keypoints"
+    live, inbox = Live(tracker, LiveConfig(buffer_s=0.0), clock=lambda: 0.0), Inbox()
+    fit = PointFit(live.inbox, tracker.example, tracker.humanoid.table, tells_places=True)
+    plain = PointFit(inbox, tracker.example, tracker.humanoid.table)
+    names, apart, told = walk.skeleton.names, list[float](), 0
+    last: np.ndarray | None = None
+    for now, points in film(walk, 30.0, 4.0):
+        fit.fit(Frame("a", names, points, now, now))
+        plain.fit(Frame("a", names, points, now, now))
+        (line,) = inbox.take().values() or ([],)
+        assert all(p.places is None for _, p in line)
+        waiting = live.inbox.take()
+        for _, packet in waiting.get("a", []):
+            assert packet.places is not None
+            assert packet.places.shape == (len(tracker.humanoid.bodies), 3)
+            # The same skeleton is fitted, whether or not the places are told.
+            assert np.allclose(packet.rot, line[-1][1].rot, atol=1e-6)
+            live.inbox.offer(packet, now)
+            last = packet.places
+        live.step(now)
+        person, goal = live.people.of(0), live.world.goal
+        if live.aims.own(0) is None or person is None or person.onto is None or last is None:
+            continue
+        newest = goal.layout.unpacked(goal.packs[:, int(goal.count[0] - 1) % goal.size])
+        pose = person.read(now + STEP)
+        assert pose is not None and pose.places is not None
+        places = person.onto.where.points(pose.places)
+        assert np.allclose(newest.pos[0].numpy(), places, atol=1e-4)
+        # What the coordinates would have told is another thing, by centimetres.
+        made = goal.coordinates(torch.tensor([0]), goal.count - 1)
+        fk = goal._poser.live(*made).pos[0].numpy()
+        apart.append(float(np.linalg.norm(fk - places, axis=-1).mean()))
+        told += 1
+    assert told > 10
+    assert 0.0005 < float(np.median(apart)) < 0.1
+    live.close()
+
+
+def test_a_stream_goal_takes_places(tracker: Tracker) -> None:
+    goal = StreamGoal(tracker.humanoid, 30.0, 2)
+    assert tracker.recovery_clips is not None
+    ease, bodies = tracker.recovery_clips.ease, len(tracker.humanoid.bodies)
+    goal.push(ease)
+    goal.draw(torch.arange(2))
+    places = torch.full((2, bodies, 3), torch.nan)
+    places[1] = torch.randn(bodies, 3, generator=torch.Generator().manual_seed(0))
+    goal.push(ease.expand(2, -1), places=places)
+    moved = places + 0.01
+    goal.push(ease.expand(2, -1), places=moved)
+    pose = goal.layout.unpacked(goal.packed(torch.arange(2), goal.count - 1))
+    assert torch.equal(pose.pos[1], moved[1]) and torch.allclose(
+        pose.linvel[1], torch.full((bodies, 3), 0.3), atol=1e-4
+    )
+    assert bool(pose.pos[0].isfinite().all()) and float(pose.linvel[0].abs().max()) < 1e-4
+    # A frame without places is told by its coordinates again.
+    goal.push(ease.expand(2, -1))
+    pose = goal.layout.unpacked(goal.packed(torch.arange(2), goal.count - 1))
+    assert torch.allclose(pose.pos[0], pose.pos[1], atol=1e-6)

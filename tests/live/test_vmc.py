@@ -12,7 +12,8 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.live import quats as q
 from poise.live.calibration import OntoBody
-from poise.live.loop import Live, LiveConfig
+from poise.live.config import LiveConfig
+from poise.live.loop import Live
 from poise.live.packet import Inbox
 from poise.live.passage import world_of
 from poise.live.sinks.vmc import OwnPuppet, Puppet, VmcSink, datagram
@@ -162,7 +163,7 @@ def test_in_through_the_body_and_out_agree_to_a_millimetre_on_the_wire() -> None
         seen = live.step(now)
         now += 1 / 30
         assert seen is not None
-        own = live.own(0)
+        own = live.aims.own(0)
         if own is None:
             continue
         seen_once += 1

@@ -82,7 +82,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.clips and live_in:
         raise PoiseError("files and a live stream were both given", hint="Leave one of them out")
     from poise.jobs.open import open_run
-    from poise.live.loop import LiveConfig
+    from poise.live.config import LiveConfig
     from poise.live.page.guard import LOOPBACK
     from poise.live.session import Session, Wanted
 

@@ -27,12 +27,14 @@ class Pose(NamedTuple):
         rot: `(J, 4)` wxyz, local.
         stale_s: for how long nothing has come.
         jumped: whether the person is elsewhere since the pose that was read before.
+        places: `(B, 3)` m of the character's bodies, where the source tells them.
     """
 
     root_pos: np.ndarray
     rot: np.ndarray
     stale_s: float
     jumped: bool
+    places: np.ndarray | None = None
 
 
 class _Frame(NamedTuple):
@@ -40,6 +42,7 @@ class _Frame(NamedTuple):
     root_pos: np.ndarray
     rot: np.ndarray
     leaps: bool
+    places: np.ndarray | None
 
 
 class JitterBuffer:
@@ -62,7 +65,14 @@ class JitterBuffer:
         self._arrived = -np.inf
         self._jumped = False
 
-    def add(self, time_s: float, arrived_s: float, root_pos: np.ndarray, rot: np.ndarray) -> None:
+    def add(
+        self,
+        time_s: float,
+        arrived_s: float,
+        root_pos: np.ndarray,
+        rot: np.ndarray,
+        places: np.ndarray | None = None,
+    ) -> None:
         """One more packet; one that is older than those that came is put in its place."""
         self._ways.append(arrived_s - time_s)
         self._way = min(self._ways)
@@ -83,7 +93,7 @@ class JitterBuffer:
             leaps = far > LEAP_M and far > JUMP * (time_s - frames[-1].time_s)
             self.jumps += leaps
             self._jumped |= leaps
-        frames.append(_Frame(time_s, root_pos, rot, leaps))
+        frames.append(_Frame(time_s, root_pos, rot, leaps, places))
 
     def read(self, now_s: float) -> Pose | None:
         """The pose at `now_s` by the loop's clock; None before anything has come."""
@@ -95,26 +105,29 @@ class JitterBuffer:
         stale = max(0.0, now_s - self._arrived)
         after = next((k for k in range(len(frames) - 1, -1, -1) if frames[k].time_s <= at), -1)
         if after == len(frames) - 1:
-            return Pose(*self._beyond(at), stale, jumped)
-        if after < 0:
-            return Pose(frames[0].root_pos, frames[0].rot, stale, jumped)
-        a, b = frames[after], frames[after + 1]
-        if b.leaps:
-            return Pose(a.root_pos, a.rot, stale, jumped)
-        share = (at - a.time_s) / (b.time_s - a.time_s)
-        return Pose(
-            a.root_pos + share * (b.root_pos - a.root_pos), slerp(a.rot, b.rot, share), stale, jumped
-        )
+            a, b, share = self._beyond(at)
+        elif after < 0:
+            a, b, share = frames[0], frames[0], 0.0
+        else:
+            a, b = frames[after], frames[after + 1]
+            share = 0.0 if b.leaps else (at - a.time_s) / (b.time_s - a.time_s)
+        if share == 0.0:
+            return Pose(a.root_pos, a.rot, stale, jumped, a.places)
+        places = None
+        if a.places is not None and b.places is not None:
+            places = a.places + share * (b.places - a.places)
+        root = a.root_pos + share * (b.root_pos - a.root_pos)
+        return Pose(root, slerp(a.rot, b.rot, share), stale, jumped, places)
 
-    def _beyond(self, at: float) -> tuple[np.ndarray, np.ndarray]:
-        """q_0 + v_0 tau (1 - e^(-t / tau)): where the motion goes on, and comes to rest."""
+    def _beyond(self, at: float) -> tuple[_Frame, _Frame, float]:
+        """The last two frames and a share of the way between them, beyond 1: q_0 + v_0 tau
+        (1 - e^(-t / tau)), where the motion goes on, and comes to rest."""
         last = self._frames[-1]
         if len(self._frames) < 2 or last.leaps:
-            return last.root_pos, last.rot
+            return last, last, 0.0
         before = self._frames[-2]
         dt = max(last.time_s - before.time_s, 1e-3)
         if dt > 0.25:
-            return last.root_pos, last.rot
+            return last, last, 0.0
         share = FADE_S * (1.0 - np.exp(-(at - last.time_s) / FADE_S)) / dt
-        root = last.root_pos + share * (last.root_pos - before.root_pos)
-        return root, slerp(before.rot, last.rot, 1.0 + share)
+        return before, last, 1.0 + share

@@ -41,6 +41,10 @@ class Elsewhere:
         out[3:7] = q.mul(turn, qpos[3:7])
         return out
 
+    def points(self, places: np.ndarray) -> np.ndarray:
+        """Points `(..., 3)` m there."""
+        return q.rotate(q.yaw(self.yaw), places) + self.shift
+
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
         """Lets the motion go on so that the coordinates `seen (7 + n)` are where and face as `to
         (7 + n)` does; heights stay."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,8 @@ class Packet:
         root_pos: `(3)` m, the root joint in the world.
         rot: `(J, 4)` wxyz, each joint's rotation in its parent's frame, the root's in the world.
         whole: a clip that shows how the skeleton stands, where there is one; else the first seconds do.
+        places: `(B, 3)` m, where the character's bodies are to be, for policies that are told places
+            alone; None where the pose tells all.
     """
 
     person: str
@@ -41,6 +43,7 @@ class Packet:
     root_pos: np.ndarray
     rot: np.ndarray
     whole: Clip | None = None
+    places: np.ndarray | None = None
 
 
 def checked(packet: Packet) -> Packet:
@@ -58,12 +61,14 @@ def checked(packet: Packet) -> Packet:
         raise PoiseError("not finite", packet.person)
     if norms.min() < 0.5 or norms.max() > 2.0:
         raise PoiseError("no rotation", packet.person)
-    if np.abs(packet.root_pos).max() > FAR_M:
+    places = packet.places
+    if places is not None and not np.isfinite(places).all():
+        raise PoiseError("not finite", packet.person)
+    if max(np.abs(x).max() for x in (packet.root_pos, places) if x is not None) > FAR_M:
         raise PoiseError("too far away", packet.person)
     if not 0 < len(packet.person) <= NAME:
         raise PoiseError("name", packet.person[:NAME])
-    rot = normalized(packet.rot)
-    return Packet(packet.person, packet.time_s, packet.skeleton, packet.root_pos, rot, packet.whole)
+    return replace(packet, rot=normalized(packet.rot))
 
 
 class Inbox:

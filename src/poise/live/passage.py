@@ -6,6 +6,7 @@ tests hold the two together.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -99,12 +100,21 @@ class FramePassage:
         return sum(ends) / 2  # type: ignore[return-value]
 
 
+@lru_cache(maxsize=64)
+def _levels(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Joints and their parents, those at the same distance from the root together."""
+    depth = [0] * len(parents)
+    for j, parent in enumerate(parents):
+        depth[j] = 0 if parent < 0 else depth[parent] + 1
+    levels = ([j for j, d in enumerate(depth) if d == k] for k in range(1, max(depth) + 1))
+    return [(np.array(js), np.array([parents[j] for j in js])) for js in levels]
+
+
 def world_of(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
     """World rotations `(J, 4)` of local ones."""
     out = rot.copy()
-    for j, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            out[j] = q.mul(out[parent], rot[j])
+    for joints, parents in _levels(tuple(skeleton.parents)):
+        out[joints] = q.mul(out[parents], rot[joints])
     return out
 
 
@@ -120,10 +130,9 @@ def place_of(
     skeleton: Skeleton, path: tuple[int, ...], root: np.ndarray, world: np.ndarray
 ) -> np.ndarray:
     """m, where the last joint of a path from the root is."""
-    out = root
-    for a, b in pairwise(path):
-        out = out + q.rotate(world[a], skeleton.offsets[b])
-    return out
+    if len(path) < 2:
+        return root
+    return root + q.rotate(world[list(path[:-1])], skeleton.offsets[list(path[1:])]).sum(0)
 
 
 def _chains(p: Passage) -> list[_Chain]:
@@ -167,18 +176,22 @@ class Hinges:
         self._anchors = np.array([self.rows[r.parent].joint for r in driven])
         self._rest = np.array([r.quat for r in driven])
         self._frame = np.array([r.frame for r in driven])
-        self._euler, self._single, column = list[tuple[int, ...]](), list[tuple[int, int, int]](), 0
+        single, euler, column = list[tuple[int, int, int]](), list[tuple[int, ...]](), 0
         for k, row in enumerate(driven):
             n = len(row.order)
             if n == 1:
-                self._single.append((k, "XYZ".index(row.order), column))
+                single.append((k, "XYZ".index(row.order), column))
             else:
                 order = row.order
                 if n == 2:
                     order = order[0] + next(c for c in "XYZ" if c not in order) + order[1]
                 i, j, l_ = ("XYZ".index(c) for c in order)
-                self._euler.append((k, i, j, l_, column, n))
+                euler.append((k, i, j, l_, column, n))
             column += n
+        self._single = np.array(single, dtype=int).reshape(-1, 3).T
+        self._two, self._three = (
+            np.array([e[:5] for e in euler if e[5] == n], dtype=int).reshape(-1, 5).T for n in (2, 3)
+        )
         self.count = column
 
     def __call__(self, root: np.ndarray, world: np.ndarray, before: np.ndarray | None) -> np.ndarray:
@@ -193,22 +206,26 @@ class Hinges:
         local = q.mul(q.between(self._frame, q.between(self._rest, rel)), self._frame)
         m, angles = q.matrix(local), np.zeros(self.count)
         last = np.zeros(self.count) if before is None else before
-        for k, axis, at in self._single:
-            angles[at] = 2.0 * np.arctan2(local[k, 1 + axis], local[k, 0])
-        for k, i, j, l_, at, n in self._euler:
-            e = 1.0 if (j - i) % 3 == 1 else -1.0
-            b = np.arcsin(np.clip(e * m[k, i, l_], -1.0, 1.0))
-            a = np.arctan2(-e * m[k, j, l_], m[k, l_, l_])
-            c = np.arctan2(-e * m[k, i, j], m[k, i, i])
-            if n == 2:
-                angles[at : at + 2] = a, c
-                continue
-            first, second = np.array([a, b, c]), np.array([a + np.pi, np.pi - b, c + np.pi])
-            here = last[at : at + 3]
-            near = [np.square(_wrapped(x - here)).sum() for x in (first, second)]
-            angles[at : at + 3] = first if near[0] <= near[1] else second
+        k, axis, at = self._single
+        angles[at] = 2.0 * np.arctan2(local[k, 1 + axis], local[k, 0])
+        a, _, c = _euler(m, *self._two[:4])
+        angles[self._two[4]], angles[self._two[4] + 1] = a, c
+        at = self._three[4] + np.arange(3)[:, None]
+        first = np.stack(_euler(m, *self._three[:4]))
+        second = np.stack((first[0] + np.pi, np.pi - first[1], first[2] + np.pi))
+        near, far = (np.square(_wrapped(x - last[at])).sum(0) for x in (first, second))
+        angles[at] = np.where(near <= far, first, second)
         out[7:] = last + _wrapped(angles - last)
         return out
+
+
+def _euler(
+    m: np.ndarray, k: np.ndarray, i: np.ndarray, j: np.ndarray, l_: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The angles `(n)` of turns `m[k]` about axes i, then j, then l."""
+    e = np.where((j - i) % 3 == 1, 1.0, -1.0)
+    b = np.arcsin(np.clip(e * m[k, i, l_], -1.0, 1.0))
+    return np.arctan2(-e * m[k, j, l_], m[k, l_, l_]), b, np.arctan2(-e * m[k, i, j], m[k, i, i])
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ class Person:
         if self._first is None:
             self._first = packet
         self.arrived_s = arrived_s
-        self.buffer.add(packet.time_s, arrived_s, packet.root_pos, packet.rot)
+        self.buffer.add(packet.time_s, arrived_s, packet.root_pos, packet.rot, packet.places)
         if self.onto is None and self._made is None:
             whole = packet.whole or self._standing.add(packet)
             if whole is not None:

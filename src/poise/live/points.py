@@ -37,8 +37,11 @@ class Performer:
         arrived_s: when its last frame came.
     """
 
-    def __init__(self, person: str, names: tuple[str, ...], onto: Clip, table: BodyTable):
+    def __init__(
+        self, person: str, names: tuple[str, ...], onto: Clip, table: BodyTable, tells_places: bool
+    ):
         self.person, self.names, self._onto, self._table = person, names, onto, table
+        self._tells_places = tells_places
         self._seen = list[Frame]()
         self._body: PointBody | None = None
         self._whole: Clip | None = None
@@ -68,10 +71,15 @@ class Performer:
         whole, stale = self._gaps(frame.points[self._kept], dt)
         if whole is None or stale > STALE_S:
             raise PoiseError("keypoints are missing", self.person)
-        root, rot = self._body.performer(whole[None])
         assert self._whole is not None
-        skeleton = self._whole.skeleton
-        return Packet(self.person, frame.time_s, skeleton, root[0].numpy(), rot[0].numpy(), self._whole)
+        skeleton, places = self._whole.skeleton, None
+        if self._tells_places:
+            pos, root, rot = self._body.follow(whole[None])
+            places = pos[0].numpy()
+        else:
+            root, rot = self._body.performer(whole[None])
+        at, turned = root[0].numpy(), rot[0].numpy()
+        return Packet(self.person, frame.time_s, skeleton, at, turned, self._whole, places)
 
     def _measure(self, frame: Frame) -> None:
         seen = self._seen
@@ -113,10 +121,13 @@ class PointFit:
     Args:
         onto: a clip on the humanoid's skeleton, which shows how it stands.
         table: the humanoid's bodies.
+        tells_places: whether packets also tell where the humanoid's bodies are by the keypoints alone,
+            for a policy that is told no rotations.
     """
 
-    def __init__(self, inbox: Inbox, onto: Clip, table: BodyTable):
+    def __init__(self, inbox: Inbox, onto: Clip, table: BodyTable, tells_places: bool = False):
         self.inbox, self._onto, self._table = inbox, onto, table
+        self._tells_places = tells_places
         self._people = dict[str, Performer]()
         self._waiting: queue.Queue[Frame | None] = queue.Queue(WAIT)
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -147,7 +158,7 @@ class PointFit:
             if known is None and len(self._people) >= PEOPLE:
                 self.inbox.refuse("too many people")
                 return
-            known = Performer(frame.person, frame.names, self._onto, self._table)
+            known = Performer(frame.person, frame.names, self._onto, self._table, self._tells_places)
             self._people[frame.person] = known
         known.arrived_s = frame.arrived_s
         try:

@@ -8,22 +8,38 @@ from __future__ import annotations
 import numpy as np
 
 
+def _products(width: int, signs: dict[tuple[int, int], tuple[int, float]], count: int) -> np.ndarray:
+    """`(width^2, count)`: what each product of two coordinates (i, j) adds to, and how often."""
+    out = np.zeros((width * width, count))
+    for (i, j), (k, sign) in signs.items():
+        out[width * i + j, k] += sign
+    return out
+
+
+#: Which products a_i b_j make up a b, and u_i v_j make up u x v: one product of matrices takes a tenth
+#: of the time that some thirty operations on small arrays take.
+_MUL = _products(4, {
+    (0, 0): (0, 1.0), (1, 1): (0, -1.0), (2, 2): (0, -1.0), (3, 3): (0, -1.0),
+    (0, 1): (1, 1.0), (1, 0): (1, 1.0), (2, 3): (1, 1.0), (3, 2): (1, -1.0),
+    (0, 2): (2, 1.0), (2, 0): (2, 1.0), (1, 3): (2, -1.0), (3, 1): (2, 1.0),
+    (0, 3): (3, 1.0), (3, 0): (3, 1.0), (1, 2): (3, 1.0), (2, 1): (3, -1.0),
+}, 4)  # fmt: skip
+_CROSS = _products(3, {
+    (1, 2): (0, 1.0), (2, 1): (0, -1.0), (2, 0): (1, 1.0), (0, 2): (1, -1.0),
+    (0, 1): (2, 1.0), (1, 0): (2, -1.0),
+}, 3)  # fmt: skip
+_CONJ = np.array([1.0, -1.0, -1.0, -1.0])
+
+
 def mul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The product a b, `(..., 4)`."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    out = (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-    return np.stack(out, -1)
+    every = a[..., :, None] * b[..., None, :]
+    return every.reshape(*every.shape[:-2], 16) @ _MUL
 
 
 def conj(q: np.ndarray) -> np.ndarray:
     """The inverse of unit quaternions."""
-    return q * np.array([1.0, -1.0, -1.0, -1.0])
+    return q * _CONJ
 
 
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -34,13 +50,18 @@ def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors `(..., 3)` turned by q, v + 2 w (u x v) + 2 u x (u x v)."""
     w, u = q[..., :1], q[..., 1:]
-    t = 2.0 * np.cross(u, v)
-    return v + w * t + np.cross(u, t)
+    t = 2.0 * _cross(u, v)
+    return v + w * t + _cross(u, t)
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    every = u[..., :, None] * v[..., None, :]
+    return every.reshape(*every.shape[:-2], 9) @ _CROSS
 
 
 def normalized(q: np.ndarray) -> np.ndarray:
     """Unit quaternions."""
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return q / np.sqrt((q * q).sum(-1, keepdims=True))
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray | float) -> np.ndarray:
@@ -58,7 +79,7 @@ def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray | float) -> np.ndarray
 
 def matrix(q: np.ndarray) -> np.ndarray:
     """`(..., 3, 3)`."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
+    w, x, y, z = (q[..., k] for k in range(4))
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

@@ -12,7 +12,8 @@ from typing import Any
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
-from poise.live.loop import Live, LiveConfig
+from poise.live.config import LiveConfig
+from poise.live.loop import Live
 from poise.live.packet import Inbox
 from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
@@ -75,9 +76,10 @@ class Session:
         )
         self.recorded: list[Path] = []
         self.last: dict[str, Any] = {}
-        self.live.recording = self._record
+        self.live.orders.recording = self._record
         hello = hello_of(world, {"records": True, "dreams": made is not None})
-        self.points = PointFit(self.inbox, tracker.example, world.humanoid.table)
+        places = tracker.config.goal == "keypoints"
+        self.points = PointFit(self.inbox, tracker.example, world.humanoid.table, places)
         guard = Guard(wanted.host, wanted.port, wanted.token)
         self.server = PageServer(
             guard, hello, self.inbox, self.live.commands.append, self.figures, clock, self.points

@@ -74,7 +74,7 @@ class ShowVmc:
 
     def show(self, seen: Seen, live: Live) -> None:
         """Takes a control step."""
-        own = live.own(self.sink.character)
+        own = live.aims.own(self.sink.character)
         if own is not None and not set(NEEDED) <= set(own.skeleton.names) <= set(PARENTS):
             # A person that is no VRM model.
             own = None

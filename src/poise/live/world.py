@@ -3,6 +3,7 @@ falls on them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,13 +17,12 @@ from poise.env.goals import StreamGoal
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.yielding import Yielding
 from poise.errors import PoiseError
-from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
+from poise.live.ahead import Ahead, AheadAtOnce, AheadBeside
 from poise.live.character import Body, Character
 from poise.live.hands import Hands
-from poise.plan import LookaheadConfig
 from poise.sim import Character as Actor
 from poise.sim import CharacterRows, Scene, SceneSim, alone
 from poise.sim.props import Ball
@@ -31,8 +31,6 @@ from poise.sim.props import Ball
 APART_M, AWAY = 2.0, (0.0, 400.0, 0.15)
 #: m/s of the ball when it comes.
 BALL_MPS = 4.0
-#: Simulated at once where a character looks ahead in real time: candidates, horizon, hold.
-QUICK = LookaheadConfig(candidates=8, horizon=6, hold_steps=3, smoothing=(0.0, 0.7), corrections=(1.0,))
 
 
 class Seen(NamedTuple):
@@ -63,6 +61,7 @@ class World:
         count: K.
         executor: plans recovery motions beside the loop; None plans at once.
         lookahead: characters that look ahead.
+        beside: whether that is done in a process of its own; else at once, as tests do.
 
     Attributes:
         characters: what each is to do.
@@ -83,6 +82,7 @@ class World:
         executor: Executor | None = None,
         lookahead: tuple[int, ...] = (),
         seed: int = 0,
+        beside: bool = False,
     ):
         if tracker.recovery_clips is None:
             raise PoiseError(
@@ -115,17 +115,9 @@ class World:
         self.substeps, self.resets, self.steps = sim.substeps, 0, 0
         self.lead, self.hurries, self.looked = [1] * count, False, 0
         self._act = tracker.policy.act
-        self._ahead = None
-        if tracker.value is not None:
-            full = imitation_of(tracker, [place(tracker.example, tracker)])
-            full = replace(full, task=replace(full.task, help_by="all", compliance=yields))
-            self._ahead = look_ahead(tracker, full, QUICK, 1, seed)
-            copies = self._ahead.copies
-            goal = StreamGoal(body, self.rate_hz, copies.num_envs)
-            goal.push(tracker.recovery_clips.ease)
-            goal.draw(torch.arange(copies.num_envs))
-            copies.set_goal(goal)
-        elif lookahead:
+        self._ahead: Ahead | None = None
+        self._look: Callable[[], Ahead] = lambda: (AheadBeside if beside else AheadAtOnce)(tracker, seed)
+        if lookahead and tracker.value is None:
             raise PoiseError("the policy was saved without its critic, which lookahead needs")
         self._set_down()
         self.look_ahead(lookahead)
@@ -133,13 +125,15 @@ class World:
     def look_ahead(self, characters: tuple[int, ...]) -> None:
         """Which characters look ahead; the others act at once."""
         self.ahead_of = tuple(k for k in characters if 0 <= k < self.count)
+        if self._ahead is None and self.ahead_of and self.can_look_ahead:
+            self._ahead = self._look()
         if self._ahead is not None:
             self._ahead.watch(self.env, self.ahead_of)
 
     @property
     def can_look_ahead(self) -> bool:
         """Whether the policy has a critic."""
-        return self._ahead is not None
+        return self.tracker.value is not None
 
     def _set_down(self) -> None:
         frames = torch.stack([c.ease for c in self.characters])
@@ -189,18 +183,21 @@ class World:
             self._moves[character],
         )
 
-    def step(self, frames: Tensor) -> Seen:
-        """One control step toward the frames `(K, 7 + n)`, the newest that the goals know."""
+    def step(self, frames: Tensor, places: Tensor | None = None) -> Seen:
+        """One control step toward the frames `(K, 7 + n)`, the newest that the goals know.
+
+        places: see `StreamGoal.push`.
+        """
         env, goal = self.env, self.goal
-        goal.push(frames)
+        goal.push(frames, places=places)
         lead = torch.tensor(self.lead)
         goal.at.copy_((goal.count - 1 - lead).clamp_min(0))
         goal.aim(None, None)
         goal.notes.clear()
         obs = env.observe()
         ahead = self._ahead if self.ahead_of and not self.hurries else None
-        self.looked += ahead is not None
         env.drive(self._act(obs) if ahead is None else ahead.act(obs))
+        self.looked += ahead is not None and ahead.acts
         env.controls.step(env.backend, self.substeps)
         env.renew(env.judge())
         self.steps += 1
@@ -224,4 +221,4 @@ class World:
         """Frees the simulations."""
         self.env.close()
         if self._ahead is not None:
-            self._ahead.copies.close()
+            self._ahead.close()

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
+from poise.env.snapshot import Snapshot
 from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.plan.candidates import Candidates, Changes
@@ -122,7 +123,7 @@ class LookaheadConfig:
         return replace(self, candidates=int(steps * self.hold_steps / horizon), horizon=horizon)
 
 
-class _Choice(NamedTuple):
+class Choice(NamedTuple):
     """What a decision came to.
 
     Attributes:
@@ -146,7 +147,7 @@ class _World:
         past: `(k, B, 3)` m, the bodies in the last frames, up to `PAST`.
     """
 
-    choice: _Choice | None = None
+    choice: Choice | None = None
     step: int = 0
     past: list[Tensor] = field(default_factory=list)
 
@@ -251,39 +252,65 @@ class Lookahead:
             world.past = [*world.past, pos[i].clone()][-PAST:]
         return env.unfiltered(torch.lerp(much * self.policy.act(obs) + offsets, env.action, keep))
 
-    def _decide(self, i: int, world: _World) -> _Choice:
+    def _decide(self, i: int, world: _World) -> Choice:
         """What world i does next."""
-        assert self._env is not None
-        begun, c = time.perf_counter(), self.config
-        drawn = self._drawn(world.choice)
-        bodies = torch.stack(world.past) if world.past else self._env.pose().pos[:0]
-        changes = Changes(drawn, self._keep, self._much)
-        snapshot = self._env.snapshot(torch.tensor([i]))
-        cost, _, _, rough, source, apart = self._candidates.tried(snapshot, changes, bodies.unsqueeze(0))
+        env = self._env
+        assert env is not None
+        begun = time.perf_counter()
+        bodies = torch.stack(world.past) if world.past else env.pose().pos[:0]
+        off = float((env.pose().pos[i] - env.goal_pose().pos[i]).norm(dim=-1).mean())
+        last = None if world.choice is None else world.choice.offsets[self.config.hold_steps :]
+        prices = None
         if self.prices is not None:
-            reference, clip = self._env.reference, int(self._env.clip[i])
+            reference, clip = env.reference, int(env.clip[i])
             first = int(reference.start[clip])
-            frame = torch.arange(1, apart.shape[1] + 1) + int(self._env.frame[i])
-            frame = first + frame.clamp_max(int(reference.length[clip]) - 1)
-            cost = cost + (self.prices[frame] * apart).sum((1, 2))
+            frame = torch.arange(1, self.config.horizon + 1) + int(env.frame[i])
+            prices = self.prices[first + frame.clamp_max(int(reference.length[clip]) - 1)]
+        out = self.decide(env.snapshot(torch.tensor([i])), bodies, off, last, prices=prices)
+        self.seconds.append(time.perf_counter() - begun)
+        return out
+
+    def decide(
+        self,
+        snapshot: Snapshot,
+        past: Tensor,
+        off_m: float,
+        last: Tensor | None = None,
+        meanwhile: Tensor | None = None,
+        prices: Tensor | None = None,
+    ) -> Choice:
+        """What a world does from a snapshot of it on.
+
+        Args:
+            past: `(k, B, 3)` m, its bodies in the frames before.
+            off_m: mean distance of its bodies from the goal.
+            last: `(h, A)` offsets that were planned for then.
+            meanwhile: `(m, A)` offsets that it acts by before the decision counts; the choice begins
+                with them.
+            prices: `(T, B)` in each of the frames to come, see `Lookahead`.
+        """
+        c, drawn = self.config, self._drawn(last)
+        if meanwhile is not None:
+            drawn = torch.cat((meanwhile.expand(len(drawn), -1, -1), drawn), 1)
+        changes = Changes(drawn, self._keep, self._much)
+        cost, _, _, rough, source, apart = self._candidates.tried(snapshot, changes, past.unsqueeze(0))
+        if prices is not None:
+            cost = cost + (prices[: apart.shape[1]] * apart).sum((1, 2))
         price = rough.price(source, c.jerk_price, c.slide_price)
-        off = self._env.pose().pos[i] - self._env.goal_pose().pos[i]
-        left = 1.0 - float(off.norm(dim=-1).mean()) / c.strict_m
+        left = 1.0 - off_m / c.strict_m
         cost = torch.where(cost.isfinite() & price.isfinite(), cost, torch.inf)
         allowed = cost.isfinite() & (cost <= cost.min() + c.slack * max(LEAST, left))
         # Where all went bad the policy acts alone.
         best = int(torch.where(allowed, cost + price, torch.inf).argmin()) if bool(allowed.any()) else 0
-        self.seconds.append(time.perf_counter() - begun)
-        return _Choice(drawn[best], float(self._keep[best]), float(self._much[best]))
+        return Choice(drawn[best], float(self._keep[best]), float(self._much[best]))
 
-    def _drawn(self, last: _Choice | None) -> Tensor:
-        """`(K, H, A)` offsets: none, those planned before, and random ones about either."""
+    def _drawn(self, rest: Tensor | None) -> Tensor:
+        """`(K, H, A)` offsets: none, those `(h, A)` planned before, and random ones about either."""
         c, n = self.config, len(self.config.smoothing)
         noise = draw_offsets(c.candidates, self.copies, c.noise_range, self._rng)
         about = torch.rand(c.candidates, generator=self._rng) < c.warm
         noise[: 2 * n], about[:n], about[n : 2 * n] = 0.0, False, True
         out = noise[:, None] * self._shape[:, None]
-        if last is not None:
-            rest = last.offsets[c.hold_steps :]
+        if rest is not None:
             out[about, : len(rest)] += rest
         return out

@@ -42,9 +42,15 @@ class StreamGoal(BufferedGoal):
     ):
         super().__init__(humanoid, rate_hz, num_envs, SIZE, torch.device(device), seed)
         self._stalled = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+        # Where bodies were told to be in the last frame; NaN where coordinates alone were told.
+        bodies = len(humanoid.bodies)
+        self._told = torch.full((num_envs, bodies, 3), torch.nan, device=self.device)
 
-    def push(self, qpos: Tensor, ids: Tensor | None = None) -> None:
+    def push(self, qpos: Tensor, ids: Tensor | None = None, places: Tensor | None = None) -> None:
         """The next frame, `(7 + n)` for all worlds or `(n, 7 + n)` for worlds `ids (n,)`, all for None.
+
+        places: `(n, B, 3)` m, where bodies are to be in place of where the coordinates have them; NaN in
+            worlds where that is not told.
 
         A frame that is not finite, or in which the root has no rotation, is left out, and noted.
 
@@ -66,6 +72,7 @@ class StreamGoal(BufferedGoal):
         if not bool(good.all()):
             self._note(ids[~good], "sent a frame that is no pose, which is left out")
             ids, qpos = ids[good], qpos[good]
+            places = None if places is None else places[good]
         if not len(ids):
             return
         qpos = torch.cat(
@@ -79,8 +86,30 @@ class StreamGoal(BufferedGoal):
             far = f"{float(apart[jumped].max()):.1f}"
             self._note(ids[jumped], f"jumped by {far} m between two frames; the goal is there now")
         self.append(ids, qpos, jumped)
+        self._put(ids, places, jumped)
         self._stalled[ids] = False
         self._stale[ids] = True
+
+    def _put(self, ids: Tensor, places: Tensor | None, jumped: Tensor) -> None:
+        """Puts bodies of the newest frames where they are told to be; their velocities are the
+        differences to the frame before, where that was told too."""
+        if places is None:
+            self._told[ids] = torch.nan
+            return
+        places = places.to(self._told)
+        before = self._told[ids]
+        self._told[ids] = places
+        known = places.isfinite().flatten(1).all(1)
+        if not bool(known.any()):
+            return
+        at = (self.count[ids] - 1) % self.size
+        rows = self.packs[ids, at]
+        # Views of the rows.
+        pose = self.layout.unpacked(rows)
+        pose.pos[known] = places[known]
+        both = known & before.isfinite().flatten(1).all(1) & ~jumped
+        pose.linvel[both] = (places[both] - before[both]) * self.rate_hz
+        self.packs[ids, at] = rows
 
     def close(self, ids: Tensor | None = None) -> None:
         """The streams of worlds `ids`, all for None, have ended with their last frames."""
@@ -108,7 +137,7 @@ class StreamGoal(BufferedGoal):
             self._note(fresh, f"has stalled for {STALL_S:g} s; the goal comes to rest")
 
     def rows(self) -> dict[str, Tensor]:
-        return {**super().rows(), "stalled": self._stalled}
+        return {**super().rows(), "stalled": self._stalled, "told": self._told}
 
     def _note(self, ids: Tensor, what: str) -> None:
         which = "" if self.num_envs == 1 else f" of world {int(ids[0])}"

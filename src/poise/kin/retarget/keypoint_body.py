@@ -101,11 +101,20 @@ class PointBody:
 
         places: `(T, P, 3)` m, the tracks of `self.places` in order.
         """
-        rot, root = self.passage.transfer(self._performer(places))
+        return self._onto(self._world(*self._solved(places)))
+
+    def _onto(self, performer: World) -> tuple[Tensor, Tensor]:
+        rot, root = self.passage.transfer(performer)
         offsets = torch.tensor(self.onto.offsets)
         pos, quat = forward_kinematics(self.onto.parents, offsets, root, rot)
         rows = [r.joint for r in self.table.rows]
         return pos[:, rows], quat[:, rows]
+
+    def follow(self, positions: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """The humanoid's bodies `(T, B, 3)` m as `solve` gives them, and what `performer` gives."""
+        root, rot = self.performer(positions)
+        pos = self._onto(self._world(root, rot))[0] + torch.tensor([0.0, 0.0, self.lift])
+        return pos, root, rot
 
     def performer(self, positions: np.ndarray) -> tuple[Tensor, Tensor]:
         """Root `(T, 3)` m and local rotations `(T, J, 4)` of the measured skeleton, its joints in the
@@ -118,9 +127,8 @@ class PointBody:
         tracks = hold_lengths(tracks, self.bones, LENGTH_ROUNDS)
         return Solver(self.rest, tracks, _NO_MEMORY_FPS).run()
 
-    def _performer(self, places: np.ndarray) -> World:
+    def _world(self, root: Tensor, rot: Tensor) -> World:
         """The measured skeleton in every frame."""
-        root, rot = self._solved(places)
         names = list(self.rest.parents)
         parents = tuple(-1 if up is None else names.index(up) for up in self.rest.parents.values())
         offsets = torch.tensor(np.stack([self.rest.offsets[n] for n in names]))

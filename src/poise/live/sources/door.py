@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import hmac
 import json
-import selectors
 import socket
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION
 from poise.live.packet import Inbox
 from poise.live.page.guard import EACH, Bucket
 from poise.live.sources.keypoints import Fits
+from poise.live.sources.listener import Listener
 from poise.live.sources.stream import JsonStream
 
 #: Connections at once, senders of datagrams that are known, refusals that a connection may cause.
@@ -50,56 +48,28 @@ class StreamDoor:
         token: str | None = None,
     ):  # fmt: skip
         self.inbox, self.points, self.clock, self._token = inbox, points, clock, token
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._tcp = socket.socket(family, socket.SOCK_STREAM)
-        self._udp = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            self._tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._tcp.bind((host, port))
-            self.port: int = self._tcp.getsockname()[1]
-            self._udp.bind((host, self.port))
-            self._tcp.listen(MOST)
-        except OSError as problem:
-            self._tcp.close()
-            self._udp.close()
-            what = f"cannot listen for keypoints on {host}:{port}: {problem.strerror}"
-            raise PoiseError(what, hint="Give another --keypoints port") from problem
+        self._listener = Listener(
+            host, port, (socket.SOCK_STREAM, socket.SOCK_DGRAM), ("keypoints", "--keypoints")
+        )
+        self.port, (self._tcp, self._udp) = self._listener.port, self._listener.doors
+        self._tcp.listen(MOST)
         self._lines = dict[socket.socket, _Line]()
         self._senders = dict[Any, _Line]()
-        self._count, self._stop = 0, threading.Event()
-        self._selector = selectors.DefaultSelector()
-        for door in (self._tcp, self._udp):
-            door.setblocking(False)
-            self._selector.register(door, selectors.EVENT_READ)
-        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._count = 0
+        self._listener.hear(self._tcp, self._accept)
+        self._listener.hear(self._udp, self._receive)
 
     def start(self) -> None:
         """Begins to listen."""
-        self._thread.start()
+        self._listener.start()
 
     def close(self) -> None:
         """Stops."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
-        for one in (*self._lines, self._tcp, self._udp):
-            one.close()
-        self._selector.close()
+        self._listener.close()
 
-    def _listen(self) -> None:
-        while not self._stop.is_set():
-            for key, _ in self._selector.select(0.2):
-                one = key.fileobj
-                assert isinstance(one, socket.socket)
-                # A sender that is gone, a datagram that was none: nothing ends the others.
-                with contextlib.suppress(OSError):
-                    if one is self._tcp:
-                        self._accept()
-                    elif one is self._udp:
-                        data, sender = one.recvfrom(MOST_BYTES + 1)
-                        self._datagram(data, sender[:2])
-                    else:
-                        self._read(one)
+    def _receive(self) -> None:
+        data, sender = self._udp.recvfrom(MOST_BYTES + 1)
+        self._datagram(data, sender[:2])
 
     def _line(self) -> _Line:
         self._count += 1
@@ -107,14 +77,13 @@ class StreamDoor:
 
     def _accept(self) -> None:
         made, _ = self._tcp.accept()
-        made.setblocking(False)
         if len(self._lines) >= MOST:
             self.inbox.refuse("too many connections")
             _tell(made, "too many connections")
             made.close()
             return
         self._lines[made] = self._line()
-        self._selector.register(made, selectors.EVENT_READ)
+        self._listener.hear(made, lambda: self._read(made))
 
     def _read(self, one: socket.socket) -> None:
         line = self._lines[one]
@@ -134,9 +103,8 @@ class StreamDoor:
             self.inbox.refuse(why)
             _tell(one, why)
         if not data or why is not None:
-            self._selector.unregister(one)
             del self._lines[one]
-            one.close()
+            self._listener.leave(one)
 
     def _take(self, line: _Line, text: bytes) -> str | None:
         """Takes a line; the reason to close the connection, if there is one."""

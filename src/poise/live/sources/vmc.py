@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import threading
 import time
 from collections.abc import Callable, Mapping
 
@@ -12,6 +11,7 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.live import quats as q
 from poise.live.packet import Inbox, Packet
+from poise.live.sources.listener import Listener
 from poise.live.sources.osc import MOST, Message, messages
 from poise.live.vrm import PARENTS, from_unity, skeleton_of
 from poise.motion import Skeleton
@@ -114,49 +114,29 @@ class VmcSource:
 
     def __init__(self, host: str, port: int, inbox: Inbox, clock: Callable[[], float]):
         self.inbox, self.clock = inbox, clock
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            self._socket.bind((host, port))
-        except OSError as problem:
-            self._socket.close()
-            what = f"cannot listen for VMC on {host}:{port}: {problem.strerror}"
-            raise PoiseError(what, hint="Give another --vmc port") from problem
-        self._socket.settimeout(0.2)
-        self.port: int = self._socket.getsockname()[1]
+        self._listener = Listener(host, port, (socket.SOCK_DGRAM,), ("VMC", "--vmc"))
+        self.port, (self._socket,) = self._listener.port, self._listener.doors
         self._avatars: dict[tuple[str, int], tuple[Avatar, float]] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._second, self._count = time.monotonic(), 0
+        self._listener.hear(self._socket, self._read)
 
     def start(self) -> None:
         """Begins to listen."""
-        self._thread.start()
+        self._listener.start()
 
     def close(self) -> None:
         """Stops."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(1.0)
-        self._socket.close()
+        self._listener.close()
 
-    def _listen(self) -> None:
-        second, count = time.monotonic(), 0
-        while not self._stop.is_set():
-            try:
-                data, sender = self._socket.recvfrom(MOST)
-            except TimeoutError:
-                continue
-            except OSError:
-                if self._stop.is_set():
-                    return
-                continue
-            now = time.monotonic()
-            if now - second > 1.0:
-                second, count = now, 0
-            count += 1
-            if count > RATE:
-                self.inbox.refuse("too many datagrams")
-                continue
+    def _read(self) -> None:
+        data, sender = self._socket.recvfrom(MOST)
+        now = time.monotonic()
+        if now - self._second > 1.0:
+            self._second, self._count = now, 0
+        self._count += 1
+        if self._count > RATE:
+            self.inbox.refuse("too many datagrams")
+        else:
             self.receive(data, (sender[0], sender[1]))
 
     def receive(self, data: bytes, sender: tuple[str, int]) -> None:
