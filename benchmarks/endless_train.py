@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from tracker import HELD_OUT, SIXTY, TWINS
 
+from poise.jobs.endless.labels import read_labels
 from poise.jobs.endless.run import begin
 from poise.jobs.endless.training import Endless, train_generator
 from poise.jobs.library.clips import LibraryConfig
@@ -55,7 +56,8 @@ def main() -> None:
         args.out, args.library, open_run(None).tracker, settings(args), hold_out=HELD_OUT,
         leave_out=TWINS, reading=LibraryConfig(rates=SIXTY, mirror=True), tell=print,
     )  # fmt: skip
-    model, _, _ = train_generator(motions, args.out, config, args.minutes, shown)
+    labels = read_labels(Path(__file__).with_name("endless_labels.txt"))
+    model, _, _ = train_generator(motions, args.out, config, args.minutes, shown, labels)
     model.save(args.out / "shipped.safetensors", half=True)
 
 

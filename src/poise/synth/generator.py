@@ -39,12 +39,20 @@ class Codes:
         keys: `(K, 3 D)` of pasts, see `key_of`.
         mean, log_var: `(K, Z)` of q.
         weights: `(D)` of a frame's numbers, in deviations.
+        kinds: `(K,)` which label the motion has, -1 for none; None where there are no labels.
     """
 
     keys: Tensor
     mean: Tensor
     log_var: Tensor
     weights: Tensor
+    kinds: Tensor | None = None
+
+    def only(self, kind: int) -> Codes:
+        """Those of one label."""
+        assert self.kinds is not None
+        rows = self.kinds == kind
+        return Codes(self.keys[rows], self.mean[rows], self.log_var[rows], self.weights)
 
     def key_of(self, past: Tensor) -> Tensor:
         """`(N, 3 D)` of pasts `(N, p, D)` in deviations: some of their frames, weighted."""
