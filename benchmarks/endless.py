@@ -3,9 +3,9 @@
     python benchmarks/endless.py -o endless.json [--parts ...] [--seconds 600] [--rollouts 20]
 
 Nothing helps the character. The policy alone does all rollouts of a part side by side, in as many
-worlds, and every half minute its falls are written; other rollouts are written one by one, and a command that goes on
-with the same file makes only those that it lacks. A rollout without recovery counts until the character
-falls. What is written says how many rollouts of which length were made.
+worlds, and every half minute its falls are written; other rollouts are written one by one, and a
+command that goes on with the same file makes only those that it lacks. A rollout without recovery counts
+until the character falls. What is written says how many rollouts of which length were made.
 
 parts: kinematic (no physics), lookahead, policy (alone), unrecovered (policy alone, recovery off),
 simulated-past (policy alone, which goes on from what was done), steering and steering-policy (points
