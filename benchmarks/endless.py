@@ -2,9 +2,10 @@
 
     python benchmarks/endless.py -o endless.json [--parts ...] [--seconds 600] [--rollouts 20]
 
-Nothing helps the character. Each rollout is written as soon as it is made, and a command that goes on
-with the same file makes only those that it lacks. A rollout without recovery counts until the character
-falls. What is written says how many rollouts of which length were made.
+Nothing helps the character. The policy alone does all rollouts of a part side by side, in as many
+worlds, and every half minute its falls are written; other rollouts are written one by one, and a
+command that goes on with the same file makes only those that it lacks. A rollout without recovery counts
+until the character falls. What is written says how many rollouts of which length were made.
 
 parts: kinematic (no physics), lookahead, policy (alone), unrecovered (policy alone, recovery off),
 simulated-past (policy alone, which goes on from what was done), steering and steering-policy (points
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 from endless_figures import diversity, repeats, visited
+from endless_worlds import Rollouts, rollouts
 from tracker import HELD_OUT, SIXTY, TWINS
 
 from poise.body import BodyConfig
@@ -111,31 +113,54 @@ class Bench:
     def about(self, qpos: np.ndarray) -> dict[str, Any]:
         """Figures of a motion."""
         fps, humanoid = self.made.fps, self.tracker.humanoid
+        seen = sorted(visited(humanoid, self.model.seeds, qpos, fps))
+        kinds = set[int]() if self.model.kinds is None else set(self.model.kinds[seen].tolist())
         return {
-            **figures_of([qpos], self.tracker, fps), **repeats(humanoid, qpos, fps),
-            "visited": sorted(visited(humanoid, self.model.seeds, qpos, fps)),
+            **figures_of([qpos], self.tracker, fps), **repeats(humanoid, qpos, fps), "visited": seen,
+            "labels": [name for k, name in enumerate(self.model.labels) if k in kinds],
         }  # fmt: skip
 
     def simulated(self, seed: int, **how: Any) -> dict[str, Any]:
-        """A rollout with a body."""
+        """A rollout with a body, which looks ahead."""
         done = dream(self.a.seconds, self.model, self.tracker, seed=seed, threads=1, **how)
-        falls, until = done.falls, self.a.seconds
-        if falls and not how.get("recover", True):
-            until = falls[0]
-        asked = done.figures["asked"]
-        back = dict[int, float]()
-        away = list[float]()
-        for (i, t), kind in sorted([(x, 0) for x in done.lost] + [(x, 1) for x in done.back], key=str):
-            if kind == 0:
-                back[i] = t
-            elif i in back:
-                away.append(t - back.pop(i))
+        one = Rollouts(
+            done.characters[0].done.read()[None], done.characters[0].asked.read()[None],
+            done.characters[0].done.count, list(done.lost), list(done.back), [],
+        )  # fmt: skip
+        return self.went(one, 0, **how)
+
+    def went(self, made: Rollouts, world: int, **how: Any) -> dict[str, Any]:
+        """What one rollout is worth."""
+        falls, away, down = made.of(world)
+        until = falls[0] if falls and not how.get("recover", True) else made.count / self.made.fps
+        frames = made.count if until == made.count / self.made.fps else round(until * self.made.fps)
+        asked = figures_of([made.asked[world, :frames].astype(float)], self.tracker, self.made.fps)
         return {
             "seconds": self.a.seconds, "counted_s": until, "falls": [round(t, 2) for t in falls],
-            "away_s": [round(t, 2) for t in away], "stayed_down": done.stayed_down,
-            **self.about(done.characters[0].done.read()),
+            "away_s": [round(t, 2) for t in away], "stayed_down": int(down),
+            **self.about(made.done[world, :frames].astype(float)),
             **{f"asked_{n}": asked[n] for n in NAMES},
         }  # fmt: skip
+
+    def together(self, name: str, **how: Any) -> None:
+        """All rollouts of a part side by side."""
+        count, seconds, begun = self.a.rollouts, self.a.seconds, time.process_time()
+        have = self.out.get(name, {})
+        if have.get("rollouts") == count and have.get("seconds_each") == seconds:
+            return
+
+        def look(made: Rollouts) -> None:
+            part = {"rollouts": count, "seconds_so_far": made.count / self.made.fps, "bad": made.bad,
+                    "falls": len(made.lost), "got_up": len(made.back)}  # fmt: skip
+            self.out[name] = part
+            self.keep()
+            print(name, part, f"{time.process_time() - begun:.0f} s of CPU", flush=True)
+
+        made = rollouts(self.tracker, self.made, count, seconds, look, **how)
+        spent = round(time.process_time() - begun, 1)
+        rows = [{"seed": k, **self.went(made, k, **how)} for k in range(count)]
+        self.out[name] = {**roamed(rows), "went_bad": made.bad, "cpu_s": spent, "rows": rows}
+        self.keep()
 
     def steered(self, seed: int, **how: Any) -> dict[str, Any]:
         """Points reached in turn, and when, against a straight walk at the library's own pace."""
@@ -144,16 +169,35 @@ class Bench:
             self.a.steer_seconds, self.model, self.tracker, seed=seed, threads=1, targets=points,
             hold_feet=False, **how,
         )  # fmt: skip
+        jerk = done.figures["simulated"]["jerk_m_per_s3"]
+        return self.arrived([t for _, t in done.reached], points, len(done.falls), seed, jerk)
+
+    def steered_together(self, name: str) -> None:
+        """The same course in several worlds, the policy alone."""
+        points, count = points_of(0), self.a.steer_worlds
+        made = rollouts(self.tracker, self.made, count, self.a.steer_seconds, targets=points)
+        rows = list[dict[str, Any]]()
+        for k in range(count):
+            times = [t for i, t in made.reached if i == k]
+            jerk = figures_of([made.done[k].astype(float)], self.tracker, self.made.fps)["jerk_m_per_s3"]
+            falls = len(made.of(k)[0])
+            rows.append(self.arrived(times, points, falls, k, jerk))
+        self.out[name] = {**reached(rows), "rows": rows}
+
+    def arrived(
+        self, times: list[float], points: Any, falls: int, seed: int, jerk: float | None
+    ) -> dict[str, Any]:
+        """How it went from point to point; a straight walk is at the pace of the library's own walk."""
         clips = self.tracker.recovery_clips
         assert clips is not None
         walk = clips.walks[0]
         pace = float(walk[-1, 0]) * self.made.fps / (len(walk) - 1)
-        times = [round(t, 2) for _, t in done.reached]
+        way = STEP_M * len(times)
         return {
-            "seconds": self.a.steer_seconds, "reached": len(times), "of": len(points), "at_s": times,
-            "straight_walk_s": round(STEP_M * len(times) / pace, 1), "falls": len(done.falls),
-            "times_straight": round(times[-1] * pace / (STEP_M * len(times)), 2) if times else None,
-            "jerk_m_per_s3": done.figures["simulated"]["jerk_m_per_s3"],
+            "seed": seed, "seconds": self.a.steer_seconds, "reached": len(times), "of": len(points),
+            "at_s": [round(t, 2) for t in times], "falls": falls,
+            "straight_walk_s": round(way / pace, 1),
+            "times_straight": round(times[-1] * pace / way, 2) if times else None, "jerk_m_per_s3": jerk,
         }  # fmt: skip
 
     def hour(self) -> dict[str, Any]:
@@ -178,6 +222,7 @@ class Bench:
 
 def roamed(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Summary of rollouts that go about."""
+    labels = [len(r["labels"]) for r in rows]
     everywhere = set[int]().union(*(r["visited"] for r in rows))
     out: dict[str, Any] = {
         "rollouts": len(rows), "seconds_each": rows[0]["seconds"],
@@ -185,7 +230,8 @@ def roamed(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "longest_still_s": max(r["longest_still_s"] for r in rows),
         "repeated_share": round(float(np.mean([r["repeated_share"] or 0.0 for r in rows])), 3),
         "visited_a_rollout": round(float(np.mean([len(r["visited"]) for r in rows])), 1),
-        "visited_by_all": len(everywhere),
+        "visited_by_all": len(everywhere), "labels_a_rollout": round(float(np.mean(labels)), 1),
+        "labels_at_least": min(labels), "labels": sorted(set[str]().union(*(r["labels"] for r in rows))),
     }  # fmt: skip
     if "falls" in rows[0]:
         falls, counted = sum(len(r["falls"]) for r in rows), sum(r["counted_s"] for r in rows)
@@ -221,6 +267,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--rollouts", type=int, default=20)
     parser.add_argument("--steer-seconds", type=float, default=200.0)
+    parser.add_argument("--steer-worlds", type=int, default=4)
     parser.add_argument("--hour-minutes", type=float, default=60.0)
     a = parser.parse_args()
     torch.set_num_threads(1)
@@ -229,8 +276,12 @@ def main() -> None:
     for part in a.parts:
         if part == "kinematic":
             bench.rollouts(part, bench.kinematic, roamed)
-        elif part.startswith("steering"):
+        elif part == "steering-policy":
+            bench.steered_together(part)
+        elif part == "steering":
             bench.rollouts(part, lambda s, p=part: bench.steered(s, **HOW[p]), reached)
+        elif HOW.get(part, {}).get("controller") == "policy":
+            bench.together(part, **HOW[part])
         elif part in HOW:
             bench.rollouts(part, lambda s, p=part: bench.simulated(s, **HOW[p]), roamed)
         elif part == "diversity":

@@ -212,10 +212,29 @@ def test_several_futures_bend_where_the_character_walks(
 ) -> None:
     made = trained[0].generator(tracker.humanoid, 0.0)
     rng = torch.Generator().manual_seed(0)
-    futures = made.propose(made.begin(1, rng), rng, 9)[0]
-    assert futures.shape == (9, 12, tracker.humanoid.model.nq)
-    ends = futures[:, -1, :2]
-    assert float((ends[0] - ends[2]).norm()) < 0.05 < float((ends[3] - ends[8]).norm())
+    past = made.begin(2, rng)
+    futures = made.propose(past, rng, 9)
+    assert futures.shape == (2, 9, 12, tracker.humanoid.model.nq)
+    # Two as usual, then three ways each of what followed the most similar pasts.
+    ends = futures[0, :, -1, :2]
+    left, straight, right = ends[2:5] - past[0, -1, :2]
+    turns = [float(torch.linalg.cross(_flat(straight), _flat(x))[2]) for x in (left, right)]
+    assert turns[0] * turns[1] < 0
+    assert made.propose(past, rng, 1).shape[1] == 1
+
+
+def _flat(x: Tensor) -> Tensor:
+    return torch.cat((x, x.new_zeros(1)))
+
+
+def test_wide_codes_are_those_of_the_most_similar_pasts_each_once() -> None:
+    past = torch.randn(6, 12, 2, generator=torch.Generator().manual_seed(0))
+    codes = Codes(torch.empty(0), torch.arange(6.0)[:, None], torch.zeros(6, 1), torch.ones(2))
+    codes = replace(codes, keys=codes.key_of(past))
+    z = codes.wide(past[:2], 3)[:, 0].tolist()
+    assert z[0] == 0.0 and z[3] == 1.0 and len(set(z[:3])) == len(set(z[3:])) == 3
+    # Where there are fewer than asked for they come again.
+    assert codes.wide(past[:1], 8)[:, 0].tolist()[6:] == codes.wide(past[:1], 8)[:, 0].tolist()[:2]
 
 
 def test_reach_is_larger_for_a_hip_than_for_a_wrist(motions: Motions, tracker: Tracker) -> None:

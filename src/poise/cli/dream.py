@@ -45,6 +45,8 @@ class Options:
     steer: Annotated[str | None, arg(metavar="'X,Y X,Y'|FILE", help_behavior_hint="")] = None
     """Points to reach one after another, in m from where it begins, Z up; or a file with one on each
     line. After the last one it goes where it likes."""
+    style: Annotated[str | None, arg(metavar="LABEL", help_behavior_hint="")] = None
+    """Only motion of this label, where the generator's library has labels, such as dance."""
     generator: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A kinematic policy: its file, or the folder of poise train endless; by default the one that comes
     with Poise."""
@@ -92,7 +94,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     config = Dream(
         temperature=o.temperature, count=o.count, targets=targets, seed=o.seed, controller=o.controller,
-        lookahead=ahead, recover=o.recover, past=o.past, hold_feet=o.hold_feet, threads=o.threads,
+        lookahead=ahead, recover=o.recover, past=o.past, style=o.style, hold_feet=o.hold_feet,
+        threads=o.threads,
     )  # fmt: skip
     files = names_of(motion or out / "simulated.bvh", o.count)
     for file in files:

@@ -31,6 +31,7 @@ def run(
     """
     import torch
 
+    from poise.jobs.endless.labels import read_labels
     from poise.jobs.endless.model import GENERATOR
     from poise.jobs.endless.run import RUN_FILE, begin
     from poise.jobs.endless.training import train_generator
@@ -41,6 +42,7 @@ def run(
         if getattr(library, name):
             hint = "Leave it out; --from POLICY chooses the body" if name == "onto" else "Leave it out"
             raise PoiseError(f"the recipe endless has no --{name}", hint=hint)
+    labels = read_labels(folder)
     if (out / RUN_FILE).exists() and not training.resume:
         raise held_already(out)
     torch.set_num_threads(training.threads or cores())
@@ -59,8 +61,9 @@ def run(
     say(f"{len(motions.clips)} clips, {frames:,} frames to learn from; {config.steps:,} steps")
     with showing("training") as show:
         _, stats, stopped = train_generator(
-            motions, out, config, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}")
-        )
+            motions, out, config, None, lambda s: show(s.step / s.steps, f"{times(s)}  {figures(s)}"),
+            labels,
+        )  # fmt: skip
     if stopped:
         return interrupted(out, again)
     if stats is None:

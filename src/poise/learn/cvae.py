@@ -134,7 +134,7 @@ class CVAEObjective:
         self.net, self.config, self.steps, self.weights = net, config, steps, weights
         self.half = config.products == "bfloat16" or (config.products == "auto" and bfloat16_is_fast())
         self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "net": torch.optim.Adam(net.parameters(), lr=config.lr)
+            "net": torch.optim.Adam(net.parameters(), lr=config.lr, fused=True)
         }
 
     def modules(self) -> Mapping[str, torch.nn.Module]:

@@ -19,6 +19,9 @@ COMPARED = (-1, -5, -12)
 NEAREST = 8
 #: Speed (m/s) from which on a character that walks can be turned as fast as `BEND` (rad/s) at most.
 WALKS, BEND = 0.8, 0.7
+#: Where one of several futures is to be chosen: one in so many is drawn as usual; the others are of ever
+#: less similar pasts, each bent in so many ways.
+USUAL, BENDS = 8, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +39,20 @@ class Codes:
         keys: `(K, 3 D)` of pasts, see `key_of`.
         mean, log_var: `(K, Z)` of q.
         weights: `(D)` of a frame's numbers, in deviations.
+        kinds: `(K,)` which label the motion has, -1 for none; None where there are no labels.
     """
 
     keys: Tensor
     mean: Tensor
     log_var: Tensor
     weights: Tensor
+    kinds: Tensor | None = None
+
+    def only(self, kind: int) -> Codes:
+        """Those of one label."""
+        assert self.kinds is not None
+        rows = self.kinds == kind
+        return Codes(self.keys[rows], self.mean[rows], self.log_var[rows], self.weights)
 
     def key_of(self, past: Tensor) -> Tensor:
         """`(N, 3 D)` of pasts `(N, p, D)` in deviations: some of their frames, weighted."""
@@ -50,14 +61,26 @@ class Codes:
 
     def draw(self, past: Tensor, count: int, rng: torch.Generator, temperature: float) -> Tensor:
         """`(N * count, Z)`: so many codes for each of the pasts `(N, p, D)`, in deviations."""
-        apart = torch.cdist(self.key_of(past), self.keys)
-        near, index = apart.topk(min(NEAREST, len(self.keys)), largest=False)
+        near, index = self._nearest(past, NEAREST)
         least = near[:, :1].square().clamp_min(1e-6)
         share = (-(near.square() - least) / (2 * max(temperature, 1e-3) ** 2 * least)).softmax(-1)
         picks = torch.multinomial(share, count, replacement=True, generator=rng)
         code = index.gather(1, picks).flatten()
         noise = torch.randn(len(code), self.mean.shape[1], generator=rng)
         return self.mean[code] + temperature * (0.5 * self.log_var[code]).exp() * noise
+
+    def wide(self, past: Tensor, count: int) -> Tensor:
+        """`(N * count, Z)`: the middles of the codes of the `count` most similar pasts, each once, over
+        again where there are fewer."""
+        index = self._nearest(past, count)[1]
+        index = index[:, torch.arange(count) % index.shape[1]]
+        return self.mean[index.flatten()]
+
+    def _nearest(self, past: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Distances and numbers `(N, count)` of the most similar pasts, the nearest first."""
+        apart = torch.cdist(self.key_of(past), self.keys)
+        near, index = apart.topk(min(count, len(self.keys)), largest=False)
+        return near, index
 
 
 class Kinematic:
@@ -103,26 +126,38 @@ class Kinematic:
 
     @torch.no_grad()
     def propose(self, past: Tensor, rng: torch.Generator, count: int) -> Tensor:
-        """`(n, count, future, 7 + n)`: several futures of each past, each with a z of its own. All but
-        the first third of them bend to either side, as far as the character walks."""
+        """`(n, count, future, 7 + n)`: several futures of each past. One alone is drawn as usual. Of
+        more, one in `USUAL` is; the others are what followed the most similar pasts, as many as there is
+        room for, bent to either side as far as the character walks: somewhere to go is not left to
+        chance."""
         own = past_features(past.double(), self.fps).float()
-        frames = own.repeat_interleave(count, 0)
-        if self.codes is None:
-            z = self.net.draw(len(frames), rng, self.temperature)
-        else:
-            z = self.codes.draw(self.net.scaled(own), count, rng, self.temperature)
-        made = self.net.continued(frames, z).double()
-        if count > 1:
-            bend = torch.linspace(-BEND, BEND, count).double()
-            bend[: count // 3] = 0.0
-            pace = (made[..., :2].norm(dim=-1) / WALKS).clamp_max(1.0)
-            made[..., 2] += bend.repeat(len(past))[:, None] * pace
+        usual = -(-count // USUAL)
+        kinds = -(-(count - usual) // BENDS)
+        frames = own.repeat_interleave(usual + kinds, 0)
+        made = self.net.continued(frames, self._codes(own, usual, kinds, rng)).double()
+        made = made.unflatten(0, (len(past), -1))
+        bend = torch.linspace(-BEND, BEND, BENDS).double().repeat(kinds)[: count - usual]
+        bent = made[:, usual:].repeat_interleave(BENDS, 1)[:, : count - usual].clone()
+        pace = (bent[..., :2].norm(dim=-1) / WALKS).clamp_max(1.0)
+        bent[..., 2] += bend[:, None] * pace
+        made = torch.cat((made[:, :usual], bent), 1).flatten(0, 1)
         last = past[:, -1].double().repeat_interleave(count, 0)
         out = coordinates(made, last, self.fps)
         if self.bounds is not None:
             low, high = self.bounds
             out[..., 7:] = out[..., 7:].clamp(low, high)
         return out.unflatten(0, (len(past), count))
+
+    def _codes(self, past: Tensor, usual: int, kinds: int, rng: torch.Generator) -> Tensor:
+        """`(N (usual + kinds), Z)` after pasts `(N, p, 10 + n)`."""
+        if self.codes is None:
+            return self.net.draw(len(past) * (usual + kinds), rng, self.temperature)
+        scaled = self.net.scaled(past)
+        drawn = self.codes.draw(scaled, usual, rng, self.temperature)
+        if not kinds:
+            return drawn
+        parts = drawn, self.codes.wide(scaled, kinds)
+        return torch.cat([z.unflatten(0, (len(past), -1)) for z in parts], 1).flatten(0, 1)
 
     def rows(self) -> Mapping[str, Tensor]:
         """It remembers nothing but the past that it is given."""

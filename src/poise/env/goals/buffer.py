@@ -84,6 +84,19 @@ class BufferedGoal(Goal):
         self.low[ids] = torch.minimum(self.low[ids], qpos[:, 2])
         self.count[ids] += 1
 
+    def extend(self, ids: Tensor, qpos: Tensor) -> None:
+        """Several more frames `qpos (n, f, 7 + n)` in worlds `ids (n,)`, at most as many as are kept."""
+        (n, frames), at = qpos.shape[:2], self.count[ids]
+        before = torch.cat((self.qpos[ids, (at - 1) % self.size][:, None], qpos[:, :-1]), 1)
+        qvel = (difference(qpos.flatten(0, 1), before.flatten(0, 1)) * self.rate_hz).view(n, frames, -1)
+        qvel[at == 0, 0] = 0.0
+        rows, index = ids[:, None], at[:, None] + torch.arange(frames, device=self.device)
+        self.qvel[rows, index % self.size], self.qpos[rows, index % self.size] = qvel, qpos
+        packs = self._pack(qpos.flatten(0, 1), qvel.flatten(0, 1))
+        self.packs[rows, index % self.size] = packs.view(n, frames, -1)
+        self.low[ids] = torch.minimum(self.low[ids], qpos[..., 2].amin(1))
+        self.count[ids] += frames
+
     def coordinates(self, ids: Tensor, index: Tensor) -> Start:
         """qpos `(n, 7 + n)` and qvel `(n, 6 + n)` of frames `index (n,)` of worlds `ids (n,)`."""
         known = self.count[ids]

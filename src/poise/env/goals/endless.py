@@ -103,8 +103,7 @@ class EndlessGoal(GeneratorGoal):
                 first = int(self._next[i])
                 last = min(first + self.generator.future, int(self._end[i]))
                 one = torch.tensor([i], device=self.device)
-                for row in self._ways[first:last]:
-                    self.append(one, row[None])
+                self.extend(one, self._ways[None, first:last])
                 self._next[i] = last
         super().supply(ids)
 

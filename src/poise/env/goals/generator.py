@@ -82,8 +82,7 @@ class GeneratorGoal(BufferedGoal):
                 type(self.generator).__name__,
             )
         self.clear(ids)
-        for k in range(self.generator.past):
-            self.append(ids, frames[:, k].to(self.qpos))
+        self.extend(ids, frames.to(self.qpos))
         self.at[ids] = self.generator.past - 1
 
     def supply(self, ids: Tensor) -> None:
@@ -110,8 +109,8 @@ class GeneratorGoal(BufferedGoal):
                 "the character is to stand still there."
             )
         kept = short[good]
-        for k in range(g.future if len(kept) else 0):
-            self.append(kept, made[good, k])
+        if len(kept):
+            self.extend(kept, made[good])
 
     def rows(self) -> dict[str, Tensor]:
         own = {f"generator/{k}": v for k, v in self.generator.rows().items()}

@@ -17,7 +17,7 @@ FAR = 10_000.0
 #: Distance (m) that characters are to keep, with what a simulation is off; cost of a metre too near.
 APART, NEAR_COST = 0.7, 100.0
 #: Futures that are proposed where one is chosen.
-PROPOSALS = 24
+PROPOSALS = 240
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ class Dream:
         recover: a character that has fallen gets up and goes on.
         past: what the kinematic policy goes on from: its own frames, as the paper has it, or what the
             character did.
+        style: label of the motion of the library that is done, where that has labels; None does all.
         hold_feet: standing feet are held in place in what is written.
         threads: cores of lookahead, 0 is all of them.
     """
@@ -41,6 +42,7 @@ class Dream:
     lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     recover: bool = True
     past: Literal["own", "simulated"] = "own"
+    style: str | None = None
     hold_feet: bool = True
     threads: int = 0
 

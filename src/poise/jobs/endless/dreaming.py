@@ -74,7 +74,7 @@ def dream(
         raise PoiseError(f"a motion lasts from 0.1 s to 10 hours, got {seconds:g} s")
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
     model = generator if isinstance(generator, GeneratorModel) else load_generator(generator)
-    made = model.generator(tracker.humanoid, config.temperature)
+    made = model.generator(tracker.humanoid, config.temperature, config.style)
     rate = tracker.config.sim.control_hz
     if model.fps != rate:
         raise PoiseError(f"the generator makes {model.fps:g} frames a second, the policy does {rate:g}")

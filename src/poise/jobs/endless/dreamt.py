@@ -140,7 +140,7 @@ class Dreamt(Result):
             "characters": len(self.characters), "sentence": self.sentence,
             "seed": self.config.seed, "temperature": self.config.temperature,
             "controller": self.config.controller, "recover": self.config.recover,
-            "past": self.config.past, "help_n": 0.0,
+            "past": self.config.past, "style": self.config.style, "help_n": 0.0,
             "falls": times(self.lost), "back": times(self.back), "reached": times(self.reached),
             "falls_per_hour": round(self.falls_per_hour, 2), "stayed_down": self.stayed_down,
             **self.figures,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -29,12 +29,16 @@ ENCODER = ("net/encoder", "net/posterior", "net/coming")
 _CODES = ("keys", "mean", "log_var", "weights")
 
 
-class _Meta(TypedDict):
+class _Needed(TypedDict):
     kind: str
     config: dict[str, Any]
     hinges: list[str]
     fps: float
     about: dict[str, Any]
+
+
+class _Meta(_Needed, total=False):
+    labels: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,8 @@ class GeneratorModel:
         fps: frames a second.
         about: clips, steps, seconds, seed of the training.
         codes: from which z is drawn; None draws it from N(0, I).
+        labels: names of what is done in the library.
+        kinds: `(S,)` which label each seed has, -1 for none; None where there are no labels.
     """
 
     net: CVAE | CosineCVAE
@@ -58,19 +64,42 @@ class GeneratorModel:
     fps: float
     about: Mapping[str, Any] = field(default_factory=dict[str, Any])
     codes: Codes | None = None
+    labels: tuple[str, ...] = ()
+    kinds: Tensor | None = None
 
-    def generator(self, humanoid: Humanoid, temperature: float = 1.0) -> Kinematic:
-        """What makes its motion for a body.
+    def generator(
+        self, humanoid: Humanoid, temperature: float = 1.0, style: str | None = None
+    ) -> Kinematic:
+        """What makes its motion for a body; with `style` only motion of that label.
 
         Raises:
-            PoiseError: the body has other hinges.
+            PoiseError: the body has other hinges, or there is no such label.
         """
         if tuple(humanoid.hinges) != self.hinges:
             raise PoiseError(
                 "the generator is of another body",
                 hint="Give the policy that it was trained with, or train a generator for this one",
             )
-        return Kinematic(self.net, self.seeds, self.fps, temperature, self.bounds, self.codes)
+        seeds, codes = self.seeds, self.codes
+        if style is not None:
+            seeds, codes = self._styled(style)
+        return Kinematic(self.net, seeds, self.fps, temperature, self.bounds, codes)
+
+    def _styled(self, style: str) -> tuple[Tensor, Codes]:
+        """Seeds and codes of one label."""
+        has = [k for k in self.labels if self.codes is not None and self._count(k)]
+        if style not in has or self.codes is None or self.kinds is None:
+            known = f"it has {', '.join(has)}" if has else "its library has no labels"
+            raise PoiseError(f"the generator knows no style '{style[:40]}'; {known}", "style")
+        kind = self.labels.index(style)
+        return self.seeds[self.kinds == kind], self.codes.only(kind)
+
+    def _count(self, label: str) -> int:
+        """Codes of a label, 0 where none of its pasts is a seed."""
+        kind = self.labels.index(label)
+        if self.codes is None or self.codes.kinds is None or self.kinds is None:
+            return 0
+        return int((self.codes.kinds == kind).sum()) * bool((self.kinds == kind).any())
 
     def save(self, path: Path, half: bool = False) -> None:
         """Writes it as one file; `half` keeps numbers in half precision, and leaves out the encoder,
@@ -79,11 +108,13 @@ class GeneratorModel:
         tensors = {**weights, "seeds": self.seeds.float(), "bounds": self.bounds.float()}
         if self.codes is not None:
             tensors |= {f"codes/{k}": getattr(self.codes, k) for k in _CODES}
+            if self.codes.kinds is not None and self.kinds is not None:
+                tensors |= {"codes/kinds": self.codes.kinds, "kinds": self.kinds}
         if half:
             tensors = {k: v.half() for k, v in tensors.items() if not k.startswith(ENCODER)}
         meta = {
             "kind": "kinematic policy", "config": asdict(self.net.config), "hinges": list(self.hinges),
-            "fps": self.fps, "about": dict(self.about),
+            "fps": self.fps, "about": dict(self.about), "labels": list(self.labels),
         }  # fmt: skip
         save_checkpoint(path, tensors, meta)
 
@@ -116,7 +147,17 @@ def load_generator(path: str | Path | None = None) -> GeneratorModel:
     codes = None
     if any(k.startswith("codes/") for k in tensors):
         codes = Codes(*(take(tensors, f"codes/{k}") for k in _CODES))
+    kinds = None
+    if codes is not None and "codes/kinds" in tensors:
+        kinds = take(tensors, "kinds").long()
+        codes = replace(codes, kinds=take(tensors, "codes/kinds").long())
+        if (
+            len(kinds) != len(tensors["seeds"])
+            or codes.kinds is None
+            or len(codes.kinds) != len(codes.keys)
+        ):
+            raise PoiseError("the file's labels are damaged", file)
     return GeneratorModel(
         net.eval(), tensors["seeds"].double(), tensors["bounds"].double(), hinges, float(meta["fps"]),
-        meta["about"], codes,
+        meta["about"], codes, tuple(meta.get("labels", ())), kinds,
     )  # fmt: skip

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
+from poise.jobs.endless.labels import Label, clips_of_seeds, kinds_of, names_of, spread
 from poise.jobs.endless.model import GENERATOR, GeneratorModel
 from poise.jobs.perpetual.run import clips_of
 from poise.jobs.track.placement import place
@@ -117,12 +118,12 @@ def motions_of(
     parts = [features_of(q, rate).float() for q in qpos]
     first = torch.tensor(np.cumsum([0, *(len(q) for q in qpos)]))
     pasts = [q[i : i + config.past] for q in qpos for i in range(0, len(q) - config.past, config.past)]
-    picks = np.linspace(0, len(pasts) - 1, min(SEEDS, len(pasts))).round().astype(int)
+    picks = spread(len(pasts), SEEDS)
     angles = torch.cat(qpos)[:, 7:]
     bounds = torch.stack((angles.amin(0), angles.amax(0)))
     frames = torch.cat(parts)
     return Motions(
-        Frames(frames, first), torch.stack([pasts[i] for i in picks]), bounds,
+        Frames(frames, first), torch.stack([pasts[i] for i in picks.tolist()]), bounds,
         reach_of(frames, tracker.humanoid.table, rate), tuple(tracker.humanoid.hinges), rate,
         tuple(c.name for c in library),
     )  # fmt: skip
@@ -165,8 +166,9 @@ def train_generator(
     config: Endless | None = None,
     minutes: float | None = None,
     on_block: Callable[[BlockStats], bool | None] | None = None,
+    labels: Sequence[Label] = (),
 ) -> tuple[GeneratorModel, BlockStats | None, bool]:
-    """Trains, or goes on training, in `folder`, and writes the model there.
+    """Trains, or goes on training, in `folder`, and writes the model there, with `labels` of its clips.
 
     Returns:
         the model, the last block (None where nothing was left to do), and whether Ctrl-C ended the
@@ -187,10 +189,12 @@ def train_generator(
         "clips": list(motions.clips), "frames": len(motions.frames.frames), "steps": trainer.step,
         "of": c.steps, "seconds": round(trainer.seconds, 1), "seed": c.seed,
     }  # fmt: skip
-    codes = codes_of(made, motions, c.codes) if c.codes else None
+    kinds = kinds_of(motions.clips, labels)
+    codes = codes_of(made, motions, c.codes, kinds) if c.codes else None
     model = GeneratorModel(
-        made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about, codes
-    )
+        made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about, codes,
+        names_of(labels), kinds[clips_of_seeds(motions, made.config.past)] if labels else None,
+    )  # fmt: skip
     model.save(folder / GENERATOR)
     return model, stats, stopped
 
@@ -204,12 +208,13 @@ def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
 
 
 @torch.no_grad()
-def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int) -> Codes:
-    """Codes of windows of the library, evenly spread."""
+def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int, kinds: Tensor | None = None) -> Codes:
+    """Codes of windows of the library, evenly spread; `kinds (C,)` are the clips' labels."""
     p, window = net.config.past, net.config.past + net.config.future
     frames, room = motions.frames.frames, motions.frames.room
     usable = (room >= window).nonzero()[:, 0]
     start = usable[torch.linspace(0, len(usable) - 1, min(count, len(usable))).long()]
+    clip = torch.searchsorted(motions.frames.first, start, right=True) - 1
     codes = Codes(torch.empty(0), torch.empty(0), torch.empty(0), motions.weights.sqrt())
     parts = list[tuple[Tensor, Tensor, Tensor]]()
     for some in start.split(512):
@@ -217,4 +222,5 @@ def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int) -> Codes:
         code = net.encode(x[:, :p], x[:, p:])
         parts.append((codes.key_of(x[:, :p]), code.mean, code.log_var))
     keys, mean, log_var = (torch.cat(x) for x in zip(*parts, strict=True))
-    return replace(codes, keys=keys, mean=mean, log_var=log_var)
+    kinds = kinds[clip] if kinds is not None and bool((kinds >= 0).any()) else None
+    return replace(codes, keys=keys, mean=mean, log_var=log_var, kinds=kinds)

@@ -1,0 +1,112 @@
+"""Rollouts of motion without end side by side: as many worlds, stepped together, the policy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from poise.env import ImitationEnv
+from poise.env.goals import EndlessGoal
+from poise.env.goals.steering import Steering
+from poise.eval import simulate
+from poise.jobs.track.placement import place
+from poise.jobs.track.tracking import imitation_of
+from poise.jobs.tracker import Tracker
+from poise.sim.guard import UnstableError
+from poise.synth.generator import Kinematic
+
+#: Frames between two looks at how far it is.
+LOOK = 900
+
+
+@dataclass
+class Rollouts:
+    """What worlds did.
+
+    Attributes:
+        done, asked: `(N, T, 7 + n)`, as it was simulated, and the goals; only `count` frames are there.
+        lost, back, reached: (world, s).
+        bad: how often all worlds began anew since a simulation went bad.
+    """
+
+    done: np.ndarray
+    asked: np.ndarray
+    count: int
+    lost: list[tuple[int, float]]
+    back: list[tuple[int, float]]
+    reached: list[tuple[int, float]]
+    bad: int = 0
+
+    def of(self, world: int) -> tuple[list[float], list[float], bool]:
+        """s of a world's falls, s that each took until it was up again, and whether it stayed down."""
+        falls = [t for i, t in self.lost if i == world]
+        ups = [t for i, t in self.back if i == world]
+        away = [up - fall for fall, up in zip(falls, ups, strict=False)]
+        return falls, away, len(ups) < len(falls)
+
+
+class _Keeps:
+    """Keeps every world's frames."""
+
+    def __init__(self, goal: EndlessGoal, out: Rollouts, look: Callable[[Rollouts], None]):
+        self.goal, self.out, self.look = goal, out, look
+        self._all = torch.arange(goal.num_envs)
+
+    def see(self, env: ImitationEnv, step: int) -> bool:
+        """One more frame."""
+        if step == 0:
+            return False
+        k = self.out.count
+        self.out.done[:, k] = env.backend.state.qpos
+        self.out.asked[:, k] = self.goal.coordinates(self._all, self.goal.at)[0]
+        self.out.count += 1
+        if self.out.count % LOOK == 0:
+            told(self.out, self.goal)
+            self.look(self.out)
+        return False
+
+
+def told(out: Rollouts, goal: EndlessGoal) -> None:
+    """Takes the times from a goal."""
+    for name, found in (("lost", goal.falls), ("back", goal.back), ("reached", goal.reached)):
+        setattr(out, name, [(i, round(s / goal.rate_hz, 2)) for i, s in found])
+
+
+def rollouts(
+    tracker: Tracker, made: Kinematic, count: int, seconds: float,
+    look: Callable[[Rollouts], None] = lambda _: None,
+    recover: bool = True, past: str = "own", targets: tuple[tuple[float, float], ...] = (), **_: Any,
+) -> Rollouts:  # fmt: skip
+    """`count` rollouts; number k begins from a past drawn with seed k, all later draws are of seed 0."""
+    task = imitation_of(tracker, [place(tracker.example, tracker)])
+    task = replace(task, task=replace(task.task, help_by="all"))
+    rate, steps = tracker.config.sim.control_hz, round(seconds * tracker.config.sim.control_hz)
+    begins = [made.begin(1, torch.Generator().manual_seed(k)) for k in range(count)]
+    goal = EndlessGoal(
+        made, tracker.humanoid, rate, tracker.recovery_clips if recover else None, count, seed=0,
+        lead=max(*tracker.config.window, 1) + 1, pasts=torch.cat(begins),
+        steering=Steering(targets), simulated=past == "simulated",
+    )  # fmt: skip
+    goal.draw(torch.arange(count))
+    width = tracker.humanoid.model.nq
+    empty = np.zeros((2, count, steps, width), np.float32)
+    out = Rollouts(empty[0], empty[1], 0, [], [], [])
+    env = task.env(count, None, False, 1, help_scale=0.0)
+    try:
+        while out.count < steps:
+            env.backend.write(None, *goal.start(None))
+            env.age[:] = 0
+            try:
+                keeps = _Keeps(goal, out, look)
+                simulate(env, tracker.policy, env.set_goal(goal), steps - out.count, keeps)
+            except UnstableError:
+                out.bad += 1
+                env.action[:] = 0
+    finally:
+        env.close()
+    told(out, goal)
+    return out

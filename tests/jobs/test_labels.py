@@ -1,0 +1,67 @@
+"""Styles: labels of a library's clips, and motion of one of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from poise.errors import PoiseError
+from poise.jobs.endless.labels import clips_of_seeds, kinds_of, names_of, read_labels
+from poise.jobs.endless.model import GeneratorModel, load_generator
+from poise.jobs.endless.training import Endless, motions_of, train_generator
+from poise.jobs.open import open_run
+from poise.jobs.tracker import Tracker
+from poise.learn.cvae import CVAETraining
+from poise.motion import ClipLibrary
+from poise.nets.cvae import CVAEConfig
+from toy_policy import walk
+
+SMALL = CVAEConfig(past=10, future=12, latent=4, hidden=16, decoder="cosine", cosines=6, blocks=1)
+TEXT = "# a comment\nslow  (?i)stroll\nwalk _2$|^w # the second\nslow crawl\n"
+
+
+@pytest.fixture(scope="module")
+def tracker() -> Tracker:
+    return open_run(None).tracker
+
+
+def test_the_first_label_that_fits_counts(tmp_path: Path) -> None:
+    (tmp_path / "labels.txt").write_text(TEXT)
+    labels = read_labels(tmp_path)
+    assert names_of(labels) == ("slow", "walk")
+    assert kinds_of(["a_Stroll_2", "b_2", "crawl", "nothing"], labels).tolist() == [0, 1, 0, -1]
+    empty = tmp_path / "none"
+    empty.mkdir()
+    assert read_labels(empty) == ()
+    for text, what in (("walk", "line 1 has a label alone"), ("\nwalk [", "line 2 has no regular")):
+        (tmp_path / "labels.txt").write_text(text)
+        with pytest.raises(PoiseError, match=what):
+            read_labels(tmp_path)
+    with pytest.raises(PoiseError, match="could not be read"):
+        read_labels(tmp_path / "no.txt")
+
+
+def test_a_style_is_motion_of_its_label_alone(tracker: Tracker, tmp_path: Path) -> None:
+    clips = [walk().replaced(name=name) for name in ("one", "two")]
+    motions = motions_of(ClipLibrary.of(clips), tracker, SMALL, lambda _: None)
+    (tmp_path / "labels.txt").write_text("first one\nsecond two\nthird three")
+    config = Endless(SMALL, CVAETraining(batch=4), steps=2, codes=20)
+    model = train_generator(motions, tmp_path, config, labels=read_labels(tmp_path))[0]
+    seen = clips_of_seeds(motions, 10)
+    assert len(seen) == len(motions.seeds) and set(seen.tolist()) == {0, 1}
+    again = load_generator(tmp_path)
+    for made in (model, again):
+        assert made.labels == ("first", "second", "third")
+        styled = made.generator(tracker.humanoid, style="second")
+        assert made.codes is not None and made.codes.kinds is not None and styled.codes is not None
+        assert torch.equal(styled.codes.mean, made.codes.mean[made.codes.kinds == 1])
+        assert torch.equal(styled.seeds.float(), made.seeds[seen == 1].float())
+        assert 0 < len(styled.codes.keys) < len(made.codes.keys)
+    for wrong in ("third", "fourth"):
+        with pytest.raises(PoiseError, match=f"no style '{wrong}'; it has first, second"):
+            again.generator(tracker.humanoid, style=wrong)
+    plain = GeneratorModel(model.net, model.seeds, model.bounds, model.hinges, model.fps, {}, model.codes)
+    with pytest.raises(PoiseError, match="its library has no labels"):
+        plain.generator(tracker.humanoid, style="first")
