@@ -93,6 +93,8 @@ def thrown(tracker: Tracker, counts: dict[float, int], threads: int) -> dict[str
     """The same throws at each level, by both laws and at two physics rates, and by stiffness."""
     out: dict[str, Any] = {}
     for rate, count in counts.items():
+        if not count:
+            continue
         for law in ("eq8", "algorithm1"):
             # Two tried steps for each force: a fifth of the throws is what the time allows.
             many = count if law == "eq8" else max(20, count // 5)
@@ -100,7 +102,8 @@ def thrown(tracker: Tracker, counts: dict[float, int], threads: int) -> dict[str
                 tracker, Compliance(law=law), LEVELS, many, rate, threads
             )  # type: ignore[arg-type]
     soft = (4000.0, 1000.0, 400.0, 200.0, 100.0, 50.0)
-    out["stiffness, 60 Hz"] = _thrown(tracker, Stiffness(), soft, counts[60.0], 60.0, threads)
+    if counts[60.0]:
+        out["stiffness, 60 Hz"] = _thrown(tracker, Stiffness(), soft, counts[60.0], 60.0, threads)
     return out
 
 
@@ -185,8 +188,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--svg", type=Path)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--throws", type=int, default=200, help="at 60 Hz")
-    parser.add_argument("--fine", type=int, default=200, help="throws at 600 Hz")
+    parser.add_argument("--throws", type=int, default=200, help="at 60 Hz; 0 leaves what is there")
+    parser.add_argument("--fine", type=int, default=200, help="throws at 600 Hz; 0 leaves what is there")
     args = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
@@ -199,7 +202,7 @@ def main() -> None:
     else:
         found = cost(tracker)
     told = json.loads(args.json.read_text()) if args.json.exists() else {}
-    args.json.write_text(json.dumps({**told, args.part: found}, indent=1) + "\n")
+    args.json.write_text(json.dumps({**told, args.part: {**told.get(args.part, {}), **found}}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

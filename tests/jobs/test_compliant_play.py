@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from poise.control import Stiffness
-from poise.env.scenes import Doorway, Hands, Pull, Throws
+from poise.env.scenes import Balance, Doorway, Hands, Pull, Throws, Trampoline
 from poise.errors import PoiseError
 from poise.jobs.compliant.play import WORDS, play
 from poise.jobs.compliant.watch import footfalls
@@ -68,6 +68,26 @@ def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:
     assert "<title>door, opening" in page and len(made.movers) == 3
     with pytest.raises(PoiseError, match="the scene has a motion of its own"):
         play(Doorway(1.0), tracker, read_clip(WALK), count=2, threads=1)
+
+
+def test_on_a_trampoline(tracker: Tracker) -> None:
+    made = play(Trampoline(0.1), tracker, None, None, 2, seconds=2.2, threads=1, name="trampoline")
+    assert set(made.figures) == set(made.words) and len(made.movers) == 1
+    for figures in (made.figures, made.stiff):
+        assert figures["plate_m"] > 0.05 and figures["force_peak_n"] > 300.0
+        assert abs(figures["energy_j"]) < 1000.0 and abs(figures["foot_low_m"]) < 0.3
+    # The plate goes up by about what its actuators do.
+    height = made.movers[0].pos[:, 2]
+    assert 0.04 < height.max() - height[0] < 0.25
+
+
+def test_with_a_ball_on_the_head(tracker: Tracker) -> None:
+    made = play(Balance(), tracker, None, None, 2, seconds=0.8, threads=1, name="ball")
+    assert made.figures["goal_moved_m"] > 0.0 == made.stiff["goal_moved_m"]
+    for figures in (made.figures, made.stiff):
+        assert figures["stays_s"] == pytest.approx(0.8, abs=0.1) and figures["tilt_deg"] < 45.0
+    # The forces are fictional: what is felt is drawn, and the rod moves in the report.
+    assert len(made.movers) == 2 and len(made.arrows[5]) == 2
 
 
 def test_steps_by_hand() -> None:

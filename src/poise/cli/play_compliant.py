@@ -28,19 +28,20 @@ RESULTS = ("simulated.bvh", "score.json", "figures.json", "report.html")
 @dataclass(frozen=True)
 class Options:
     """Let a trained policy stand, or do a motion, in a scene in which something pushes it: a ball that
-    is thrown, a sustained pull, a partner hand in hand. It gives way; the same is simulated without
+    is thrown, a sustained pull, a partner hand in hand, a door, a trampoline, a ball on a rod on its
+    head. It gives way; the same is simulated without
     compliance, and a table compares both. Writes the motion, figures.json, score.json, report.html."""
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """throws, pull, hands or door."""
+    """throws, pull, hands, door, trampoline or ball."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
     """The folder of the results."""
     clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """What the character does; by default it stands."""
     duration: Annotated[float, arg(metavar="SECONDS")] = 8.0
     """How long it stands."""
-    level: Annotated[float, arg(metavar="0-1")] = 0.16
-    """Level of compliance."""
+    level: Annotated[float | None, arg(metavar="0-1", help_behavior_hint="")] = None
+    """Level of compliance; by default 0.16, or for the ball a stiffness."""
     stiffness: Annotated[float | None, arg(metavar="N/M", help_behavior_hint="")] = None
     """Give way as a spring of so many newtons per metre in place of --level."""
     lag: Annotated[float, arg(metavar="SECONDS")] = 0.5
@@ -61,8 +62,14 @@ class Options:
     """throws: of the ball (1)."""
     width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """door: how wide (1)."""
+    height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """trampoline: how far its actuators rise for a bounce (0.15)."""
+    length: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """ball: of the rod (1)."""
+    pushes: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
+    """ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0)."""
     seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None
-    """throws: of the draws (0)."""
+    """throws, ball: of the draws (0)."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
     along and is told places alone; by default the one for rotations that comes with Poise."""
@@ -103,11 +110,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.open and not webbrowser.open(paths["report"].absolute().as_uri()):
         raise PoiseError("no browser could be opened", paths["report"], "Open the page by hand")
     result = {"scene": o.scene, "compliant": dict(played.figures), "without": dict(played.stiff)}
-    return Answer(result, paths, given.notes)
+    return Answer(result, paths, () if given is None else given.notes)
 
 
-def given_of(options: Options) -> Compliance | Stiffness:
-    """How the character gives way.
+def given_of(options: Options) -> Compliance | Stiffness | None:
+    """How the character gives way; None leaves it to the scene.
 
     Raises:
         PoiseError: numbers that make no sense.
@@ -116,7 +123,7 @@ def given_of(options: Options) -> Compliance | Stiffness:
 
     if options.stiffness is not None:
         return Stiffness(options.stiffness, options.lag)
-    return Compliance(options.level)
+    return None if options.level is None else Compliance(options.level)
 
 
 def scene_of(options: Options) -> PlayScene:
@@ -135,7 +142,8 @@ def scene_of(options: Options) -> PlayScene:
     kind: Any = SCENES[o.scene]
     stated: dict[str, Any] = {
         "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
-        "sway": o.sway, "mass": o.mass, "width": o.width, "seed": o.seed,
+        "sway": o.sway, "mass": o.mass, "width": o.width, "height": o.height, "length": o.length,
+        "pushes": o.pushes, "seed": o.seed,
     }  # fmt: skip
     stated = {k: v for k, v in stated.items() if v is not None}
     own = {f.name for f in fields(kind)}

@@ -11,7 +11,7 @@ from poise.errors import PoiseError
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _BALL = int(mujoco.mjtJoint.mjJNT_BALL)
-_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_JOINT, _SITE = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_SITE)
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,9 @@ def place_of(model: mujoco.MjModel, name: str, body: int) -> Place:
     coordinates = [
         np.arange(n) + at for n, at in zip(wide[joints], model.jnt_qposadr[joints], strict=True)
     ]
-    driven = (model.actuator_trntype == _JOINT) & np.isin(model.actuator_trnid[:, 0], joints)
+    at, by = model.actuator_trnid[:, 0], model.actuator_trntype
+    sites = np.flatnonzero(np.isin(model.site_bodyid, bodies))
+    driven = (by == _JOINT) & np.isin(at, joints) | (by == _SITE) & np.isin(at, sites)
     return Place(
         name,
         _slice(name, bodies),

@@ -5,7 +5,7 @@ from poise.env.events.event import Condition, Event, Happening
 from poise.env.events.in_scene import InScene, MeteredPart, ScenePart
 from poise.env.events.push import OnePush, Push
 from poise.env.events.pushes import Pushes, Pushing
-from poise.env.events.things import Move, SetDown, Switch, Throw, near
+from poise.env.events.things import Move, SetDown, Switch, Throw, always, near
 
 __all__ = [
     "Condition",
@@ -22,6 +22,7 @@ __all__ = [
     "SetDown",
     "Switch",
     "Throw",
+    "always",
     "near",
     "touches_of",
 ]

@@ -49,7 +49,7 @@ class InScene:
     touches: tuple[str, ...] = ()
     metered: tuple[str, ...] = ()
     felt: tuple[str, ...] = ()
-    felt_part: Mapping[str, Callable[[SceneSim, Tensor], Tensor]] = field(default_factory=dict)
+    felt_part: Mapping[str, Callable[[ScenePart, Tensor], Tensor]] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     ends: Literal["character", "world"] = "character"
 
@@ -124,7 +124,7 @@ class ScenePart(Plugin):
             seen = self.sim.link(end.name) if end.link else self.sim.touch(end.name)
             body[mine, i], point[mine, i] = end.body, seen.point.to(like)
             part = self.given.felt_part.get(end.name)
-            acts = seen.force if part is None else part(self.sim, seen.force)
+            acts = seen.force if part is None else part(self, seen.force)
             force[mine, i] = end.sign * acts.to(like)
         return Felt(body, point, force, driven=False)
 

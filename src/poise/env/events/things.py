@@ -207,6 +207,11 @@ def near(a: str, b: str, metres: float) -> Condition:
     return condition
 
 
+def always(sim: SceneSim) -> Tensor:
+    """In all worlds."""
+    return torch.ones(sim.num_envs, dtype=torch.bool, device=sim.backend.device)
+
+
 @dataclass(frozen=True)
 class Move:
     """A thing that goes a way of its own: it is set to it at every control step, velocity and all.

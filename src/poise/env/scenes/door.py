@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.events import Happening, InScene, SetDown
+from poise.env.events import Happening, InScene, ScenePart, SetDown
 from poise.env.frame import Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
 from poise.env.scenes.stage import Stage, hand_of
@@ -109,9 +109,9 @@ def way(sim: SceneSim, door: str = "door") -> Tensor:
     return quat_rotate(quat, torch.tensor([1.0, 0.0, 0.0]).to(quat).expand(len(quat), 3))
 
 
-def across(sim: SceneSim, force: Tensor) -> Tensor:
+def across(part: ScenePart, force: Tensor) -> Tensor:
     """The part of a force that does not move the knob."""
-    n = way(sim).to(force)
+    n = way(part.sim).to(force)
     return force - (force * n).sum(-1, keepdim=True) * n
 
 

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from poise.body import Humanoid
-from poise.env.events import InScene, Move, Switch
+from poise.env.events import InScene, Move, Switch, always
 from poise.env.reference import Reference
 from poise.env.scenes.stage import Stage, hand_of
 from poise.errors import PoiseError
-from poise.sim import Link, SceneSim
+from poise.sim import Link
 from poise.sim.props import Carrier
 
 
@@ -63,7 +63,7 @@ class Hands:
         part = InScene(
             sees=(name,),
             felt=("hands",),
-            events=(Move(name, self._path(velocity, ahead)), Switch("hands", _always)),
+            events=(Move(name, self._path(velocity, ahead)), Switch("hands", always)),
         )
         return Stage((prop,), (Link("hands", name, body, "ball", measured=True),), (), (part,))
 
@@ -79,7 +79,3 @@ class Hands:
             return qpos, qvel
 
         return path
-
-
-def _always(sim: SceneSim) -> Tensor:
-    return torch.ones(sim.num_envs, dtype=torch.bool, device=sim.backend.device)

@@ -6,13 +6,21 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from poise.body import Humanoid
+from poise.control import Compliance, Stiffness
 from poise.env.frame import ObsTerm, RewardTerm
 from poise.env.goals.goal import Goal
 from poise.env.plugins import Plugin
 from poise.env.reference import Reference
 from poise.errors import PoiseError
-from poise.sim import Backend, Link, Touch
+from poise.sim import Backend, Floor, Link, Plane, Touch
 from poise.sim.props import Prop
+
+Given = Compliance | Stiffness
+
+
+def as_given(given: Given | None) -> Given:
+    """The paper's compliance where nothing else is stated."""
+    return given or Compliance()
 
 
 class Stage(NamedTuple):
@@ -21,7 +29,9 @@ class Stage(NamedTuple):
     Attributes:
         props, links, touches: see `sim.Scene`; the character's bodies have their own names.
         plugins: of the task; those that tell forces (`Plugin.felt`) are what the character gives way to.
+        floor: what they stand on.
         obs, rewards: of a policy that learns the scene: the task's state and reward.
+        yields: how a character gives way in the scene, of what is stated, None for nothing.
         from_start: whether episodes begin with the motion's first frame, since the scene goes by time.
     """
 
@@ -32,6 +42,8 @@ class Stage(NamedTuple):
     obs: tuple[ObsTerm, ...] = ()
     rewards: tuple[RewardTerm, ...] = ()
     from_start: bool = False
+    floor: Floor = Plane()
+    yields: Callable[[Given | None], Given] = as_given
 
 
 class PlayScene(Protocol):

@@ -22,8 +22,8 @@ from poise.env.scenes import PlayScene
 from poise.errors import PoiseError
 from poise.eval import run_episodes, write_score
 from poise.eval.rolloutset import RolloutSet
-from poise.jobs.compliant.meters import meter_of, words_of
 from poise.jobs.compliant.motions import motion_of
+from poise.jobs.compliant.scene_meters import meter_of, words_of
 from poise.jobs.compliant.standing import standing
 from poise.jobs.compliant.watch import Watch
 from poise.jobs.deliver import make_report, simulated_clip
@@ -129,7 +129,7 @@ def play(
     Args:
         policy: see `poise.track`.
         clip: what the character does; None stands at ease for so many `seconds`.
-        given: how it gives way; None is Compliance().
+        given: how it gives way; None is what suits the scene, Compliance() for most.
         count: of episodes, side by side.
         name: of the scene, by default that of its class.
 
@@ -143,9 +143,9 @@ def play(
     clip = clip or own_motion
     task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
     stage = scene.stage(task.humanoid, task.reference)
-    task = replace(task, props=stage.props, links=stage.links, touches=stage.touches)
+    task = replace(task, props=stage.props, links=stage.links, touches=stage.touches, floor=stage.floor)
     both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
-    for compliance in (given or Compliance(), None):
+    for compliance in (stage.yields(given), None):
         own = replace(task.task, plugins=stage.plugins, compliance=compliance, help_by="all")
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads))
     (imitation, rollouts, seen, evaluation), (_, others, other, _) = both
