@@ -16,9 +16,10 @@ from poise.nets.between import Between
 from poise.nets.transition import Filled as Transition
 from poise.nets.transition import Known
 from poise.spatial import slerp
+from poise.synth.flight import flown
 from poise.synth.footlock import lock_feet
 from poise.synth.gaps import Gap
-from poise.synth.limits import Calmed, Motion, calmed, excess, flown
+from poise.synth.limits import Calmed, Feet, Motion, calmed, excess
 from poise.synth.other_rig import OtherRig
 from poise.synth.planted import planted
 from poise.synth.seams import meet, sampled, spread
@@ -73,6 +74,7 @@ class Filler:
         feet: its joints that may stand.
         limits: `(J,)` m/s that its joints reach at most.
         aloft: m that each keyframe is off the floor, 0 for those that stand.
+        speeds: m/s, the level velocity at those in the air.
         calmed: what each gap was made of to keep to what people reach, by its ends.
         best: the network's best guess of each gap, which filling it anew needs again.
     """
@@ -85,6 +87,7 @@ class Filler:
     feet: Sequence[int]
     limits: Tensor
     aloft: dict[int, float]
+    speeds: dict[int, Tensor] = field(default_factory=dict[int, Tensor])
     calmed: dict[Gap, Calmed] = field(default_factory=dict[Gap, Calmed])
     best: dict[Gap, tuple[Tensor, Tensor, Tensor]] = field(
         default_factory=dict[Gap, tuple[Tensor, Tensor, Tensor]]
@@ -111,28 +114,30 @@ class Filler:
         ends = (root[[a, b]], rot[[a, b]])
         made = spread(ends, (made[0], made[1]))
         before, after = (self.aloft.get(k, 0.0) for k in gap)
-        in_air = torch.zeros(b - a + 1, dtype=torch.bool)
-        if jumps := max(before, after) > 0.0:
-            flight = flown(plain[0][:, 2], before, after, self.own.fps)
-            here, there = ends[0][:, None, :2].to(made[0]).unbind(0)
-            level = torch.lerp(here, there, flight.along[:, None])
-            path = torch.cat((level, flight.height[:, None]), 1)
+        flight = None
+        if max(before, after) > 0.0:
+            speeds = self.speeds.get(a), self.speeds.get(b)
+            flight = flown(plain[0][:, 2], ends[0][:, :2], before, after, self.own.fps, speeds)
+            path = torch.cat((flight.level, flight.height[:, None]), 1)
             made, plain = (path, made[1]), (path.clone(), plain[1])
-            in_air[0], in_air[1:-1], in_air[-1] = before > 0.0, flight.in_air, after > 0.0
 
-        def finish(motion: Motion, hold: bool) -> Motion:
+        def finish(motion: Motion, feet: Feet) -> Motion:
             root[a + 1 : b], rot[a + 1 : b] = motion
-            self._finish(root, rot, gap, contact[:, :0] if jumps or not hold else contact)
-            if jumps and hold:
-                here = slice(a, b + 1)
-                rot[here] = planted(self.own.skeleton, root[here], rot[here], in_air, self.own.fps)
+            holds = feet == "held" and flight is None
+            self._finish(root, rot, gap, contact if holds else contact[:, :0])
+            if flight is not None and feet == "held":
+                here, off = slice(a, b + 1), (before > 0.0, after > 0.0)
+                moved = planted(self.own.skeleton, (root[here], rot[here]), off, flight, self.own.fps)
+                root[here], rot[here] = moved
             return root[a + 1 : b].clone(), rot[a + 1 : b].clone()
 
         def over(motion: Motion) -> float:
             whole = tuple(torch.cat((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
             return excess(self.own.skeleton, self.limits, (whole[0], whole[1]), self.own.fps)[0]
 
-        done = calmed(made, plain, finish, over, self.filling.foot_lock, most)
+        # Feet that are let go would be under the floor before and after a flight.
+        ways: tuple[Feet, ...] = ("held",) if flight is not None else ("held", "free")
+        done = calmed(made, plain, finish, over, ways if self.filling.foot_lock else ("free",), most)
         root[a + 1 : b], rot[a + 1 : b] = done.motion
         self.calmed[gap] = done
 

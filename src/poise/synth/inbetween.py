@@ -18,6 +18,7 @@ from poise.motion.pack import unpack_clips
 from poise.motion.windows import foot_joints, still_root, without_still_root
 from poise.spatial import slerp
 from poise.synth.filler import EACH_GAP, Filler, Filling, interpolated
+from poise.synth.flight import flight_speeds
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
 from poise.synth.limits import ALOFT_M, Calmed, fastest, off_floor, under_floor
 from poise.synth.other_rig import OtherRig
@@ -93,7 +94,8 @@ def fill_keyframes(
         if float(d) > 0.0
     ]
     aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
-    filler = Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft)
+    speeds = flight_speeds(root[:, :2], keys, aloft, own.fps)
+    filler = Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft, speeds)
     clips: list[Clip] = []
     faults: list[GapFault] = []
     for sample in range(filling.samples):
@@ -124,7 +126,7 @@ def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
         return ", ".join(gaps[:6]) + (f" and {len(gaps) - 6} more" if len(gaps) > 6 else "")
 
     less = [f"{a} to {b} ({100 * c.share:.0f} %)" for (a, b), c in calmed.items() if c.share < 1.0]
-    free = [f"{a} to {b}" for (a, b), c in calmed.items() if not c.held]
+    free = [f"{a} to {b}" for (a, b), c in calmed.items() if c.feet == "free"]
     fast = [f"{a} to {b} ({c.over:.1f} x)" for (a, b), c in calmed.items() if c.over > 1.0]
     out: list[str] = []
     if less:
