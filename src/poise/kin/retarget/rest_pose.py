@@ -70,7 +70,7 @@ def with_rest_pose(clip: Clip) -> Rested:
 
 
 def _skeleton(skeleton: Skeleton, rot: Tensor) -> Skeleton:
-    """The skeleton whose rest pose has the world rotations `rot (J, 4)`; what its file's own frames
+    """The skeleton with a rest pose of world rotations `rot (J, 4)`; what its file's own frames
     say is forgotten."""
     offsets = torch.tensor(skeleton.offsets)
     above = rot[[max(p, 0) for p in skeleton.parents]]
