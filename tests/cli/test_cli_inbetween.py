@@ -45,3 +45,14 @@ def test_iterations_must_be_a_sensible_number(
     argv = ["inbetween", str(walk), "--keyframes", "0,30", "-o", str(tmp_path / "o.bvh")]
     assert main([*argv, "--adapt", "-1"]) == 2
     assert "--adapt must be 0 to 1000" in capsys.readouterr().err
+
+
+def test_a_name_without_a_format_is_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk = Path(str(files("poise"))) / "data/walk.bvh"
+    argv = ["inbetween", str(walk), "--keyframes", "0,30", "-o", str(tmp_path / "out"), "--samples", "3"]
+    assert main(argv) == 2
+    told = capsys.readouterr().err
+    assert "cannot be written as 'out-0'" in told and "filling" not in told
+    assert list(tmp_path.iterdir()) == []

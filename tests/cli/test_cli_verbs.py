@@ -54,6 +54,19 @@ def test_help_texts_are_as_they_were(verb: str, monkeypatch: pytest.MonkeyPatch)
     assert text == path.read_text(encoding="utf-8"), f"set {UPDATE}=1 to accept the new text"
 
 
+def test_info_loads_no_physics() -> None:
+    """It answers within two or three seconds, most of which torch takes."""
+    walk = Path(poise.__file__).parent / "data/walk.bvh"
+    code = (
+        "import sys; from poise.cli.main import main; main(['info', sys.argv[1]]); "
+        "assert not {'mujoco', 'scipy.linalg', 'jinja2'} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(walk)], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_version_and_help_come_quickly_and_without_torch() -> None:
     start = time.perf_counter()
     done = call("--version")

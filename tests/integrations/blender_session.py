@@ -1,6 +1,9 @@
 """Run by a Python that has `bpy`: an armature moves, its action goes out and comes back.
 
-python blender_session.py ADD_ON_FOLDER OUT.json COMMAND...
+python blender_session.py ADD_ON_FOLDER OUT.json VERBS COMMAND...
+
+VERBS are words of the panel with commas between: what it does one after another, each with the action of
+the start.
 """
 
 from __future__ import annotations
@@ -86,7 +89,7 @@ def heads(body: bpy.types.Object) -> list[list[list[float]]]:
     return out
 
 
-def main(addon: str, out: str, *command: str) -> None:
+def main(addon: str, out: str, verbs: str, *command: str) -> None:
     """Writes what Blender shows before and after."""
     sys.path.insert(0, addon)
     import poise_blender
@@ -99,7 +102,7 @@ def main(addon: str, out: str, *command: str) -> None:
     poise_blender.register()
     body = armature()
     animate(body)
-    before = heads(body)
+    before, start = heads(body), body.animation_data.action
     sent = exchange.motion_of(scene, body, FIRST, LAST)
     bvh.write(sent, Path(out).with_suffix(".bvh"))
     exchange.new_action(scene, body, bvh.read(Path(out).with_suffix(".bvh")), "again", FIRST)
@@ -107,11 +110,21 @@ def main(addon: str, out: str, *command: str) -> None:
     exchange.new_action(scene, body, bvh.read(Path(out).with_suffix(".bvh")), "there", FIRST)
     if command:
         scene.poise.command = " ".join(f'"{c}"' for c in command)
-        scene.poise.verb = "doctor"
-        told["ended"] = sorted(bpy.ops.poise.run())
-        told |= {"told": scene.poise.told, "after": heads(body)}
-        told["action"] = body.animation_data.action.name
-        told["range"] = [float(x) for x in body.animation_data.action.frame_range]
+        there = body.animation_data.action
+        for verb in verbs.split(","):
+            # What was baked has a key in every frame; keyframes to complete are those of the start.
+            body.animation_data.action = there if verb == "doctor" else start
+            scene.poise.verb, scene.poise.controller = verb, "policy"
+            ended = sorted(bpy.ops.poise.run())
+            action = body.animation_data.action
+            told[verb] = {
+                "ended": ended,
+                "told": scene.poise.told,
+                "after": heads(body),
+                "action": action.name,
+                "range": [float(x) for x in action.frame_range],
+            }
+        told["start"] = start.name
         scene.poise.command = "no-such-command"
         try:
             bpy.ops.poise.run()

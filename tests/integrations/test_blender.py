@@ -80,25 +80,48 @@ def _blender() -> str:
     return named or sys.executable
 
 
-def test_an_action_goes_out_and_comes_back_within_a_millimetre(tmp_path: Path) -> None:
+def _session(tmp_path: Path, verbs: str, seconds: float) -> dict:
+    """What Blender shows before and after; the command's results are kept as VERB.bvh."""
     python, out = _blender(), tmp_path / "told.json"
     # A wrapper, since the other Python's environment is not this one's.
     poise = tmp_path / "poise.py"
     poise.write_text(
-        f"import sys\nsys.path[:0] = {sys.path!r}\nfrom poise.cli.main import main\nmain()\n"
+        f"import shutil, sys\nsys.path[:0] = {sys.path!r}\nfrom poise.cli.main import main\n"
+        "code = main()\nout = sys.argv[sys.argv.index('-o') + 1]\n"
+        f"shutil.copy(out, {str(tmp_path)!r} + '/' + sys.argv[1] + '.bvh')\nsys.exit(code)\n"
     )
-    line = [python, str(SESSION), str(ADDON), str(out), sys.executable, str(poise)]
+    line = [python, str(SESSION), str(ADDON), str(out), verbs, sys.executable, str(poise)]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     done = subprocess.run(
-        line, capture_output=True, text=True, timeout=240, env=environment, check=False
+        line, capture_output=True, text=True, timeout=seconds, env=environment, check=False
     )
     assert done.returncode == 0 and out.exists(), done.stdout[-2000:] + done.stderr[-2000:]
-    told = json.loads(out.read_text(encoding="utf-8"))
-    before = np.array(told["before"])
-    clip = read_clip(out.with_suffix(".bvh"), unit_m=1.0, up_axis="Z")
+    return json.loads(out.read_text(encoding="utf-8"))
+
+
+def test_an_action_goes_out_and_comes_back_within_a_millimetre(tmp_path: Path) -> None:
+    told = _session(tmp_path, "doctor", 240)
+    before, doctor = np.array(told["before"]), told["doctor"]
+    clip = read_clip(tmp_path / "told.bvh", unit_m=1.0, up_axis="Z")
     assert np.abs(_in_order(clip, told["names"]) - before).max() < 1e-3
     assert np.abs(np.array(told["again"]) - before).max() < 1e-3
-    assert told["ended"] == ["FINISHED"], told["told"]
-    assert "faults before" in told["told"] and told["action"] == "there doctor"
-    assert told["range"] == [5.0, 64.0] and np.abs(np.array(told["after"]) - before).max() < 1.0
-    assert "was not found" in told["refused"] and told["kept"] == told["action"]
+    assert doctor["ended"] == ["FINISHED"], doctor["told"]
+    assert "faults before" in doctor["told"] and doctor["action"] == "there doctor"
+    assert doctor["range"] == [5.0, 64.0]
+    assert np.abs(np.array(doctor["after"]) - before).max() < 1.0
+    assert "was not found" in told["refused"] and told["kept"] == doctor["action"]
+
+
+@pytest.mark.timeout(1500)
+def test_what_a_body_did_comes_back_as_a_new_action(tmp_path: Path) -> None:
+    """Track and complete: Blender shows what Poise wrote, within a millimetre, about where it was."""
+    told = _session(tmp_path, "track,complete", 1200)
+    before = np.array(told["before"])
+    for verb in ("track", "complete"):
+        did = told[verb]
+        assert did["ended"] == ["FINISHED"] and did["action"] == f"{told['start']} {verb}", did["told"]
+        written = _in_order(read_clip(tmp_path / f"{verb}.bvh", unit_m=1.0, up_axis="Z"), told["names"])
+        shown = np.array(did["after"])[: len(written)]
+        assert did["range"][0] == 5.0 and np.abs(shown - written).max() < 1e-3
+        # The body begins as the action does, at its height.
+        assert np.abs(shown[0] - before[0]).mean() < 0.1

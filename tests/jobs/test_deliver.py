@@ -69,8 +69,14 @@ def test_the_written_motion_is_as_high_as_its_source(height: float):
     for source in (low, high):
         out = done.clips[f"simulated_{source.name}"]
         assert np.abs(out.positions() - source.positions()).max() < 0.02
-    told = [note for note in done.notes if note.startswith("high") and "as high as the source" in note]
-    assert len(told) == 1 and f"{round(1000 * floor_of(imitation, 1)):+d} mm" in told[0]
+    # Soles that sank in the file cannot in the simulation: feet are as high as in the file all the same.
+    for recording in evaluation.recordings:
+        recording.qpos[:, 2] += 0.015
+    again = finished(imitation, replace(evaluation, card=Card()), hold=False)  # type: ignore[arg-type]
+    for name, clip in done.clips.items():
+        assert np.abs(again.clips[name].positions() - clip.positions()).max() < 1e-6
+    (told,) = (note for note in done.notes if note.startswith("high") and "as high as" in note)
+    assert "on a floor at" in told
 
 
 class Nothing:
@@ -106,7 +112,7 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     done = deliver(imitation, evaluation, tmp_path / "raw", {}, tmp_path / "raw.npz", hold=False)
     assert done.card.delivered == () and not any("held" in note for note in done.notes)
     off = read_clip(tmp_path / "raw.npz").positions() - raw.positions()
-    assert np.abs(off - [0, 0, floor_of(imitation)]).max() < 1e-9
+    assert np.ptp(off, axis=(0, 1)).max() < 1e-9 and abs(off[0, 0, 2] - floor_of(imitation)) < 0.046
     done = deliver(imitation, evaluation, tmp_path / "held", {})
     (figures,) = json.loads((tmp_path / "held/score.json").read_text())["delivered"]
     assert figures["delivered"]["penetration_mm"] <= figures["simulated"]["penetration_mm"] + 0.1

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
 from poise.body.table import BodyTable
 from poise.errors import PoiseError
 from poise.motion import Skeleton
 
-_GEOMS = {
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-}
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +78,8 @@ class Humanoid:
         sides = {rows[i].side: i + 1 for i in self.rows_of("thigh")}
         if not {"left", "right"} <= sides.keys():
             raise PoiseError("the body has no two thighs, between which its left is", "Humanoid")
+        import mujoco
+
         data = mujoco.MjData(self.model)
         data.qpos[:], data.qpos[3] = 0.0, 1.0
         mujoco.mj_kinematics(self.model, data)
@@ -98,6 +97,8 @@ class Humanoid:
 
 def make_spec(table: BodyTable) -> mujoco.MjSpec:
     """The `MjSpec` of a humanoid with nothing around it; see `add_humanoid`."""
+    import mujoco
+
     spec = mujoco.MjSpec()
     spec.modelname = "poise"
     spec.compiler.degree = False
@@ -109,6 +110,12 @@ def make_spec(table: BodyTable) -> mujoco.MjSpec:
 def add_humanoid(spec: mujoco.MjSpec, table: BodyTable, prefix: str = "") -> None:
     """Adds a body to a description, with names that begin with `prefix`; damping sits in the joints, the
     torque limit on the actuator's proportional part alone (so that saturation never removes damping)."""
+    import mujoco
+
+    kinds = mujoco.mjtGeom
+    geoms = {
+        "capsule": kinds.mjGEOM_CAPSULE, "box": kinds.mjGEOM_BOX, "sphere": kinds.mjGEOM_SPHERE
+    }  # fmt: skip
     made: list[mujoco.MjsBody] = []
     for row in table.rows:
         parent = spec.worldbody if row.parent < 0 else made[row.parent]
@@ -130,7 +137,7 @@ def add_humanoid(spec: mujoco.MjSpec, table: BodyTable, prefix: str = "") -> Non
         for i, geom in enumerate(row.geoms):
             body.add_geom(
                 name=prefix + (f"{row.name}_{i}" if i else row.name),
-                type=_GEOMS[geom.kind],
+                type=geoms[geom.kind],
                 size=list(geom.size),
                 pos=list(geom.pos),
                 quat=list(geom.quat),

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 
 from poise.body import presets
@@ -24,7 +23,11 @@ from poise.motion import Skeleton
 from poise.motion.io.limited import read_limited
 from poise.motion.roles import find_roles
 
-_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+if TYPE_CHECKING:
+    import mujoco
+
+#: MuJoCo's number of free joints.
+_FREE = 0
 _SCRIPT = Path(__file__).with_name("mjcf_file.py")
 #: Shapes that are kept, and those that become the box around them.
 _SHAPES, _BOXED = ("sphere", "capsule", "box"), ("mesh", "cylinder", "ellipsoid")
@@ -71,6 +74,8 @@ def read_mjcf(path: Path | str, damping: float = 0.02) -> MjcfBody:
         made = read_limited(_SCRIPT, path, check_mjcf(path), "MJCF file", "Make it smaller")
     except PoiseError as problem:
         raise brief(problem, path) from None
+    import mujoco
+
     model = mujoco.MjModel.from_binary_path("body.mjb", {"body.mjb": made["model"].tobytes()})
     reader = _Reader(model, str(path))
     skeleton = reader.skeleton()
@@ -81,6 +86,8 @@ class _Reader:
     """One compiled model in its default pose."""
 
     def __init__(self, model: mujoco.MjModel, path: str) -> None:
+        import mujoco
+
         self.model, self.path, self.notes = model, path, []
         self.data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.data)
@@ -104,6 +111,8 @@ class _Reader:
         return [j for j in every if self.model.jnt_type[j] != _FREE]
 
     def _check_joints(self, body: int) -> None:
+        import mujoco
+
         name, hinges = self._name(body), self._joints(body)
         for j in hinges:
             kind = _kind(mujoco.mjtJoint(self.model.jnt_type[j]))
@@ -234,6 +243,8 @@ class _Reader:
 
     def _gains(self, hinges: list[int], numbers: PartNumbers, strength: Strength) -> tuple[float, float]:
         """kp and torque limit of a body: the largest among its hinges', else those of its part."""
+        import mujoco
+
         model = self.model
         kps, torques = [], []
         for j in hinges:
@@ -256,6 +267,8 @@ class _Reader:
 
     def _geoms(self, body: int, height: float) -> tuple[Geom, ...]:
         """The shapes that collide (all where none does) in the frame of the default pose."""
+        import mujoco
+
         model, data, origin = self.model, self.data, self._origin(body)
         every = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
         colliding = [g for g in every if model.geom_contype[g] or model.geom_conaffinity[g]]
@@ -305,6 +318,8 @@ def _axes(axes: np.ndarray) -> tuple[str, tuple[float, float, float, float]]:
     if len(axes) == 3 and axes[2] @ third < 0:
         # A left-handed triple: its second axis is the frame's Z, its third the frame's Y.
         matrix, letters = np.stack((first, -third, second), 1), "XZY"
+    import mujoco
+
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, matrix.reshape(-1))
     return letters, floats(quat)

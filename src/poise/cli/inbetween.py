@@ -56,7 +56,7 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, fills, writes."""
     from poise.jobs.inbetween.fill import inbetween
-    from poise.motion.io import write_clip
+    from poise.motion.io import check_writable, write_clip
     from poise.synth.gaps import check_keyframes
 
     o = options
@@ -65,6 +65,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}")
     one = o.samples == 1
     outs = [o.out] if one else [o.out.with_stem(f"{o.out.stem}-{k}") for k in range(o.samples)]
+    check_writable(outs[0])
     for path in (*outs, *((o.picture,) if o.picture else ())):
         may_write(path, o.force, o.clip)
     clip = o.reading.read(o.clip)

@@ -39,6 +39,8 @@ VERBS = {
     "play": "simulate a trained run from one frame and write a page to watch",
     "doctor": "what is wrong with a motion, and mend it; without a clip: is this machine ready",
 }
+#: Verbs that only read and write motions.
+_LIGHT = ("info", "convert")
 _FIRST = (
     ("poise demo", "two minutes, no clip of yours; then open demo/report.html"),
     ("poise info walk.bvh", "what the clip holds"),
@@ -126,7 +128,7 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         inputs += inputs_of(options)
         # What is imported now takes seconds.
         tell(_begins(verb, inputs), "dim")
-    _share_cores()
+    _share_cores(verb not in _LIGHT)
     answer = module.run(options, rest)
     notes(answer.notes)
     for path in answer.outputs.values():
@@ -151,16 +153,22 @@ def _begins(verb: str, inputs: Sequence[Path]) -> str:
     return f"{doing} {', '.join(map(str, inputs[:3]))}{more}"
 
 
-def _share_cores() -> None:
-    """One thread for torch, since the physics uses the cores; OMP_NUM_THREADS overrules it."""
+def _share_cores(physics: bool) -> None:
+    """One thread for torch, since the physics uses the cores; OMP_NUM_THREADS overrules it. physics:
+    whether the verb needs MuJoCo, which takes time to load."""
     try:
-        import mujoco
         import torch
     except ImportError:
         # Only `doctor` runs without them, and it says what to do.
         return
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
+    if not physics:
+        return
+    try:
+        import mujoco
+    except ImportError:
+        return
     # The guard reports instabilities; MuJoCo's own log would litter the user's folder.
     mujoco.set_mju_user_warning(lambda _: None)
 

@@ -12,6 +12,8 @@ import torch
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
 from poise.kin import hold_feet, lowest_height, qpos_to_clip
+from poise.kin.doctor.support import SOLE_M
+from poise.kin.feet.height import stands_higher
 from poise.metrics import success
 from poise.motion import Clip, ground_shift, resample
 from poise.motion.io import home_suffix, write_clip
@@ -56,8 +58,20 @@ def floor_of(imitation: Imitation, index: int = 0) -> float:
 
 
 def as_high_as_source(clip: Clip, imitation: Imitation, index: int = 0) -> Clip:
-    """A simulated motion, which stands on z = 0, at the height of clip `index` in its own file."""
-    return ground_shift(clip, floor_of(imitation, index))
+    """A simulated motion, which stands on z = 0, as high as clip `index` does in its own file.
+
+    Feet that stand are as high as there; files tell joints and no soles, so that the floor that was
+    found may be off by some centimetres. Where a motion rests on something as well, its floor counts.
+    """
+    floor, rows = floor_of(imitation, index), imitation.humanoid.table.rows
+    source = imitation.library.clips[index]
+    higher = None
+    if not imitation.props and clip.skeleton.same_bones(source.skeleton):
+        feet = [row.joint for row in rows if row.kind == "foot"]
+        higher = stands_higher(clip, source, feet)
+    if higher is None:
+        return ground_shift(clip, floor)
+    return ground_shift(clip, min(max(-higher, floor - SOLE_M), floor + SOLE_M))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +105,8 @@ def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) ->
             figures.append(found)
             notes += _sentences(found)
         clips[name] = as_high_as_source(clip, imitation, recording.clip)
-        notes += _floor_told(imitation, recording.clip)
+        raised = float(clips[name].root_pos[0, 2] - clip.root_pos[0, 2])
+        notes += _floor_told(clip.name, raised)
     return Delivery(clips, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
 
 
@@ -160,13 +175,13 @@ def _held(
     return held, found
 
 
-def _floor_told(imitation: Imitation, index: int) -> list[str]:
-    floor = round(floor_of(imitation, index) * 1000)
+def _floor_told(name: str, floor_m: float) -> list[str]:
+    floor = round(floor_m * 1000)
     if not floor:
         return []
     return [
-        f"{imitation.library.clips[index].name}: the written motion stands as high as the source, on a "
-        f"floor at {floor:+d} mm. Reading it with --ground auto puts that floor at 0."
+        f"{name}: the written motion stands as high as the source, on a floor at {floor:+d} mm. Reading "
+        "it with --ground auto puts that floor at 0."
     ]
 
 

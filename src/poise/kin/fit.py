@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
@@ -202,6 +201,8 @@ def widen(
 
 def _overlaps(humanoid: Humanoid, motions: list[np.ndarray]) -> tuple[tuple[str, str], ...]:
     """Pairs of bodies with shapes that overlap by more than `OVERLAP_M` in some reference frame."""
+    import mujoco
+
     model = humanoid.model
     data = mujoco.MjData(model)
     found: set[tuple[str, str]] = set()

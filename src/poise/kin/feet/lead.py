@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from poise.kin.feet.contact import Sole
@@ -125,6 +124,8 @@ def _solve(rows: list[Rows], width: int, fixed: np.ndarray, fps: float) -> np.nd
             _add(band, rhs, bend, np.zeros(frames - 2), np.full(frames - 2, SMOOTH_S**2))
         back = np.where(fixed, _PINNED, RETURN_PER_S**2)
         _add(band, rhs, np.tile(unit, (frames, 1, 1)), np.zeros(frames), back)
+    from scipy.linalg import solveh_banded
+
     x = solveh_banded(band, rhs, lower=True).reshape(frames, width)
     x[fixed] = 0.0
     return x

@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 
 from poise.body import Humanoid, make_spec
 from poise.errors import PoiseError, did_you_mean
 from poise.kin.ik.body import IkBody
+
+if TYPE_CHECKING:
+    import mujoco
 
 #: Weights against 1 for a target's metre: of hinge angles (m/rad), and of the pelvis (per m and rad).
 POSTURE, ROOT = 3e-3, 0.2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from poise.motion.points.labels import SIDES
@@ -224,6 +223,8 @@ def steady_twist(shown: Tensor, fps: float) -> Tensor:
     diagonal[0], diagonal[-1] = diagonal[0] - between, diagonal[-1] - between
     # The upper band; its first number stands outside the matrix, and a single frame has none.
     bands = np.stack((np.full(len(diagonal), -between), diagonal.numpy()))
+    from scipy.linalg import solveh_banded
+
     z = solveh_banded(bands[-len(diagonal) :], right.numpy())
     return torch.atan2(torch.tensor(z[:, 1]), torch.tensor(z[:, 0]))
 
