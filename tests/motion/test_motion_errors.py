@@ -275,10 +275,6 @@ def test_files_that_are_no_motion(tmp_path: Path) -> None:
     assert refusal(tmp_path / "none.bvh") == ": there is no such file"
     assert refusal(tmp_path) == ": this is a folder, not a motion file. Name one file in it"
     assert refusal(put(tmp_path, "a.bvh", "")) == ": the file is empty"
-    assert (
-        refusal(put(tmp_path, "a.fbx", b"Kaydara FBX Binary  \0"))
-        == f": FBX files are not read yet. {READABLE}"
-    )
     for suffix, name in ((".vmd", "VMD"),):
         path = put(tmp_path, f"a{suffix}", b"\1P\2\3")
         assert refusal(path) == f": {name} files are not read yet. {READABLE}"

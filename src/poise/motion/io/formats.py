@@ -13,6 +13,7 @@ from poise.motion.io.angles.deepmimic import read_deepmimic
 from poise.motion.io.angles.opensim import looks_like_mot, read_mot
 from poise.motion.io.bvh.read import read_bvh
 from poise.motion.io.bvh.write import write_bvh
+from poise.motion.io.fbx.read import looks_like_fbx, read_fbx
 from poise.motion.io.gltf.read import read_gltf
 from poise.motion.io.gltf.write import write_gltf
 from poise.motion.io.named_arrays import (
@@ -87,6 +88,7 @@ READERS = (
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("glTF", (".glb", ".gltf", ".vrm", ".vrma"), _looks_like_gltf, read_gltf),
     Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
+    Reader("FBX", (".fbx",), looks_like_fbx, read_fbx),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL, Kimodo, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
     Reader(
@@ -108,7 +110,6 @@ READERS = (
 _REFUSERS = ("ASF", "robot", "OpenPose")
 READABLE = "Formats that can be read: " + ", ".join(r.name for r in READERS if r.name not in _REFUSERS)
 _MAGIC = (
-    (b"Kaydara FBX", "FBX"),
     (b"PK\x03\x04", "zip"),
     (b"\x89HDF", "HDF5"),
 )
@@ -117,7 +118,6 @@ _TORCH = (
     "numpy.savez('motion.npz', fps=RATE, **{k: v.numpy() for k, v in d.items()})"
 )
 _NOT_YET = {
-    ".fbx": "FBX",
     ".h5": "HDF5",
     ".vmd": "VMD",
 }

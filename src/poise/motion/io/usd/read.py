@@ -49,10 +49,13 @@ def read_usd(path: Path, options: ReadOptions) -> Clip:
     size, fps = check_file(path), options.fps
     limits = {"joints": MAX_JOINTS, "poses": MAX_POSES, "value": MAX_VALUE, "fps": fps}
     held = read_limited(_SCRIPT, path, size, "USD file", **limits)
-    return assemble(_raw_motion(held, path, options), options)
+    return assemble(raw_of_matrices(held, "USD", path, options), options)
 
 
-def _raw_motion(held: dict[str, np.ndarray], path: Path, options: ReadOptions) -> RawMotion:
+def raw_of_matrices(
+    held: dict[str, np.ndarray], form: str, path: Path, options: ReadOptions
+) -> RawMotion:
+    """The motion of a skeleton that a script has read joint by joint as matrices, see `usd.stage`."""
     notes = [str(n) for n in held["notes"]]
     parents = [int(p) for p in held["parents"]]
     names = unique_names([str(n) for n in held["names"]], notes)
@@ -66,7 +69,7 @@ def _raw_motion(held: dict[str, np.ndarray], path: Path, options: ReadOptions) -
     bones = rigid_bones(names, parents, place, turn, steady, base, notes)
     up, unit = str(held["up"]), float(held["unit"])
     return RawMotion(
-        format="usd",
+        format=form.lower(),
         path=path,
         names=names,
         parents=tuple(parents),
@@ -76,7 +79,7 @@ def _raw_motion(held: dict[str, np.ndarray], path: Path, options: ReadOptions) -
         rot=bones.rot,
         fps=float(held["fps"]),
         channels=(),
-        unit_m=checked_unit("USD", unit, up, names, parents, bones, options, path, notes),
+        unit_m=checked_unit(form, unit, up, names, parents, bones, options, path, notes),
         up_axis=up,
         travel_joint=None if bones.travel is None else names[bones.travel],
         cyclic=bool(held["cyclic"]),
