@@ -23,7 +23,7 @@ from poise.motion import Skeleton
 
 
 class JsonStream:
-    """What one connection sends, see docs/live.md.
+    """What one connection sends, see docs/live-protocol.md.
 
     Args:
         inbox: where packets go; what is refused is counted there.

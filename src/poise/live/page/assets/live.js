@@ -121,6 +121,7 @@
     $("recovered").textContent = c.recovered;
     $("help").textContent = message.help_n.toFixed(0);
     $("refused").textContent = Object.values(message.refused).reduce((a, b) => a + b, 0);
+    $("refused").title = Object.entries(message.refused).map(([why, count]) => `${why}: ${count}`).join(", ");
     $("pause").setAttribute("aria-pressed", message.paused);
     $("dream").setAttribute("aria-pressed", c.endless);
     $("record").setAttribute("aria-pressed", Boolean(message.recording));
