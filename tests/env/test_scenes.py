@@ -70,7 +70,7 @@ def test_a_pull_and_throws(task: Imitation) -> None:
     stage = Throws(mass=2.0).stage(task.humanoid, task.reference)
     assert stage.props[0].mass == 2.0  # type: ignore[attr-defined]
     assert len(stage.touches) == len(task.humanoid.bodies) + 1
-    assert set(SCENES) == {"throws", "pull", "hands", "door", "trampoline", "ball"}
+    assert set(SCENES) == {"throws", "pull", "hands", "door", "trampoline", "ball", "chicken"}
 
 
 def test_doors_of_all_widths_have_their_knob_at_the_hand(task: Imitation) -> None:

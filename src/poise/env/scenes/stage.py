@@ -12,7 +12,7 @@ from poise.env.goals.goal import Goal
 from poise.env.plugins import Plugin
 from poise.env.reference import Reference
 from poise.errors import PoiseError
-from poise.sim import Backend, Floor, Link, Plane, Touch
+from poise.sim import Backend, Character, Floor, Link, Plane, Touch
 from poise.sim.props import Prop
 
 Given = Compliance | Stiffness
@@ -35,7 +35,7 @@ class Stage(NamedTuple):
         from_start: whether episodes begin with the motion's first frame, since the scene goes by time.
     """
 
-    props: tuple[Prop, ...] = ()
+    props: tuple[Prop | Character, ...] = ()
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.scenes import PlayScene, door
+from poise.env.scenes import Chicken, PlayScene, door
 from poise.errors import PoiseError
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.tracker import Tracker
@@ -23,8 +23,12 @@ from poise.spatial import quat_mul
 REACH_M, INWARD_M, KNOB_M = 0.3, 0.03, 1.12
 
 
-def motion_of(scene: PlayScene, tracker: Tracker) -> Clip | None:
-    """The motion of a scene that has one of its own, else None."""
+def motion_of(scene: PlayScene, tracker: Tracker, seconds: float = 8.0) -> Clip | None:
+    """The motion of a scene that has one of its own, else None; a door takes its own time."""
+    if isinstance(scene, Chicken):
+        from poise.jobs.compliant.hopping import AT_SOMEBODY, WAYS, hopping
+
+        return hopping(tracker, seconds, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
     return opening(tracker) if isinstance(scene, door.Doorway) else None
 
 
@@ -65,7 +69,7 @@ def opening(tracker: Tracker) -> Clip:
     rate, ease = float(tracker.config.sim.control_hz), at_ease(tracker)
     frames = round(door.LASTS_S * rate) + 1
     t = np.arange(frames) / rate
-    open_by = door.OPENS * _step(t, door.GRIPS_S + 0.1, door.LETS_GO_S - 0.3)
+    open_by = door.OPENS * smooth_step(t, door.GRIPS_S + 0.1, door.LETS_GO_S - 0.3)
     radius = door.MADE_FOR - door.Door().width + door.Door().knob[1]
     # From where the knob is closed: x = r sin(phi), y = -r (1 - cos(phi)).
     knob = np.stack((radius * np.sin(open_by), -radius * (1.0 - np.cos(open_by)), 0.0 * t), 1)
@@ -82,7 +86,9 @@ def _hand_path(clip: Clip, knob: np.ndarray, t: np.ndarray) -> Tensor:
     hand = clip.positions()[:, end_of(clip.skeleton, "left_hand")]
     shoulder = clip.positions()[0, clip.skeleton.parents[_elbow(clip)]]
     there = np.array([shoulder[0] + REACH_M, shoulder[1] - INWARD_M, KNOB_M]) + knob
-    share = _step(t, 0.4, door.GRIPS_S - 0.2) - _step(t, door.LETS_GO_S + 0.05, door.LASTS_S - 0.1)
+    share = smooth_step(t, 0.4, door.GRIPS_S - 0.2) - smooth_step(
+        t, door.LETS_GO_S + 0.05, door.LASTS_S - 0.1
+    )
     return torch.from_numpy(hand + share[:, None] * (there - hand))
 
 
@@ -96,7 +102,7 @@ def _led(clip: Clip, goal: Tensor) -> Clip:
     return clip.replaced(rot=led.numpy())
 
 
-def _step(t: np.ndarray, start: float, stop: float) -> np.ndarray:
+def smooth_step(t: np.ndarray, start: float, stop: float) -> np.ndarray:
     """0 before `start`, 1 after `stop`, s, smooth between them."""
     x = np.clip((t - start) / (stop - start), 0.0, 1.0)
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))

@@ -18,10 +18,11 @@ import torch
 
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
-from poise.env.scenes import PlayScene
+from poise.env.scenes import Chicken, PlayScene
 from poise.errors import PoiseError
 from poise.eval import run_episodes, write_score
 from poise.eval.rolloutset import RolloutSet
+from poise.jobs.compliant.fight import opposing, rival_stage, weighed
 from poise.jobs.compliant.motions import motion_of
 from poise.jobs.compliant.scene_meters import meter_of, words_of
 from poise.jobs.compliant.standing import standing
@@ -137,16 +138,23 @@ def play(
         PoiseError: the body cannot do the scene, or the clip cannot be read.
     """
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
-    own_motion = motion_of(scene, tracker)
+    own_motion = motion_of(scene, tracker, seconds)
     if clip is not None and own_motion is not None:
         raise PoiseError("the scene has a motion of its own", name or "play", "Leave the clip out")
     clip = clip or own_motion
     task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
+    rival: Imitation | None = None
+    if isinstance(scene, Chicken):
+        task = weighed(task, scene.mass)
     stage = scene.stage(task.humanoid, task.reference)
+    if isinstance(scene, Chicken) and scene.against == "rival":
+        stage, rival = rival_stage(scene, tracker, stage)
     task = replace(task, props=stage.props, links=stage.links, touches=stage.touches, floor=stage.floor)
     both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
     for compliance in (stage.yields(given), None):
-        own = replace(task.task, plugins=stage.plugins, compliance=compliance, help_by="all")
+        others = () if rival is None else (opposing(rival, tracker, compliance),)
+        plugins = (*stage.plugins, *others)
+        own = replace(task.task, plugins=plugins, compliance=compliance, help_by="all")
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads))
     (imitation, rollouts, seen, evaluation), (_, others, other, _) = both
     return Played(
