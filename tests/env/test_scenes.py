@@ -159,7 +159,7 @@ def _far_off(task: Imitation) -> tuple[Tensor, Tensor]:
 
 
 def test_a_ball_on_the_head(task: Imitation) -> None:
-    scene = Balance(spread=0.1, pushes=50.0)
+    scene = Balance(spread=0.1, gain=0.0, damping=0.0, pushes=50.0)
     stage = scene.stage(task.humanoid, task.reference)
     own = replace(task.task, plugins=stage.plugins, compliance=stage.yields(None), dones=())
     made = replace(task, task=own, props=stage.props, links=stage.links, config=task.config)

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.frame import ObsTerm, RewardTerm
+from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
 from poise.env.goals.goal import Goal
 from poise.env.plugins import Plugin
 from poise.env.reference import Reference
@@ -30,7 +30,7 @@ class Stage(NamedTuple):
         props, links, touches: see `sim.Scene`; the character's bodies have their own names.
         plugins: of the task; those that tell forces (`Plugin.felt`) are what the character gives way to.
         floor: what they stand on.
-        obs, rewards: of a policy that learns the scene: the task's state and reward.
+        obs, rewards, dones: of a policy that learns the scene: the task's state, reward and failure.
         yields: how a character gives way in the scene, of what is stated, None for nothing.
         from_start: whether episodes begin with the motion's first frame, since the scene goes by time.
     """
@@ -41,6 +41,7 @@ class Stage(NamedTuple):
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
     obs: tuple[ObsTerm, ...] = ()
     rewards: tuple[RewardTerm, ...] = ()
+    dones: tuple[DoneTerm, ...] = ()
     from_start: bool = False
     floor: Floor = Plane()
     yields: Callable[[Given | None], Given] = as_given

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.env import Reference
-from poise.jobs.compliant.motions import at_ease, smooth_step
+from poise.jobs.compliant.poses import at_ease, smooth_step
 from poise.jobs.tracker import Tracker
 from poise.kin import clip_to_qpos, match_positions, qpos_to_clip
 from poise.kin.directed import end_of

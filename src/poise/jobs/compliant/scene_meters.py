@@ -14,7 +14,7 @@ from poise.env import ImitationEnv
 from poise.env.goals import DisplacedGoal
 from poise.env.opponent import Opposing
 from poise.env.scenes import Balance, Chicken, Doorway, PlayScene, Trampoline
-from poise.env.scenes.ball import upright_of
+from poise.env.scenes.ball import COS_45, upright_of
 from poise.env.scenes.door import WANTED, across
 from poise.env.scenes.trampoline import FIRST_S, Bouncing
 from poise.jobs.compliant.meters import Meter, part_of
@@ -25,8 +25,6 @@ from poise.sim import Mechanics
 G = 9.81
 #: s after the first touch at which it is looked how far a player was pushed.
 PUSHED_S = 0.5
-#: Of the angle at which a rod counts as fallen.
-COS_45 = math.cos(math.pi / 4)
 
 
 class DoorMeter:
