@@ -176,6 +176,7 @@ def test_a_ball_on_the_head(task: Imitation) -> None:
     forces.asked[1, 3:] = torch.tensor([0.0, 0.0, 99.0])
     env.step(env.action)
     felt = forces.felt()
+    assert felt is not None
     assert felt.force[0].norm(dim=-1).tolist() == pytest.approx([50.0, 0.0], abs=1e-4)
     assert felt.force[1, 1].tolist() == pytest.approx([0.0, 0.0, ball.MOST_N], abs=1e-4)
     assert not felt.driven and felt.body[0].tolist() == [env.goal.humanoid.rows_of("head")[-1] + 1, 1]

@@ -94,7 +94,7 @@ class Balance:
             events=(Tilted(top, self.spread, self.seed), Switch(link.name, always)),
         )
         chest = (humanoid.rows_of("spine") or (0,))[-1]
-        push = Pushes((self.pushes,) * 2, (2.0, 3.0), 0.1, (chest,), reference.rate_hz, self.seed)
+        push = Pushes((self.pushes, self.pushes), (2.0, 3.0), 0.1, (chest,), reference.rate_hz, self.seed)
         pushes = (push,) if self.pushes else ()
         known = {"head": head, "length": self.length}
         return Stage(

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from poise.env import Reference
 from poise.jobs.compliant.poses import at_ease, smooth_step
@@ -73,7 +74,7 @@ def _hopping(
     hanging[:, 2] += height
     clip = still.replaced(root_pos=still.root_pos + moved)
     root, rot = clip.tensors()
-    goals = {right: torch.from_numpy(standing), left: torch.from_numpy(hanging)}
+    goals: dict[int | str, Tensor] = {right: torch.from_numpy(standing), left: torch.from_numpy(hanging)}
     bent = clip.replaced(rot=match_positions(clip.skeleton, rot, root, goals).numpy())
     # The sole stays level.
     world, level = torch.from_numpy(bent.world()[1]), torch.from_numpy(still.world()[1])
