@@ -94,7 +94,8 @@ class Balance:
             events=(Tilted(top, self.spread, self.seed), Switch(link.name, always)),
         )
         chest = (humanoid.rows_of("spine") or (0,))[-1]
-        push = Pushes((self.pushes, self.pushes), (2.0, 3.0), 0.1, (chest,), reference.rate_hz, self.seed)
+        force, rate = (self.pushes, self.pushes), reference.rate_hz
+        push = Pushes(force, (2.0, 3.0), 0.1, (chest,), rate, self.seed)
         pushes = (push,) if self.pushes else ()
         known = {"head": head, "length": self.length}
         return Stage(
