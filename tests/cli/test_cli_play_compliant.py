@@ -34,6 +34,7 @@ def test_a_scene_from_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[
         (("door", "--width", "-1"), "a door is 0 to 10 m wide"),
         (("pull", "--width", "2"), "--width says nothing of the scene 'pull'"),
         (("trampoline", "--height", "3"), "a bounce is 0 to 1 m high"),
+        (("chicken", "--other", "1"), "players weigh 2 to 500 kg"),
         (("ball", "--length", "0"), "a rod is 0.1 to 5 m long"),
         (("hand",), "Did you mean 'hands'?"),
         (("pull", "--mass", "2"), "--mass says nothing of the scene 'pull'"),

@@ -20,6 +20,7 @@ from poise.jobs.presets import preset_of
 from poise.motion import read_clip
 from poise.plan import TrajOptConfig
 from poise.recipes import ResidualForce
+from poise.recipes.compliant import Compliant
 from poise.recipes.perpetual import Perpetual
 
 KINDS: dict[str, Any] = {
@@ -27,6 +28,7 @@ KINDS: dict[str, Any] = {
     "perpetual": Perpetual,
     "inbetween": Inbetween,
     "endless": Endless,
+    "compliant": Compliant,
 }
 
 

@@ -143,7 +143,13 @@ def test_choices_are_those_of_the_parts_behind_them() -> None:
     from poise.recipes import RECIPE, perpetual
 
     assert get_args(options.Rule) == tuple(RULES)
-    assert (RECIPE["name"], inbetween.RECIPE["name"], perpetual.RECIPE["name"], "endless") == RECIPES
+    assert (
+        RECIPE["name"],
+        inbetween.RECIPE["name"],
+        perpetual.RECIPE["name"],
+        "endless",
+        "compliant",
+    ) == RECIPES
 
 
 def test_info_json_holds_exactly_the_keys(clip: Path, answered) -> None:

@@ -70,7 +70,7 @@ def test_a_pull_and_throws(task: Imitation) -> None:
     stage = Throws(mass=2.0).stage(task.humanoid, task.reference)
     assert stage.props[0].mass == 2.0  # type: ignore[attr-defined]
     assert len(stage.touches) == len(task.humanoid.bodies) + 1
-    assert set(SCENES) == {"throws", "pull", "hands", "door", "trampoline", "ball"}
+    assert set(SCENES) == {"throws", "pull", "hands", "door", "trampoline", "ball", "chicken"}
 
 
 def test_doors_of_all_widths_have_their_knob_at_the_hand(task: Imitation) -> None:
@@ -159,7 +159,7 @@ def _far_off(task: Imitation) -> tuple[Tensor, Tensor]:
 
 
 def test_a_ball_on_the_head(task: Imitation) -> None:
-    scene = Balance(spread=0.1, pushes=50.0)
+    scene = Balance(spread=0.1, gain=0.0, damping=0.0, pushes=50.0)
     stage = scene.stage(task.humanoid, task.reference)
     own = replace(task.task, plugins=stage.plugins, compliance=stage.yields(None), dones=())
     made = replace(task, task=own, props=stage.props, links=stage.links, config=task.config)
@@ -176,6 +176,7 @@ def test_a_ball_on_the_head(task: Imitation) -> None:
     forces.asked[1, 3:] = torch.tensor([0.0, 0.0, 99.0])
     env.step(env.action)
     felt = forces.felt()
+    assert felt is not None
     assert felt.force[0].norm(dim=-1).tolist() == pytest.approx([50.0, 0.0], abs=1e-4)
     assert felt.force[1, 1].tolist() == pytest.approx([0.0, 0.0, ball.MOST_N], abs=1e-4)
     assert not felt.driven and felt.body[0].tolist() == [env.goal.humanoid.rows_of("head")[-1] + 1, 1]

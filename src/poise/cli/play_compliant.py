@@ -29,11 +29,11 @@ RESULTS = ("simulated.bvh", "score.json", "figures.json", "report.html")
 class Options:
     """Let a trained policy stand, or do a motion, in a scene in which something pushes it: a ball that
     is thrown, a sustained pull, a partner hand in hand, a door, a trampoline, a ball on a rod on its
-    head. It gives way; the same is simulated without
+    head, or an opponent that hops on one leg as it does. It gives way; the same is simulated without
     compliance, and a table compares both. Writes the motion, figures.json, score.json, report.html."""
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """throws, pull, hands, door, trampoline or ball."""
+    """throws, pull, hands, door, trampoline, ball or chicken."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
     """The folder of the results."""
     clip: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -59,7 +59,11 @@ class Options:
     sway: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """hands: how far the partner's hand swings (0.1)."""
     mass: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
-    """throws: of the ball (1)."""
+    """throws: of the ball (1). chicken: of the player (85)."""
+    other: Annotated[float | None, arg(metavar="KG", help_behavior_hint="")] = None
+    """chicken: of the opponent (36)."""
+    against: Annotated[Literal["bag", "rival"] | None, arg(help_behavior_hint="")] = None
+    """chicken: a punching bag as heavy as the opponent (default), or the opponent itself."""
     width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """door: how wide (1)."""
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
@@ -69,10 +73,12 @@ class Options:
     pushes: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
     """ball: how hard the chest is pushed for 0.1 s every 2 to 3 s (0)."""
     seed: Annotated[int | None, arg(metavar="S", help_behavior_hint="")] = None
-    """throws, ball: of the draws (0)."""
+    """throws, ball, chicken: of the draws (0)."""
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
     along and is told places alone; by default the one for rotations that comes with Poise."""
+    learned: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
+    """What was learned on top of the policy: the folder of poise train compliant SCENE."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores; 0 is all."""
     open: Flag = False
@@ -93,15 +99,22 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
     from poise.jobs.compliant.play import play
+    from poise.jobs.compliant.training import open_learned
     from poise.jobs.open import open_run
 
     scene, given = scene_of(o), given_of(o)
     clip = None if o.clip is None else o.reading.read(o.clip)
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
+        learned = None if o.learned is None else open_learned(o.learned, tracker)
+    if learned is not None and learned.config.scene != o.scene:
+        what = f"the run learned the scene '{learned.config.scene}', not '{o.scene}'"
+        raise PoiseError(what, o.learned, f"Write poise play compliant {learned.config.scene}")
+    if learned is not None and (o.level is not None or o.stiffness is not None):
+        raise PoiseError("a run gives way as it has learned to", hint="Leave --level, --stiffness out")
     with claimed(o.out):
         with working("simulating"):
-            played = play(scene, tracker, clip, given, o.count, o.duration, o.threads, o.scene)
+            played = play(scene, tracker, clip, given, o.count, o.duration, o.threads, o.scene, learned)
         with working("writing"):
             paths = played.write(o.out)
     rows = [(played.words[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
@@ -143,7 +156,7 @@ def scene_of(options: Options) -> PlayScene:
     stated: dict[str, Any] = {
         "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
         "sway": o.sway, "mass": o.mass, "width": o.width, "height": o.height, "length": o.length,
-        "pushes": o.pushes, "seed": o.seed,
+        "pushes": o.pushes, "other": o.other, "against": o.against, "seed": o.seed,
     }  # fmt: skip
     stated = {k: v for k, v in stated.items() if v is not None}
     own = {f.name for f in fields(kind)}

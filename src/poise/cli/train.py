@@ -38,13 +38,13 @@ class Options:
     """Train a recipe on one clip, on several clips of one skeleton or on a folder, and no more."""
 
     recipe: Annotated[Positional[str], arg(metavar="RECIPE")]
-    """residual-force, inbetween, perpetual, or endless."""
+    """residual-force, inbetween, perpetual, endless, or compliant."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUNDIR")]
     """The run folder, for poise eval and poise play."""
     clips: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="CLIP ...", help_behavior_hint="(required)")
     ] = ()
-    """Motion files."""
+    """Motion files. compliant: the scene, ball or door."""
     json: Flag = False
     """Print one JSON document and nothing else on stdout, see docs/json.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
@@ -66,6 +66,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.training.print_config:
         return printed(config)
     again = command_line("train", argv)
+    if o.recipe == "compliant":
+        from poise.cli.train_compliant import run as compliant
+
+        return compliant(config, o.out, o.training, again)
     if o.recipe != "residual-force":
         _only_a_folder(o)
         from poise.cli.train_endless import run as endless
@@ -109,7 +113,12 @@ def config_of(o: Options) -> Any:
     values = given(o.recipe_settings, o.network, o.primitives)
     default = class_of(o.recipe)()
     known = {f.name for f in fields(default)}
-    own = {"inbetween": ("dropout",), "perpetual": BY_HAND, "endless": ("going_on",)}.get(o.recipe, ())
+    own = {
+        "inbetween": ("dropout",),
+        "perpetual": BY_HAND,
+        "endless": ("going_on",),
+        "compliant": ("set",),
+    }.get(o.recipe, ())
     for name in [*values, *(given(o.body) if "body" not in known else ())]:
         if name not in known and name not in own:
             option = {"num_envs": "envs", "going_on": "from"}.get(name, name.replace("_", "-"))
@@ -118,10 +127,14 @@ def config_of(o: Options) -> Any:
         return settings(o.primitives, o.training, o.body, values)
     if o.recipe == "endless":
         values.pop("going_on", None)
+    if o.recipe == "compliant" and o.clips:
+        if len(o.clips) > 1:
+            raise PoiseError(f"one scene is learned at a time, got {len(o.clips)}")
+        values["scene"] = str(o.clips[0])
     if "dropout" in values:
         values["between_training.dropout"] = values.pop("dropout")
     t, clip = o.training, None
-    if t.by_clip and o.clips:
+    if t.by_clip and o.clips and o.recipe != "compliant":
         clip = o.reading.read(o.clips[0])
     return t.settings(o.recipe, default, o.body, values, clip)
 

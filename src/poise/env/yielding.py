@@ -105,6 +105,10 @@ class Yielding(Plugin):
         assert isinstance(goal, DisplacedGoal)
         self.goal = goal
 
+    def sources(self) -> Mapping[str, Tensor]:
+        """u, for terms of a policy that learns with it."""
+        return {"compliance/u": self.goal.offset}
+
     def rows(self) -> dict[str, Tensor]:
         return {"compliance/level": self.level}
 

@@ -62,7 +62,8 @@ class Imitation:
     Attributes:
         config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
         recovery_clips: those of the library, where recovery is learned by them.
-        props: what else stands in every world, such as a chair or a ball.
+        props: what else stands in every world, such as a chair or a ball, or another character, which
+            `env.opponent` moves.
         links, touches, floor: of such worlds, see `Scene`; the character's bodies have their own names.
         physics: a model in place of the body's own on a floor, such as a heavier one; without props.
     """
@@ -74,7 +75,7 @@ class Imitation:
     config: Any
     task: TaskConfig
     recovery_clips: RecoveryClips | None = None
-    props: tuple[Prop, ...] = ()
+    props: tuple[Prop | Character, ...] = ()
     physics: mujoco.MjModel | None = None
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
@@ -132,7 +133,7 @@ class Imitation:
             return make_backend(self.model, count, device, threads=threads)
         things = (Character(self.humanoid), *self.props)
         scene = Scene(things, self.links, self.touches, self.floor, self.config.sim)
-        return SceneSim(scene, count, device, threads).characters()
+        return SceneSim(scene, count, device, threads).characters(things[0].name)
 
     def bare(self, rewards: bool = False, groups: bool = False) -> Imitation:
         """The same task with what a policy needs alone: no ends, no style, and without rewards but for

@@ -1,6 +1,7 @@
 """Scenes in which a character gives way, one file each."""
 
 from poise.env.scenes.ball import Balance
+from poise.env.scenes.chicken import Chicken
 from poise.env.scenes.door import Doorway
 from poise.env.scenes.hands import Hands
 from poise.env.scenes.pull import Pull
@@ -11,12 +12,13 @@ from poise.env.scenes.trampoline import Trampoline
 #: The scenes by their names.
 SCENES: dict[str, type[PlayScene]] = {
     "throws": Throws, "pull": Pull, "hands": Hands, "door": Doorway, "trampoline": Trampoline,
-    "ball": Balance,
+    "ball": Balance, "chicken": Chicken,
 }  # fmt: skip
 
 __all__ = [
     "SCENES",
     "Balance",
+    "Chicken",
     "Doorway",
     "Hands",
     "PlayScene",

@@ -4,6 +4,7 @@
 # pyright: reportUnknownVariableType=false
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,7 +14,7 @@ from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
 from poise.env.events import InScene, Pushes, Switch, always
 from poise.env.events.event import Drawn
-from poise.env.frame import Frame, ObsTerm, RewardTerm
+from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goals.displaced import DisplacedGoal
 from poise.env.goals.goal import Goal
 from poise.env.plugins import Felt, Plugin
@@ -32,6 +33,8 @@ UP_M = 0.2
 UNIT_N, MOST_N = 100.0, 150.0
 #: Of the linear law, N/m and N s/m.
 GAIN, DAMPING = 700.0, 250.0
+#: Of the angle at which a rod counts as fallen.
+COS_45 = math.cos(math.pi / 4)
 FLAT = torch.tensor([1.0, 1.0, 0.0])
 
 
@@ -40,9 +43,9 @@ class Balance:
     """A rod with a ball on its end stands on the head, free to tilt.
 
     Two fictional forces, at the head and at the root, act on nothing but the goal, which gives way to
-    them: so the character moves as it wants the ball to go. A policy that learns the scene sets them,
-    six numbers; without one a linear law does, of where the ball is and how fast, against where the head
-    would be without giving way. Since nothing moves by such a force in the simulation, `Stiffness` and
+    them: so the character moves as it wants the ball to go. A linear law sets them, of where the ball is
+    and how fast, against where the head would be without giving way; a policy that learns the scene adds
+    to them, six numbers. Since nothing moves by such a force in the simulation, `Stiffness` and
     algorithm1 give way to it, eq8 does not.
 
     Attributes:
@@ -91,13 +94,15 @@ class Balance:
             events=(Tilted(top, self.spread, self.seed), Switch(link.name, always)),
         )
         chest = (humanoid.rows_of("spine") or (0,))[-1]
-        push = Pushes((self.pushes,) * 2, (2.0, 3.0), 0.1, (chest,), reference.rate_hz, self.seed)
+        force, rate = (self.pushes, self.pushes), reference.rate_hz
+        push = Pushes(force, (2.0, 3.0), 0.1, (chest,), rate, self.seed)
         pushes = (push,) if self.pushes else ()
         known = {"head": head, "length": self.length}
         return Stage(
             (top,), (link,), (), (part, *pushes, Fictional(self, head)),
             (ObsTerm("task/ball", ball_seen, known),),
-            (RewardTerm("task/above", above, 0.5, known, imitation=False),), True, yields=fictional,
+            (RewardTerm("task/above", above, 0.5, known, imitation=False),),
+            (DoneTerm("task/dropped", dropped),), True, yields=fictional,
         )  # fmt: skip
 
 
@@ -167,7 +172,7 @@ class FictionalForces(Plugin):
 
     Attributes:
         asked: `(N, 6)` what a policy asks for in the control steps that come, at head and root, in units
-            of `UNIT_N` and the heading's axes; None leaves it to the linear law.
+            of `UNIT_N` and the heading's axes, beside the linear law; None for nothing.
     """
 
     def __init__(self, given: Fictional, rows: CharacterRows, sim: SceneSim, goal: Goal):
@@ -182,18 +187,17 @@ class FictionalForces(Plugin):
 
     def push(self, drive: Drive) -> None:
         """A control step begins: sets the forces that are held for it."""
+        law = self._given.given
+        off, moves = tipped(self._sim, law.length)
+        off = off - self._head()
+        # A ball that has fallen is let go.
+        up = (off[:, 2:] > 0.5 * law.length).to(off)
+        one = up * FLAT.to(off) * (law.gain * off + law.damping * moves)
+        force = torch.stack((one, one), 1).to(self._force)
         if self.asked is not None:
             local = UNIT_N * self.asked.unflatten(1, (2, 3)).to(self._force)
             heading = heading_quat(self._rows.state.xquat[:, 1]).unsqueeze(1)
-            force = quat_rotate(heading.to(local).expand(-1, 2, -1), local)
-        else:
-            law = self._given.given
-            off, moves = tipped(self._sim, law.length)
-            off = off - self._head()
-            # A ball that has fallen is let go.
-            up = (off[:, 2:] > 0.5 * law.length).to(off)
-            one = up * FLAT.to(off) * (law.gain * off + law.damping * moves)
-            force = torch.stack((one, one), 1).to(self._force)
+            force = force + quat_rotate(heading.to(local).expand(-1, 2, -1), local)
         size = force.norm(dim=-1, keepdim=True)
         self._force = force * (MOST_N / size.clamp_min(MOST_N))
 
@@ -239,3 +243,10 @@ def above(frame: Frame, head: int, length: float) -> Tensor:
     arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
     off = (pos + arm - frame.sim.pos[:, head])[:, :2]
     return torch.exp(-SHARPNESS * off.square().sum(-1))
+
+
+def dropped(frame: Frame) -> Tensor:
+    """`(N,)` bool: the rod leans by more than 45 degrees."""
+    quat = frame.source("rod/quat")
+    along = quat_rotate(quat, torch.tensor([0.0, 0.0, 1.0]).to(quat).expand(len(quat), 3))
+    return along[:, 2] < COS_45

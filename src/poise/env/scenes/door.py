@@ -86,7 +86,7 @@ class Doorway:
         return Stage(
             (door,), (link,), (), (part,),
             (ObsTerm("task/phase", phase), ObsTerm("task/knob", knob_seen, {"row": row, "knob": knob})),
-            (RewardTerm("task/open", opened, 0.5, imitation=False),), True,
+            (RewardTerm("task/open", opened, 0.5, imitation=False),), from_start=True,
         )  # fmt: skip
 
 

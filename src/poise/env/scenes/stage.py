@@ -7,12 +7,12 @@ from typing import NamedTuple, Protocol
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.frame import ObsTerm, RewardTerm
+from poise.env.frame import DoneTerm, ObsTerm, RewardTerm
 from poise.env.goals.goal import Goal
 from poise.env.plugins import Plugin
 from poise.env.reference import Reference
 from poise.errors import PoiseError
-from poise.sim import Backend, Floor, Link, Plane, Touch
+from poise.sim import Backend, Character, Floor, Link, Plane, Touch
 from poise.sim.props import Prop
 
 Given = Compliance | Stiffness
@@ -30,17 +30,18 @@ class Stage(NamedTuple):
         props, links, touches: see `sim.Scene`; the character's bodies have their own names.
         plugins: of the task; those that tell forces (`Plugin.felt`) are what the character gives way to.
         floor: what they stand on.
-        obs, rewards: of a policy that learns the scene: the task's state and reward.
+        obs, rewards, dones: of a policy that learns the scene: the task's state, reward and failure.
         yields: how a character gives way in the scene, of what is stated, None for nothing.
         from_start: whether episodes begin with the motion's first frame, since the scene goes by time.
     """
 
-    props: tuple[Prop, ...] = ()
+    props: tuple[Prop | Character, ...] = ()
     links: tuple[Link, ...] = ()
     touches: tuple[Touch, ...] = ()
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
     obs: tuple[ObsTerm, ...] = ()
     rewards: tuple[RewardTerm, ...] = ()
+    dones: tuple[DoneTerm, ...] = ()
     from_start: bool = False
     floor: Floor = Plane()
     yields: Callable[[Given | None], Given] = as_given

@@ -10,54 +10,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.scenes import PlayScene, door
-from poise.errors import PoiseError
+from poise.env.scenes import Chicken, PlayScene, door
+from poise.jobs.compliant.hopping import AT_SOMEBODY, WAYS, hopping
+from poise.jobs.compliant.poses import at_ease, smooth_step
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.tracker import Tracker
 from poise.kin import match_positions, qpos_to_clip
 from poise.kin.directed import end_of
 from poise.motion import Clip
-from poise.spatial import quat_mul
 
 #: Where the hand takes the knob: m before the shoulder, to the middle from it, and above the floor.
 REACH_M, INWARD_M, KNOB_M = 0.3, 0.03, 1.12
 
 
-def motion_of(scene: PlayScene, tracker: Tracker) -> Clip | None:
-    """The motion of a scene that has one of its own, else None."""
+def motion_of(scene: PlayScene, tracker: Tracker, seconds: float = 8.0) -> Clip | None:
+    """The motion of a scene that has one of its own, else None; a door takes its own time."""
+    if isinstance(scene, Chicken):
+        return hopping(tracker, seconds, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
     return opening(tracker) if isinstance(scene, door.Doorway) else None
-
-
-def at_ease(tracker: Tracker, yaw: float = 0.0) -> np.ndarray:
-    """`(7 + n,)` the policy's pose at ease, above the origin, facing +X turned by `yaw` rad.
-
-    Raises:
-        PoiseError: the policy has not learned to stand at ease, which policies with recovery have.
-    """
-    if tracker.recovery_clips is None:
-        raise PoiseError(
-            "the policy knows no pose at ease", hint="Give a policy that was trained with recovery"
-        )
-    qpos = tracker.recovery_clips.ease.double().numpy().copy()
-    clip = qpos_to_clip(np.stack([qpos, qpos]), tracker.humanoid.table, tracker.humanoid.skeleton, 30.0)
-    left, right = (clip.positions()[0, end_of(clip.skeleton, f"{s}_foot")] for s in ("left", "right"))
-    hips = _hips(tracker, clip)
-    side = hips if hips is not None else left - right
-    turn = yaw + np.pi / 2 - np.arctan2(side[1], side[0])
-    about = torch.tensor([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)], dtype=torch.float64)
-    qpos[3:7] = quat_mul(about, torch.from_numpy(qpos[3:7])).numpy()
-    qpos[:2] = 0.0
-    return qpos
-
-
-def _hips(tracker: Tracker, clip: Clip) -> np.ndarray | None:
-    """From the right hip to the left one."""
-    rows = tracker.humanoid.table.rows
-    by = {rows[i].side: rows[i].joint for i in tracker.humanoid.rows_of("thigh")}
-    if not {"left", "right"} <= by.keys():
-        return None
-    pos = clip.positions()[0]
-    return pos[by["left"]] - pos[by["right"]]
 
 
 def opening(tracker: Tracker) -> Clip:
@@ -65,7 +35,7 @@ def opening(tracker: Tracker) -> Clip:
     rate, ease = float(tracker.config.sim.control_hz), at_ease(tracker)
     frames = round(door.LASTS_S * rate) + 1
     t = np.arange(frames) / rate
-    open_by = door.OPENS * _step(t, door.GRIPS_S + 0.1, door.LETS_GO_S - 0.3)
+    open_by = door.OPENS * smooth_step(t, door.GRIPS_S + 0.1, door.LETS_GO_S - 0.3)
     radius = door.MADE_FOR - door.Door().width + door.Door().knob[1]
     # From where the knob is closed: x = r sin(phi), y = -r (1 - cos(phi)).
     knob = np.stack((radius * np.sin(open_by), -radius * (1.0 - np.cos(open_by)), 0.0 * t), 1)
@@ -82,7 +52,9 @@ def _hand_path(clip: Clip, knob: np.ndarray, t: np.ndarray) -> Tensor:
     hand = clip.positions()[:, end_of(clip.skeleton, "left_hand")]
     shoulder = clip.positions()[0, clip.skeleton.parents[_elbow(clip)]]
     there = np.array([shoulder[0] + REACH_M, shoulder[1] - INWARD_M, KNOB_M]) + knob
-    share = _step(t, 0.4, door.GRIPS_S - 0.2) - _step(t, door.LETS_GO_S + 0.05, door.LASTS_S - 0.1)
+    share = smooth_step(t, 0.4, door.GRIPS_S - 0.2) - smooth_step(
+        t, door.LETS_GO_S + 0.05, door.LASTS_S - 0.1
+    )
     return torch.from_numpy(hand + share[:, None] * (there - hand))
 
 
@@ -94,9 +66,3 @@ def _led(clip: Clip, goal: Tensor) -> Clip:
     root, rot = clip.tensors()
     led = match_positions(clip.skeleton, rot, root, {end_of(clip.skeleton, "left_hand"): goal})
     return clip.replaced(rot=led.numpy())
-
-
-def _step(t: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """0 before `start`, 1 after `stop`, s, smooth between them."""
-    x = np.clip((t - start) / (stop - start), 0.0, 1.0)
-    return x * x * x * (10.0 + x * (6.0 * x - 15.0))

@@ -18,13 +18,16 @@ import torch
 
 from poise.control import Compliance, Stiffness
 from poise.env import ImitationEnv
-from poise.env.scenes import PlayScene
+from poise.env.on_top import Topped
+from poise.env.scenes import Chicken, PlayScene
 from poise.errors import PoiseError
 from poise.eval import run_episodes, write_score
 from poise.eval.rolloutset import RolloutSet
+from poise.jobs.compliant.fight import opposing, rival_stage, weighed
 from poise.jobs.compliant.motions import motion_of
 from poise.jobs.compliant.scene_meters import meter_of, words_of
 from poise.jobs.compliant.standing import standing
+from poise.jobs.compliant.training import Learned
 from poise.jobs.compliant.watch import Watch
 from poise.jobs.deliver import make_report, simulated_clip
 from poise.jobs.open import open_run
@@ -35,6 +38,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.motion.io import write_clip
+from poise.recipes.compliant import seen
 from poise.recipes.imitation import Imitation
 from poise.view import Mover, write_report
 
@@ -123,6 +127,7 @@ def play(
     seconds: float = 8.0,
     threads: int = 0,
     name: str = "",
+    learned: Learned | None = None,
 ) -> Played:
     """A scene with compliance and without, by the policy alone, from starts that differ by a hair.
 
@@ -132,27 +137,41 @@ def play(
         given: how it gives way; None is what suits the scene, Compliance() for most.
         count: of episodes, side by side.
         name: of the scene, by default that of its class.
+        learned: what was learned on top of the policy, for the character that gives way; it gives way as
+            it has learned to.
 
     Raises:
         PoiseError: the body cannot do the scene, or the clip cannot be read.
     """
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
-    own_motion = motion_of(scene, tracker)
+    own_motion = motion_of(scene, tracker, seconds)
     if clip is not None and own_motion is not None:
         raise PoiseError("the scene has a motion of its own", name or "play", "Leave the clip out")
     clip = clip or own_motion
     task = standing(tracker, seconds) if clip is None else imitation_of(tracker, [place(clip, tracker)])
+    rival: Imitation | None = None
+    if isinstance(scene, Chicken):
+        task = weighed(task, scene.mass)
     stage = scene.stage(task.humanoid, task.reference)
+    if isinstance(scene, Chicken) and scene.against == "rival":
+        stage, rival = rival_stage(scene, tracker, stage)
     task = replace(task, props=stage.props, links=stage.links, touches=stage.touches, floor=stage.floor)
     both: list[tuple[Imitation, RolloutSet, Watch, Evaluation]] = []
+    if learned is not None:
+        given = learned.config.given()
     for compliance in (stage.yields(given), None):
-        own = replace(task.task, plugins=stage.plugins, compliance=compliance, help_by="all")
-        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads))
-    (imitation, rollouts, seen, evaluation), (_, others, other, _) = both
+        others = () if rival is None else (opposing(rival, tracker, compliance),)
+        plugins = (*stage.plugins, *others)
+        own = replace(task.task, plugins=plugins, compliance=compliance, help_by="all")
+        top = None if compliance is None else learned
+        if top is not None:
+            own = replace(own, obs=(*own.obs, *seen(stage)))
+        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top))
+    (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
     return Played(
         name or type(scene).__name__.lower(), {**WORDS, **words_of(scene)}, imitation, evaluation,
-        seen.figures(rollouts, task), other.figures(others, task), count,
-        tuple(seen.arrows), seen.movers(),
+        looked.figures(rollouts, task), other.figures(others, task), count,
+        tuple(looked.arrows), looked.movers(),
     )  # fmt: skip
 
 
@@ -161,17 +180,31 @@ def _title(scene: str, motion: str) -> str:
 
 
 def _episodes(
-    scene: PlayScene, tracker: Tracker, task: Imitation, count: int, threads: int
+    scene: PlayScene,
+    tracker: Tracker,
+    task: Imitation,
+    count: int,
+    threads: int,
+    learned: Learned | None = None,
 ) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
     zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
+    topped = None if learned is None else Topped(tracker.policy, learned.top, learned.added)
 
     def make(worlds: int) -> ImitationEnv:
         env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
         watch.begin(env)
+        if topped is not None:
+            topped.begin(env)
         return env
 
     rollouts, recordings = run_episodes(
-        make, tracker.policy, zero, zero, cycles=1, observers=[watch], trial=torch.arange(count)
+        make,
+        topped or tracker.policy,
+        zero,
+        zero,
+        cycles=1,
+        observers=[watch],
+        trial=torch.arange(count),
     )
     card = scored(rollouts, task, tracker.about, RULE, tracker.config.method)
     return task, rollouts, watch, Evaluation(card, rollouts, recordings, False)

@@ -8,18 +8,23 @@ import math
 from collections.abc import Callable, Mapping
 
 import torch
+from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.env.scenes import Balance, Doorway, PlayScene, Trampoline
-from poise.env.scenes.ball import upright_of
+from poise.env.goals import DisplacedGoal
+from poise.env.opponent import Opposing
+from poise.env.scenes import Balance, Chicken, Doorway, PlayScene, Trampoline
+from poise.env.scenes.ball import COS_45, upright_of
 from poise.env.scenes.door import WANTED, across
 from poise.env.scenes.trampoline import FIRST_S, Bouncing
 from poise.jobs.compliant.meters import Meter, part_of
+from poise.jobs.compliant.stiffness import FALLEN
+from poise.jobs.compliant.throws import TOUCHES_N
 from poise.sim import Mechanics
 
 G = 9.81
-#: Of the angle at which a rod counts as fallen.
-COS_45 = math.cos(math.pi / 4)
+#: s after the first touch at which it is looked how far a player was pushed.
+PUSHED_S = 0.5
 
 
 class DoorMeter:
@@ -138,8 +143,63 @@ class BallMeter:
         }
 
 
+class ChickenMeter:
+    """How far a blow pushes a player off, and its opponent, where that is one."""
+
+    words: Mapping[str, str] = {
+        "pushed_mm": f"Pelvis pushed off its way in {PUSHED_S:g} s from the first touch on, mean, mm",
+        "rival_pushed_mm": "The same of its opponent, mm",
+        "touched": "Episodes with a touch",
+        "rival_fell": "Episodes in which the opponent fell",
+    }
+
+    def begin(self, env: ImitationEnv) -> None:
+        self._part = part_of(env)
+        opposing = env.plugin(Opposing)
+        self._envs = [env] if opposing is None else [env, opposing.env]
+        n = env.num_envs
+        self._left = torch.full((n,), -1, dtype=torch.long)
+        self._from = torch.zeros(len(self._envs), n, 2)
+        self._way = torch.zeros(len(self._envs), n)
+        self._fell = torch.zeros(n, dtype=torch.bool)
+
+    def see(self, env: ImitationEnv, step: int) -> None:
+        off = torch.stack([_off(e) for e in self._envs])
+        felt = self._part.felt()
+        assert felt is not None
+        touched = (felt.force.norm(dim=-1) > TOUCHES_N).any(1)
+        begins = touched & (self._left < 0)
+        self._from[:, begins] = off[:, begins]
+        self._left[begins] = round(PUSHED_S * env.goal.rate_hz)
+        ends = self._left == 1
+        self._way[:, ends] = (off - self._from).norm(dim=-1)[:, ends]
+        self._left = torch.where(self._left > 0, self._left - 1, self._left)
+        if len(self._envs) > 1:
+            height = self._envs[1].pose().pos[:, 0, 2]
+            if step == 0:
+                self._stood = height.clone()
+            self._fell |= height < FALLEN * self._stood
+
+    def figures(self) -> dict[str, float]:
+        counts = self._left == 0
+        ways = self._way[:, counts].mean(1) if bool(counts.any()) else self._way[:, 0] * 0.0
+        return {
+            "pushed_mm": 1000.0 * float(ways[0]),
+            "rival_pushed_mm": 1000.0 * float(ways[1]) if len(ways) > 1 else 0.0,
+            "touched": float((self._left >= 0).sum()),
+            "rival_fell": float(self._fell.sum()),
+        }
+
+
+def _off(env: ImitationEnv) -> Tensor:
+    """`(N, 2)` m, the pelvis from where the motion has it, which does not give way."""
+    goal = env.goal.goal if isinstance(env.goal, DisplacedGoal) else env.goal
+    return (env.pose().pos[:, 0] - goal.layout.unpacked(goal.now()).pos[:, 0])[:, :2]
+
+
 METERS: Mapping[type[PlayScene], Callable[[], Meter]] = {
     Doorway: DoorMeter, Trampoline: TrampolineMeter, Balance: BallMeter,
+    Chicken: ChickenMeter,
 }  # fmt: skip
 
 

@@ -1,0 +1,46 @@
+"""`poise train compliant`: a scene in which the character gives way, learned on top of a policy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from poise.cli.answer import Answer
+from poise.cli.console import say
+from poise.cli.output import claimed
+from poise.cli.progress import training as progress
+from poise.cli.progress import working
+from poise.cli.training import held_already
+from poise.cli.training import stopped as interrupted
+from poise.errors import PoiseError
+
+if TYPE_CHECKING:
+    from poise.cli.options import Training
+    from poise.recipes.compliant import Compliant
+
+
+def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
+    """Trains until the limit or Ctrl-C."""
+    from poise.jobs.compliant.training import RUN_FILE, train
+    from poise.jobs.open import open_run
+    from poise.learn import LATEST, Until
+
+    if training.device != "cpu":
+        raise PoiseError("the recipe compliant trains on the CPU", hint="Leave --device out")
+    if (out / RUN_FILE).exists() and not training.resume:
+        raise held_already(out)
+    with working("opening the policy"):
+        tracker = open_run(None).tracker
+    until = Until(minutes=training.minutes, iterations=training.iterations)
+    with claimed(out), progress(until) as show:
+        result = train(config, tracker, out, until, show, training.threads)
+    if result.interrupted:
+        return interrupted(out, again)
+    last = result.last
+    if last is None:
+        say(f"{out} had reached its limit before; nothing was trained.")
+    else:
+        say(f"Trained {last.seconds:.0f} s, {last.samples:,} samples")
+        say(f"poise play compliant {config.scene} --learned {out} -o OUT shows it")
+    told = None if last is None else {"seconds": last.seconds, "samples": last.samples}
+    return Answer(told, {"run": out, "checkpoint": out / LATEST})
