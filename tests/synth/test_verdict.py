@@ -12,6 +12,7 @@ from poise.motion import Clip
 from poise.synth.filler import Filler
 from poise.synth.gaps import Gap
 from poise.synth.inbetween import Filling, fill_keyframes
+from poise.synth.limits import Feet
 from poise.synth.verdict import JUDGED, GapFault, judged, told, weight
 from toy_human import swing
 
@@ -51,9 +52,15 @@ def test_a_gap_with_faults_is_filled_anew_and_one_without_is_not(
     fill = Filler.fill
 
     def spoiled(
-        self: Filler, root: torch.Tensor, rot: torch.Tensor, gap: Gap, noise: object, most: float = 1.0
+        self: Filler,
+        root: torch.Tensor,
+        rot: torch.Tensor,
+        gap: Gap,
+        noise: object,
+        most: float,
+        ways: tuple[Feet, ...],
     ) -> None:
-        fill(self, root, rot, gap, noise, most)  # type: ignore[arg-type]
+        fill(self, root, rot, gap, noise, most, ways)  # type: ignore[arg-type]
         calls.append((gap, most))
         if gap.a == 45 and most == 1.0:
             root[gap.a + 8 : gap.b - 8, 1] += 0.5

@@ -18,6 +18,7 @@ from poise.nets.transition import Known
 from poise.spatial import slerp
 from poise.synth.flight import flown
 from poise.synth.footlock import lock_feet
+from poise.synth.footsteps import stepped
 from poise.synth.gaps import Gap
 from poise.synth.limits import Calmed, Feet, Motion, calmed, excess
 from poise.synth.other_rig import OtherRig
@@ -46,7 +47,7 @@ class Filling:
     foot_lock: bool = True
     adaptation: Adaptation | None = None
     seed: int = 0
-    rounds: int = 3
+    rounds: int = 4
 
 
 def interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
@@ -75,6 +76,7 @@ class Filler:
         limits: `(J,)` m/s that its joints reach at most.
         aloft: m that each keyframe is off the floor, 0 for those that stand.
         speeds: m/s, the level velocity at those in the air.
+        floor: m, heights of ankles and of toes that stand.
         calmed: what each gap was made of to keep to what people reach, by its ends.
         best: the network's best guess of each gap, which filling it anew needs again.
     """
@@ -88,6 +90,7 @@ class Filler:
     limits: Tensor
     aloft: dict[int, float]
     speeds: dict[int, Tensor] = field(default_factory=dict[int, Tensor])
+    floor: tuple[float, float] = (0.0, 0.0)
     calmed: dict[Gap, Calmed] = field(default_factory=dict[Gap, Calmed])
     best: dict[Gap, tuple[Tensor, Tensor, Tensor]] = field(
         default_factory=dict[Gap, tuple[Tensor, Tensor, Tensor]]
@@ -101,8 +104,10 @@ class Filler:
         gap: Gap,
         noise: torch.Generator | None,
         most: float = 1.0,
+        ways: tuple[Feet, ...] = ("held", "stepped", "free"),
     ) -> None:
-        """Fills a gap in place, with the share `most` of the network's motion at most."""
+        """Fills a gap in place, with the share `most` of the network's motion at most, and with the
+        first of `ways` for its feet that people can do."""
         a, b = gap
         if noise is not None:
             *made, contact = self._transition(root, rot, gap, noise)
@@ -121,6 +126,13 @@ class Filler:
             path = torch.cat((flight.level, flight.height[:, None]), 1)
             made, plain = (path, made[1]), (path.clone(), plain[1])
 
+        def fast(whole: Motion) -> float:
+            return excess(self.own.skeleton, self.limits, whole, self.own.fps)[0]
+
+        def over(motion: Motion) -> float:
+            whole = tuple(torch.cat((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
+            return fast((whole[0], whole[1]))
+
         def finish(motion: Motion, feet: Feet) -> Motion:
             root[a + 1 : b], rot[a + 1 : b] = motion
             holds = feet == "held" and flight is None
@@ -129,14 +141,20 @@ class Filler:
                 here, off = slice(a, b + 1), (before > 0.0, after > 0.0)
                 moved = planted(self.own.skeleton, (root[here], rot[here]), off, flight, self.own.fps)
                 root[here], rot[here] = moved
+            if feet == "stepped":
+                here = slice(a, b + 1)
+                past = (root[a - 1 : a], rot[a - 1 : a]) if a else None
+                walked = stepped(
+                    self.own.skeleton, (root[here], rot[here]), self.floor, past, self.own.fps, fast
+                )
+                if walked is not None:
+                    root[here], rot[here] = walked
+                    self._finish(root, rot, gap, contact[:, :0])
             return root[a + 1 : b].clone(), rot[a + 1 : b].clone()
 
-        def over(motion: Motion) -> float:
-            whole = tuple(torch.cat((e[:1], m, e[1:])) for e, m in zip(ends, motion, strict=True))
-            return excess(self.own.skeleton, self.limits, (whole[0], whole[1]), self.own.fps)[0]
-
-        # Feet that are let go would be under the floor before and after a flight.
-        ways: tuple[Feet, ...] = ("held",) if flight is not None else ("held", "free")
+        if flight is not None:
+            # Feet that are let go would be under the floor before and after a flight.
+            ways = ("held",)
         done = calmed(made, plain, finish, over, ways if self.filling.foot_lock else ("free",), most)
         root[a + 1 : b], rot[a + 1 : b] = done.motion
         self.calmed[gap] = done

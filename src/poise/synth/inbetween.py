@@ -20,7 +20,14 @@ from poise.spatial import slerp
 from poise.synth.filler import EACH_GAP, Filler, Filling, interpolated
 from poise.synth.flight import flight_speeds
 from poise.synth.gaps import Gap, check_keyframes, split_gaps
-from poise.synth.limits import ALOFT_M, Calmed, fastest, off_floor, under_floor
+from poise.synth.limits import (
+    ALOFT_M,
+    Calmed,
+    fastest,
+    off_floor,
+    standing_heights,
+    under_floor,
+)
 from poise.synth.other_rig import OtherRig
 from poise.synth.rounds import best_of_rounds
 from poise.synth.verdict import GapFault
@@ -95,7 +102,9 @@ def fill_keyframes(
     ]
     aloft = {k: float(h) for k, h in zip(kept, heights, strict=True) if k in keys and h > ALOFT_M}
     speeds = flight_speeds(root[:, :2], keys, aloft, own.fps)
-    filler = Filler(own, model, filling, keys, rig, feet, fastest(own.skeleton), aloft, speeds)
+    floor = standing_heights(own.skeleton, (root[kept], rot[kept]))
+    limits = fastest(own.skeleton)
+    filler = Filler(own, model, filling, keys, rig, feet, limits, aloft, speeds, floor)
     clips: list[Clip] = []
     faults: list[GapFault] = []
     for sample in range(filling.samples):
@@ -127,7 +136,7 @@ def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
 
     less = [f"{a} to {b} ({100 * c.share:.0f} %)" for (a, b), c in calmed.items() if c.share < 1.0]
     free = [f"{a} to {b}" for (a, b), c in calmed.items() if c.feet == "free"]
-    fast = [f"{a} to {b} ({c.over:.1f} x)" for (a, b), c in calmed.items() if c.over > 1.0]
+    fast = [f"{a} to {b} ({c.over:.1f} x)" for (a, b), c in calmed.items() if c.over > 1.02]
     out: list[str] = []
     if less:
         out.append(

@@ -26,6 +26,9 @@ ALOFT_M = 0.12
 #: m under the floor from which on a keyframe is no longer a foot that sank in.
 UNDER_M = 0.1
 
+#: Of the heights of the lower foot in frames that are kept, this share is where it stands.
+_STANDS = 0.3
+
 #: Root `(T, 3)` m and rotations `(T, J, 4)`.
 Motion = tuple[Tensor, Tensor]
 #: What is done with the feet of a gap: held where the network says that they stand, led from one place
@@ -114,6 +117,22 @@ def off_floor(skeleton: Skeleton, motion: Motion) -> Tensor:
     """`(T,)` m, how much higher the lowest joint is than in the frames that stand, of all given."""
     low = lowest(skeleton, motion)
     return low - low.quantile(0.1)
+
+
+def standing_heights(skeleton: Skeleton, motion: Motion) -> tuple[float, float]:
+    """m, how high the ankle and the toes are of the lower foot, in most frames; 0 without feet."""
+    try:
+        anatomy = find_anatomy(skeleton)
+    except PoiseError:
+        return 0.0, 0.0
+    ankles, toes = anatomy.of("foot"), [toe for _, toe in anatomy.toes]
+    if not ankles or not toes:
+        return 0.0, 0.0
+    offsets = torch.tensor(np.array(skeleton.offsets), dtype=motion[0].dtype)
+    height = forward_kinematics(skeleton.parents, offsets, *motion)[0][..., 2]
+    low = (height[:, list(some)].amin(-1).quantile(_STANDS) for some in (ankles, toes))
+    ankle, toe = (float(x) for x in low)
+    return ankle, toe
 
 
 def under_floor(skeleton: Skeleton, motion: Motion) -> Tensor:

@@ -12,11 +12,17 @@ from poise.motion import Clip
 from poise.spatial import slerp
 from poise.synth.filler import Filler
 from poise.synth.gaps import Gap
-from poise.synth.limits import Calmed, Motion, excess
+from poise.synth.limits import Calmed, Feet, Motion, excess
 from poise.synth.verdict import GapFault, judged, weight
 
-#: Shares of the network's motion in the best guess, round by round; the rest is interpolated.
-SHARES = (1.0, 0.5, 0.0)
+#: Shares of the network's motion in the best guess, round by round, the rest being interpolated, and
+#: what is done with feet: at last they are led from stand to stand.
+ROUNDS: tuple[tuple[float, tuple[Feet, ...]], ...] = (
+    (1.0, ("held", "stepped", "free")),
+    (0.5, ("held", "stepped", "free")),
+    (1.0, ("stepped",)),
+    (0.0, ("stepped",)),
+)
 #: Seconds beside a keyframe over which what the doctor mends fades in.
 FADE_S = 0.15
 #: Gaps of one clip that are mended so at most: each costs an examination of the whole clip.
@@ -43,7 +49,7 @@ def best_of_rounds(
     kept: dict[Gap, tuple[tuple[int, int], Motion, Calmed | None, Tensor]] = {}
     wanting = list(gaps)
     for round_ in range(max(1, filler.filling.rounds)):
-        noise, most = None, SHARES[min(round_, len(SHARES) - 1)]
+        noise, (most, ways) = None, ROUNDS[min(round_, len(ROUNDS) - 1)]
         if sample:
             most = 1.0
             seed = (filler.filling.seed * 100_003 + sample) * 1_009 + round_
@@ -51,7 +57,7 @@ def best_of_rounds(
         beside: dict[Gap, Tensor] = {}
         for made, gap in enumerate(wanting, 1):
             beside[gap] = rot[max(0, gap.a - 1)].clone()
-            filler.fill(root, rot, gap, noise, most)
+            filler.fill(root, rot, gap, noise, most, ways)
             if on_gap is not None and not round_:
                 on_gap(made)
         found = judged(_clip(filler, root, rot), gaps, sample)
