@@ -128,9 +128,10 @@ def config_of(o: Options) -> Any:
     if o.recipe == "endless":
         values.pop("going_on", None)
     if o.recipe == "compliant" and o.clips:
-        if len(o.clips) > 1:
-            raise PoiseError(f"one scene is learned at a time, got {len(o.clips)}")
-        values["scene"] = str(o.clips[0])
+        scene, *more = map(str, o.clips)
+        if more:
+            raise PoiseError(f"one scene is learned at a time, got {len(more) + 1}")
+        values["scene"] = scene
     if "dropout" in values:
         values["between_training.dropout"] = values.pop("dropout")
     t, clip = o.training, None
