@@ -177,8 +177,8 @@ class _Finder:
 
     def find(self) -> None:
         for joint, role in self.fixed.items():
-            who = "you said so" if joint in self.said else "the file's VRM bones say so"
-            self._add(role, joint, 1.0, who)
+            why = "you said so" if joint in self.said else "the file's VRM bones say so"
+            self._add(role, joint, 1.0, why)
         limbs = {(side, kinds): self._limb(side, kinds) for side in SIDES for kinds in (LEG, ARM)}
         for (side, _), limb in limbs.items():
             for kind, joint in limb.items():
