@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from poise.motion.io.text import write_whole
+
 COLORS = ("#e0692e", "#3b7ddd", "#7a5cd6", "#1f9d75", "#c2417c", "#8a8f98", "#a88a00")
 """One colour per series, in order; readable on white and on near-black."""
 
@@ -72,7 +74,7 @@ def _thin(n: int, most: int = 800) -> np.ndarray:
 
 def _write(text: str, path: Path | str | None) -> str:
     if path is not None:
-        Path(path).write_text(text, encoding="utf-8")
+        write_whole(Path(path), text)
     return text
 
 

@@ -38,6 +38,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.motion.io import write_clip
+from poise.motion.io.text import write_whole
 from poise.recipes.compliant import seen
 from poise.recipes.imitation import Imitation
 from poise.view import Mover, write_report
@@ -104,7 +105,7 @@ class Played:
         write_clip(self.clip, paths["simulated"])
         told = {"scene": self.scene, "episodes": self.count, "compliant": dict(self.figures),
                 "without": dict(self.stiff)}  # fmt: skip
-        paths["figures"].write_text(json.dumps(told, indent=1) + "\n")
+        write_whole(paths["figures"], json.dumps(told, indent=1) + "\n")
         paths["score"] = write_score(self.evaluation.card, out / "score.json")
         report = make_report(self.imitation, self.evaluation, {})
         frames = len(report.reference.pos)

@@ -56,7 +56,9 @@ def read_accessor(file: GltfFile, index: object, kind: str, what: str) -> np.nda
         raise PoiseError(f"{name} has no data", file.path)
     if sparse is not None:
         out = _with_sparse(file, sparse, out, name)
-    values = out.astype(np.float64)
+    # Odd kinds of NaN are told as what they are where they are used.
+    with np.errstate(invalid="ignore"):
+        values = out.astype(np.float64)
     if accessor.get("normalized") and dtype.kind in "iu":
         values = np.maximum(values / np.iinfo(dtype).max, -1.0)
     return values

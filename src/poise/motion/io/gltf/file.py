@@ -190,7 +190,7 @@ def _beside(uri: str, index: int, path: Path) -> Path:
     folder = path.parent.resolve()
     try:
         target = (folder / name.replace("\\", "/")).resolve()
-        inside, there = target.is_relative_to(folder), target.exists()
+        inside, there = target.is_relative_to(folder), target.is_file()
     except (OSError, ValueError, RuntimeError):
         raise PoiseError(f"the address of buffer {index} names no file", path) from None
     if not inside:

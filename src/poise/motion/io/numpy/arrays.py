@@ -33,11 +33,15 @@ Unpickle = Callable[[bytes, str | Path], Any]
 """Makes the value in a pickle's bytes; the second argument is the place that errors name."""
 
 _HEADER_BYTES = 1 << 16
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError)
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, struct.error, RuntimeError),
+    # Names of members that are no text.
+    UnicodeDecodeError,
+)
 
 # NumPy reads headers as Python literals, hence the odd company.
 _BAD_HEADER = (
-    *(ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError),
+    *(ValueError, TypeError, SyntaxError, RecursionError, MemoryError, EOFError, IndexError),
     tokenize.TokenError,
 )
 

@@ -22,6 +22,7 @@ from poise.motion.io.raw import ReadOptions
 from poise.motion.io.tables import BLANK, number, number_table
 from poise.motion.io.text import (
     CUT_OFF,
+    MAX_JOINTS,
     at_line,
     decode,
     read_bytes,
@@ -127,7 +128,7 @@ def _quoted(name: str) -> str:
 
 def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
     """The `# key: value` lines, and the index of the line with the column names."""
-    version = decode(lines[0], path, 1).removeprefix(MARK).strip(" ,\t")
+    version = decode(lines[0] if lines else b"", path, 1).removeprefix(MARK).strip(" ,\t")
     if version != str(VERSION):
         raise PoiseError(
             f"the file has version {shown(version)} of Poise's CSV; this Poise reads version {VERSION}",
@@ -157,8 +158,8 @@ def _skeleton(header: dict[str, str], path: Path) -> Skeleton:
     except (TypeError, ValueError, OverflowError) as error:
         raise PoiseError(f"the skeleton record is damaged ({shown(error)})", path, CUT_OFF) from None
     source = source_from_json(header["source"], path)
-    if not np.isfinite(ends).all():
-        raise PoiseError("the skeleton record holds an end that is not finite", path)
+    if not (np.isfinite(ends).all() and (np.abs(ends[:, 0]) <= MAX_JOINTS).all()):
+        raise PoiseError("the skeleton record holds an end that is not finite or on no joint", path)
     return make_skeleton(names, parents, offsets, ends[:, 0].astype(int), ends[:, 1:], source, path)
 
 

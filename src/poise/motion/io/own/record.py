@@ -50,7 +50,10 @@ def fitted(value: Any, kind: Any) -> Any:
         fields = get_type_hints(kind)
         return kind(**{k: fitted(value[k], fields[k]) for k in fields if k in value})  # type: ignore[operator]
     if kind is float and type(value) in (int, float):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ValueError("a number beyond all bounds") from None
     if type(value) is not kind:
         raise ValueError(f"{type(value).__name__} in the wrong place")
     return value

@@ -1,0 +1,85 @@
+"""What `python -m tests.fuzz` has found, each as a small file: refused in one sentence or read."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from handmade_gltf_files import Gltf, walker
+from handmade_numpy_files import odd_clip
+
+from poise.errors import PoiseError
+from poise.motion import read_clip, write_clip
+
+
+def refusal(path: Path, data: bytes) -> str:
+    path.write_bytes(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(PoiseError) as error:
+            read_clip(path, allow_pickle=True)
+    message = str(error.value)
+    assert message.startswith(str(path)) and message.isprintable()
+    return message
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> str:
+    write_clip(odd_clip(), tmp_path / "sound.csv")
+    return (tmp_path / "sound.csv").read_text()
+
+
+@pytest.mark.parametrize("uri", [".", "./"])
+def test_a_buffer_that_is_a_folder(tmp_path: Path, uri: str) -> None:
+    assert "buffer" in refusal(tmp_path / "a.gltf", walker()[0].gltf(uri).encode())
+
+
+def test_a_header_without_its_shape(tmp_path: Path) -> None:
+    text = b"{'descr': ('<f8',), 'fortran_order': False, 'shape': (2, 3), }\n"
+    refusal(tmp_path / "a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text)
+
+
+def test_a_number_of_the_record_beyond_all_bounds(tmp_path: Path, table: str) -> None:
+    lines = table.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("# source:"))
+    record = json.loads(lines[at].partition(":")[2])
+    record["unit_m"] = 10**400
+    lines[at] = "# source: " + json.dumps(record)
+    assert "source is damaged" in refusal(tmp_path / "a.csv", "\n".join(lines).encode())
+
+
+def test_ends_on_joints_beyond_all_bounds(tmp_path: Path, table: str) -> None:
+    lines = table.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("# skeleton:"))
+    record = json.loads(lines[at].partition(":")[2])
+    record["ends"] = [[1e300, 0, 0, 0]]
+    lines[at] = "# skeleton: " + json.dumps(record)
+    assert "on no joint" in refusal(tmp_path / "a.csv", "\n".join(lines).encode())
+
+
+@pytest.mark.parametrize("data", [b"\xef\xbb\xbf", b"\n", b"\r\n", b" ", b"\xef\xbb\xbf\n"])
+def test_a_table_of_nothing(tmp_path: Path, data: bytes) -> None:
+    refusal(tmp_path / "a.csv", data)
+
+
+def test_a_member_whose_name_is_no_text(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("pos\u00e9.npy", b"x")
+    data = buffer.getvalue().replace("\u00e9".encode(), b"\xff\xff")
+    assert "damaged" in refusal(tmp_path / "a.npz", data)
+
+
+def test_a_signalling_nan_is_no_warning(tmp_path: Path) -> None:
+    file: Gltf = walker()[0]
+    # Single precision, the top bit of its fraction clear.
+    bare = np.frombuffer(bytes(file.data), dtype=np.uint8).copy()
+    bare[:4] = np.frombuffer(struct.pack("<I", 0x7F800001), dtype=np.uint8)
+    file.data[:] = bare.tobytes()
+    refusal(tmp_path / "a.glb", file.glb())
