@@ -53,6 +53,12 @@ def test_the_loop_goes_on_while_another_process_decides_and_after_its_end() -> N
     # Asked for once more, it begins anew.
     world.look_ahead((1,))
     assert decisions(ahead, 1, lambda: world.step(ease)) == 1
+    # After steps in which there was no time, nothing that was decided before is acted by.
+    assert decisions(ahead, 1, lambda: world.step(ease)) == 1
+    world.hurries, looked = True, world.looked
+    world.step(ease)
+    world.hurries = False
+    assert all(w.choice is None for w in ahead._worlds.values()) and world.looked == looked
     if hasattr(os, "kill"):
         pid = ahead._process.pid
         assert pid is not None

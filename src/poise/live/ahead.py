@@ -51,6 +51,10 @@ class Ahead(Protocol):
         """Actions `(N, A)`."""
         ...
 
+    def skip(self) -> None:
+        """The policy acts alone in this step: what was decided before is of another time afterwards."""
+        ...
+
     @property
     def acts(self) -> bool:
         """Whether the last actions had looked ahead."""
@@ -88,12 +92,17 @@ class AheadAtOnce:
 
     def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
         """See `Ahead`."""
+        self._watched = env, worlds
         self._lookahead.watch(env, worlds)
 
     def act(self, obs: Tensor) -> Tensor:
         """See `Ahead`."""
         self.acts = True
         return self._lookahead.act(obs)
+
+    def skip(self) -> None:
+        """See `Ahead`."""
+        self.watch(*self._watched)
 
     def close(self) -> None:
         """See `Ahead`."""
@@ -200,6 +209,10 @@ class AheadBeside:
             world.since = None if world.since is None else world.since + 1
             world.past = [*world.past, pos[i].clone()][-PAST:]
         return env.unfiltered(torch.lerp(much * self._policy.act(obs) + offsets, env.action, keep))
+
+    def skip(self) -> None:
+        """See `Ahead`. What was asked is not waited for."""
+        self._worlds = {k: _World() for k in self._worlds}
 
     def _ask(self, i: int, world: _World, pos: Tensor) -> None:
         """Hands a question over, where nothing is being decided and this character's turn has come."""

@@ -196,6 +196,8 @@ class World:
         goal.notes.clear()
         obs = env.observe()
         ahead = self._ahead if self.ahead_of and not self.hurries else None
+        if self._ahead is not None and ahead is None:
+            self._ahead.skip()
         env.drive(self._act(obs) if ahead is None else ahead.act(obs))
         self.looked += ahead is not None and ahead.acts
         env.controls.step(env.backend, self.substeps)
