@@ -6,7 +6,10 @@ Every network learns for the same CPU time of one thread. Cross holds whole subj
 of the other clips. A method is kinematic, or has a body: then the tracker that comes with Poise does its
 motion, without help and without training of its own. MAE is the mean over the frames of the Euclidean
 distance of all hinges, rad, FAE that of the last frame; the mean of 10 samples, and the best beside it.
-Written after each method; a command that goes on with the same file makes only what it lacks.
+Written after each method; with --run RUN, the folder of a training (`endless_train.py`), its motions are
+learned from, only the held-out clips are read, so that there is Cross alone, and its generator, which
+learned for longer, is one more method (--shipped: the one that comes with Poise, too). A command that
+goes on with the same file makes only what it lacks.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from tracker import HELD_OUT, SIXTY, TWINS
 from poise.body import BodyConfig
 from poise.env.goals import EndlessGoal
 from poise.env.goals.generator import MotionGenerator
+from poise.jobs.endless.model import SHIPPED, load_generator
+from poise.jobs.endless.run import RUN_FILE, opened
 from poise.jobs.endless.training import Endless, Motions, codes_of, learner_of, motions_of
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.folder import library_of, split
@@ -182,18 +187,36 @@ def read(folders: list[Path], hold_out: list[str], tracker: Tracker) -> tuple[Mo
     return motions, windows + windows_of(list(parts.test), tracker, True, net.past, net.future)
 
 
+def held_out(run: Path, folder: Path, only: str, tracker: Tracker) -> tuple[Motions, list[Window]]:
+    """The motions of a run, and windows of clips that it has not learned from."""
+    motions, config, _ = opened(run / RUN_FILE)
+    how = LibraryConfig(rates=SIXTY, leave_out=(f"^{folder.resolve().name}-(?!.*({only})$)",))
+    library, _ = library_of(folder, tracker.target, config=how, body=BodyConfig(), tell=print)
+    known = set(motions.clips) & set(library.names)
+    if known:
+        raise SystemExit(f"the run has learned from {', '.join(sorted(known))}")
+    return motions, windows_of(list(library), tracker, True, config.net.past, config.net.future)
+
+
 def main() -> None:
     """Trains and predicts with each method and seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--library", type=Path, nargs="+", required=True)
     parser.add_argument("--hold-out", nargs="+", default=list(HELD_OUT))
     parser.add_argument("-o", type=Path, required=True)
+    parser.add_argument("--run", type=Path)
+    parser.add_argument("--only", default=r"(05|11|14)_\d+")
+    parser.add_argument("--shipped", action="store_true")
+    parser.add_argument("--kinematic", action="store_true", help="leaves the body out")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     a = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
-    motions, windows = read(a.library, a.hold_out, tracker)
+    if a.run is None:
+        motions, windows = read(a.library, a.hold_out, tracker)
+    else:
+        motions, windows = held_out(a.run, a.library[0], a.only, tracker)
     out: dict[str, Any] = json.loads(a.o.read_text()) if a.o.exists() else {"methods": {}}
     out |= {
         "command": "python benchmarks/endless_tables.py", "seconds_of_training": a.seconds,
@@ -208,14 +231,28 @@ def main() -> None:
         print(name, value["all"], flush=True)
 
     keep("zero velocity", errors(windows, lambda p: p[:, -1:].expand(-1, frames, -1)))
+    whole = {"the run's generator": a.run, "the shipped one": SHIPPED if a.shipped else None}
+    for name, file in whole.items():
+        if file is not None and name not in out["methods"]:
+            model = load_generator(file)
+            made = model.generator(tracker.humanoid)
+            about = {"steps": model.about.get("steps")}
+            at = errors(windows, lambda p, m=made: Proposed(m)(p, frames, 0))
+            keep(name, {**about, **at})
+            if not a.kinematic:
+                body = errors(windows, lambda p, m=made: simulated(tracker, m, p, frames, 0))
+                keep(f"{name} with a body", {**about, **body})
     for seed in a.seeds:
         for name in ("ours", *NETS):
-            if f"{name} with a body, seed {seed}" in out["methods"]:
+            last = f"{name}, seed {seed}" if a.kinematic else f"{name} with a body, seed {seed}"
+            if last in out["methods"]:
                 continue
             made, steps = trained(motions, name, seed, a.seconds)
             about = {"steps": steps, "seed": seed}
             kinematic = errors(windows, lambda p, m=made, s=seed: Proposed(m)(p, frames, s))
             keep(f"{name}, seed {seed}", {**about, **kinematic})
+            if a.kinematic:
+                continue
             body = errors(windows, lambda p, m=made, s=seed: simulated(tracker, m, p, frames, s))
             keep(f"{name} with a body, seed {seed}", {**about, **body})
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.env import ImitationEnv
 from poise.env.goals import EndlessGoal
 from poise.env.goals.led import FALLS, RETURNS, TRACKS
+from poise.env.goals.steering import Steering
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
@@ -169,3 +170,41 @@ def test_without_recovery_clips_a_character_stays_where_it_fell(
         assert goal.watch(env.backend.state.qpos, env.pose().pos + 9.0, env.pose().linvel)
     assert int(goal.doing) == FALLS and len(goal.falls) == 1 and not goal.back
     env.close()
+
+
+class Circles(Stands):
+    """Proposes the past's last frame and, of each other future, a walk in another direction."""
+
+    def __init__(self, pose: Tensor):
+        super().__init__(pose)
+        self.asked = 0
+
+    def propose(self, past: Tensor, rng: torch.Generator, count: int) -> Tensor:
+        self.asked += 1
+        out = past[:, None, -1:].repeat(1, count, self.future, 1)
+        angle = torch.linspace(0, 2 * torch.pi, count).double()
+        step = 0.05 * torch.arange(1, self.future + 1).double()
+        way = torch.stack((angle.cos(), angle.sin()), -1)[:, None] * step[:, None]
+        out[..., :2] += way
+        out[:, 0] = past[:, -1:]
+        return out
+
+
+def test_of_several_futures_the_nearest_is_done_and_thought_over_halfway(
+    tracker: Tracker, task: Imitation
+) -> None:
+    assert tracker.recovery_clips is not None
+    ease = tracker.recovery_clips.ease.double()
+    made, still = Circles(ease), torch.zeros(1, len(task.humanoid.bodies), 3)
+    points = ((1.5, 0.0), (1.5, 1.5))
+    goal = EndlessGoal(made, task.humanoid, 30.0, None, lead=1, steering=Steering(points))
+    goal.draw(torch.zeros(1, dtype=torch.long))
+    goal.aim(None, None)
+    assert int(goal.count) == made.past + made.future // 2
+    for _ in range(75):
+        goal.advance(None, None)
+        qpos = goal.start(None)[0]
+        goal.watch(qpos, goal.layout.unpacked(goal.now()).pos, still)
+    # The character is where it is to be: the straight ways take 20 and 30 frames and a bit.
+    assert [world for world, _ in goal.reached] == [0, 0] and goal.reached[-1][1] < 60
+    assert made.asked > 12 and not goal.falls

@@ -62,6 +62,7 @@ def test_a_style_is_motion_of_its_label_alone(tracker: Tracker, tmp_path: Path) 
     for wrong in ("third", "fourth"):
         with pytest.raises(PoiseError, match=f"no style '{wrong}'; it has first, second"):
             again.generator(tracker.humanoid, style=wrong)
-    plain = GeneratorModel(model.net, model.seeds, model.bounds, model.hinges, model.fps, {}, model.codes)
+    parts = model.net, model.seeds, model.bounds, model.hinges, model.fps
+    plain = GeneratorModel(*parts, {}, model.codes)
     with pytest.raises(PoiseError, match="its library has no labels"):
         plain.generator(tracker.humanoid, style="first")

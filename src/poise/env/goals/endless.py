@@ -60,6 +60,9 @@ class EndlessGoal(GeneratorGoal):
             # A copy reads what the world that it is of has known ahead, and makes nothing itself.
             self.lead = 0
         self.steering, self.pasts = steering or Steering(), pasts
+        if self.steering.targets:
+            # The way to a target is thought over after each half of a segment.
+            self.keeps = -(-generator.future // 2)
         self.get_up = None
         if recovery_clips is not None:
             self.get_up = GetUpPlanner(recovery_clips, humanoid.table, rate_hz)

@@ -62,6 +62,8 @@ class GeneratorGoal(BufferedGoal):
         size = generator.past + 2 * generator.future + lead + 2
         super().__init__(humanoid, rate_hz, num_envs, size, torch.device(device), seed)
         self.generator, self.lead = generator, lead
+        # Frames of what it makes that are done before it makes more.
+        self.keeps = generator.future
 
     def begin(self, ids: Tensor) -> Tensor:
         """`(n, past, 7 + n)` frames from which motions of worlds `ids (n,)` begin."""
@@ -110,7 +112,7 @@ class GeneratorGoal(BufferedGoal):
             )
         kept = short[good]
         if len(kept):
-            self.extend(kept, made[good])
+            self.extend(kept, made[good, : self.keeps])
 
     def rows(self) -> dict[str, Tensor]:
         own = {f"generator/{k}": v for k, v in self.generator.rows().items()}
