@@ -11,7 +11,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env.goals.generator import GeneratorGoal, MotionGenerator
 from poise.env.goals.led import FALLS, LOST, REST, RETURNS, TRACKS, WAITS_S
-from poise.env.goals.steering import PROPOSALS, REACHED, Steering, cost_of
+from poise.env.goals.steering import REACHED, Steering, cost_of
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import DOWN, plan_recovery
@@ -116,7 +116,7 @@ class EndlessGoal(GeneratorGoal):
         propose = getattr(self.generator, "propose", None)
         if propose is None or not self.steering.chooses:
             return super().make(past, ids)
-        futures, out = propose(past, self.rng, PROPOSALS), list[Tensor]()
+        futures, out = propose(past, self.rng, self.steering.proposals), list[Tensor]()
         steps = torch.arange(1, self.generator.future + 1, device=self.device)
         for world, made in zip(ids.tolist(), futures, strict=True):
             others = list[Tensor]()

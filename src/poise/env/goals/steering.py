@@ -16,8 +16,8 @@ REACHED = 0.5
 FAR = 10_000.0
 #: Distance (m) that characters are to keep, with what a simulation is off; cost of a metre too near.
 APART, NEAR_COST = 0.7, 100.0
-#: Futures that are proposed where one is chosen.
-PROPOSALS = 240
+#: Futures that are proposed where one is chosen: to get somewhere, and to keep apart alone.
+PROPOSALS, FEW = 240, 24
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class Steering:
     def chooses(self) -> bool:
         """Whether one of several futures is to be chosen at all."""
         return bool(self.targets) or self.apart
+
+    @property
+    def proposals(self) -> int:
+        """How many futures one is chosen from."""
+        return PROPOSALS if self.targets else FEW
 
     def target(self, reached: int) -> Tensor | None:
         """The next one `(2)` m after so many; None after the last."""
