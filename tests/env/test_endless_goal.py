@@ -194,7 +194,8 @@ def test_of_several_futures_the_nearest_is_done_and_thought_over_halfway(
     tracker: Tracker, task: Imitation
 ) -> None:
     assert tracker.recovery_clips is not None
-    ease = tracker.recovery_clips.ease.double()
+    ease = tracker.recovery_clips.ease.double().clone()
+    ease[:2] = 0.0
     made, still = Circles(ease), torch.zeros(1, len(task.humanoid.bodies), 3)
     points = ((1.5, 0.0), (1.5, 1.5))
     goal = EndlessGoal(made, task.humanoid, 30.0, None, lead=1, steering=Steering(points))
@@ -206,5 +207,5 @@ def test_of_several_futures_the_nearest_is_done_and_thought_over_halfway(
         qpos = goal.start(None)[0]
         goal.watch(qpos, goal.layout.unpacked(goal.now()).pos, still)
     # The character is where it is to be: the straight ways take 20 and 30 frames and a bit.
-    assert [world for world, _ in goal.reached] == [0, 0] and goal.reached[-1][1] < 60
+    assert [world for world, _ in goal.reached] == [0, 0] and goal.reached[-1][1] < 70
     assert made.asked > 12 and not goal.falls
