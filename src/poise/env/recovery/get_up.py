@@ -29,8 +29,7 @@ class GetUpPlanner:
     """How the characters of a library get up from anywhere.
 
     Of all clips that get up, the one is taken that has the frame nearest to how the character lies, from
-    there on; after tries in vain the next nearest. A library needs one from the back and one from the
-    belly.
+    there on. A library needs one from the back and one from the belly.
     """
 
     def __init__(self, recovery_clips: RecoveryClips, table: BodyTable, rate_hz: float):
@@ -42,19 +41,15 @@ class GetUpPlanner:
             height = up.pos[:, 0, 2]
             up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
 
-    def up(self, start: Tensor, tries: int = 0) -> Tensor:
-        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up.
-
-        tries: how many were in vain; each takes the next nearest clip, and after the last the nearest.
-        """
+    def up(self, start: Tensor) -> Tensor:
+        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up."""
         lying, clips = Poses(self.table, start[None]), self.ups
         costs = [
             # Of two frames alike the later one is up sooner.
             lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
             for up, clip in zip(self._ups, clips, strict=True)
         ]
-        nearest = sorted(range(len(clips)), key=lambda k: float(costs[k].min()))
-        which = nearest[tries % len(clips)]
+        which = min(range(len(clips)), key=lambda k: float(costs[k].min()))
         entry = int(self._ups[which].rows[int(costs[which].argmin())])
         clip = self._laid(start, clips[which][entry:])
         return torch.cat((self._lifted(self.blend(start, clip[0]))[:-1], clip))
