@@ -228,6 +228,22 @@ def test_a_point_with_fewer_directions_moves_in_those_that_it_has() -> None:
     assert not pseudo_inverse(torch.zeros(1, 3, 4).double(), ones).any()
 
 
+def test_the_short_inverse_is_that_by_eigenvalues() -> None:
+    rng = torch.Generator().manual_seed(0)
+    b = torch.randn(60, 3, 9, generator=rng, dtype=torch.float64)
+    b[:10, 2] *= 0.1
+    b[10:20, 2] *= 1e-4
+    b[20:30, :2] = 0.0
+    b[30:40] = 0.0
+    square = b @ b.transpose(-1, -2)
+    values, axes = torch.linalg.eigh(square)
+    least = RANK * values[:, -1:]
+    inverse = torch.where((values > least) & (values > 0.0), 1.0 / values, 0.0)
+    expected = axes @ torch.diag_embed(inverse) @ axes.transpose(-1, -2)
+    made = pseudo_inverse(b, torch.ones(9, dtype=torch.float64))
+    torch.testing.assert_close(made, b.transpose(-1, -2) @ expected, rtol=1e-9, atol=1e-9)
+
+
 def test_weights_keep_the_law_as_pseudo_inverse_and_not_as_printed() -> None:
     rng = torch.Generator().manual_seed(0)
     jac = torch.randn(6, 3, 5, generator=rng, dtype=torch.float64)

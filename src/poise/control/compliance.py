@@ -204,6 +204,23 @@ def pseudo_inverse(jacobian: Tensor, weights: Tensor, weighting: str = "inverse"
 
 def _inverse3(square: Tensor) -> Tensor:
     """The pseudo-inverse of positive semidefinite `(..., 3, 3)`, see `RANK`."""
+    a, b, c = square.unbind(-1)
+    # The adjugate of a symmetric matrix: cross products of its columns.
+    adjugate = torch.stack([torch.linalg.cross(x, y) for x, y in ((b, c), (c, a), (a, b))], -1)
+    det = (a * adjugate[..., 0]).sum(-1)
+    size = square.diagonal(dim1=-2, dim2=-1).sum(-1)
+    # The least eigenvalue is at least det / size^2 and the largest one at most size.
+    full = det > RANK * size**3
+    out = adjugate / torch.where(full, det, 1.0)[..., None, None]
+    if not bool(full.all()):
+        out = torch.where(full[..., None, None], out, 0.0)
+        rest = ~full & (size > 0.0)
+        if bool(rest.any()):
+            out[rest] = _by_eigenvalues(square[rest])
+    return out
+
+
+def _by_eigenvalues(square: Tensor) -> Tensor:
     values, axes = torch.linalg.eigh(square)
     real = values > RANK * values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny)
     inverse = torch.where(real, 1.0 / values.clamp_min(torch.finfo(values.dtype).tiny), 0.0)
