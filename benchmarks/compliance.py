@@ -202,7 +202,9 @@ def main() -> None:
     else:
         found = cost(tracker)
     told = json.loads(args.json.read_text()) if args.json.exists() else {}
-    args.json.write_text(json.dumps({**told, args.part: {**told.get(args.part, {}), **found}}, indent=1) + "\n")
+    args.json.write_text(
+        json.dumps({**told, args.part: {**told.get(args.part, {}), **found}}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":
