@@ -4,6 +4,8 @@ costs.
 python benchmarks/compliance.py stiffness --json benchmarks/compliance.json --svg docs/stiffness.svg
 python benchmarks/compliance.py throws --json benchmarks/compliance.json
 python benchmarks/compliance.py hands --json benchmarks/compliance.json
+python benchmarks/compliance.py door --json benchmarks/compliance.json
+python benchmarks/compliance.py scenes --json benchmarks/compliance.json
 python benchmarks/compliance.py cost --json benchmarks/compliance.json
 
 All by the policy that comes with Poise, alone and without help; no training. Each part writes its
@@ -29,7 +31,7 @@ from scipy.stats import spearmanr
 import poise
 from poise.control import Compliance, Stiffness
 from poise.env.events import Pushes
-from poise.env.scenes import Hands
+from poise.env.scenes import Balance, Chicken, Doorway, Hands, PlayScene, Trampoline
 from poise.jobs.compliant.play import play
 from poise.jobs.compliant.standing import standing
 from poise.jobs.compliant.stiffness import Measured, measure
@@ -181,12 +183,58 @@ def hands(tracker: Tracker, threads: int) -> dict[str, Any]:
     return out
 
 
+def doors(tracker: Tracker, threads: int) -> dict[str, Any]:
+    """Doors of three widths, by level and by stiffness, beside the twin that does not give way."""
+    ways = {
+        "level 0.16": Compliance(0.16), "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5),
+        "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
+    }  # fmt: skip
+    out: dict[str, Any] = {"episodes": 16}
+    for width in (1.0, 1.35, 1.7):
+        rows: dict[str, Any] = {}
+        for way, given in ways.items():
+            made = play(Doorway(width), tracker, None, given, 16, threads=threads)
+            rows["without"] = dict(made.stiff)
+            rows[way] = dict(made.figures)
+        out[f"{width:g} m"] = rows
+    return out
+
+
+def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str, Any]:
+    """Trampoline, ball and chicken fight, each beside its twin that does not give way."""
+    cases: dict[str, tuple[PlayScene, dict[str, Compliance | Stiffness | None]]] = {
+        "trampoline": (
+            Trampoline(), {"level 0.16": Compliance(0.16), "level 0.04": Compliance(0.04)}
+        ),
+        "ball": (Balance(), {"linear law": None}),
+        "ball, pushed with 50 N": (Balance(pushes=50.0), {"linear law": None}),
+        "chicken, heavy and light": (
+            Chicken(against="rival"),
+            {"level 0.16": Compliance(0.16), "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5)},
+        ),
+        "chicken, heavy against a bag of 36 kg": (Chicken(85.0, 36.0), {"level 0.16": Compliance(0.16)}),
+        "chicken, light against a bag of 85 kg": (Chicken(36.0, 85.0), {"level 0.16": Compliance(0.16)}),
+    }  # fmt: skip
+    out: dict[str, Any] = {"episodes": 8}
+    for name, (scene, ways) in cases.items():
+        if only not in (None, name.split(",")[0]):
+            continue
+        rows: dict[str, Any] = {}
+        for way, given in ways.items():
+            made = play(scene, tracker, None, given, 8, 8.0, threads)
+            rows["without"] = dict(made.stiff)
+            rows[way] = dict(made.figures)
+        out[name] = rows
+    return out
+
+
 def main() -> None:
     """One part of it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("stiffness", "throws", "hands", "cost"))
+    parser.add_argument("part", choices=("stiffness", "throws", "hands", "door", "scenes", "cost"))
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--svg", type=Path)
+    parser.add_argument("--only", choices=("trampoline", "ball", "chicken"), help="of the scenes")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--throws", type=int, default=200, help="at 60 Hz; 0 leaves what is there")
     parser.add_argument("--fine", type=int, default=200, help="throws at 600 Hz; 0 leaves what is there")
@@ -199,12 +247,15 @@ def main() -> None:
         found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads)
     elif args.part == "hands":
         found = hands(tracker, args.threads)
+    elif args.part == "door":
+        found = doors(tracker, args.threads)
+    elif args.part == "scenes":
+        found = scenes(tracker, args.threads, args.only)
     else:
         found = cost(tracker)
     told = json.loads(args.json.read_text()) if args.json.exists() else {}
-    args.json.write_text(
-        json.dumps({**told, args.part: {**told.get(args.part, {}), **found}}, indent=1) + "\n"
-    )
+    told[args.part] = {**told.get(args.part, {}), **found}
+    args.json.write_text(json.dumps(told, indent=1) + "\n")
 
 
 if __name__ == "__main__":
