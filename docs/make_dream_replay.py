@@ -1,9 +1,9 @@
-"""Draws docs/dream-replay.svg: half a minute of a character that goes about, as a picture that moves.
+"""Draws docs/dream-replay.svg: a character that goes about, as a picture that moves.
 
     poise dream --seconds 30 --seed 3 -o dreamt
     python docs/make_dream_replay.py dreamt/simulated.bvh docs/dream-replay.svg
 
-The camera goes along with the character and looks in one direction; crosses on the floor stand still,
+The camera goes along with the character and looks in one direction; dashes on the floor stand still,
 one each metre, so that a foot that slides is seen against them. Ten pictures a second, between which
 browsers go in straight lines.
 """
@@ -53,7 +53,7 @@ def main(motion: Path, out: Path) -> None:
         here = np.round(camera[f, :2])
         grid = [(here[0] + i, here[1] + j, 0.0) for i in range(-NEAR, NEAR + 1)
                 for j in range(-NEAR, NEAR + 1)]  # fmt: skip
-        # A cross that comes into sight takes the place of one that left, so paths keep their form.
+        # A dash that comes into sight takes the place of one that left, so paths keep their form.
         grid.sort(key=lambda p: (p[0] % (2 * NEAR + 1), p[1] % (2 * NEAR + 1)))
         drawn["floor"].append("".join(f"M{x - 3:.0f} {y:.0f}h6" for x, y in flat(np.array(grid))))
         at = flat(pos[f])
