@@ -136,7 +136,7 @@ def _calmings(calmed: dict[Gap, Calmed]) -> tuple[str, ...]:
 
     less = [f"{a} to {b} ({100 * c.share:.0f} %)" for (a, b), c in calmed.items() if c.share < 1.0]
     free = [f"{a} to {b}" for (a, b), c in calmed.items() if c.feet == "free"]
-    fast = [f"{a} to {b} ({c.over:.1f} x)" for (a, b), c in calmed.items() if c.over > 1.02]
+    fast = [f"{a} to {b} ({c.over:.1f} x)" for (a, b), c in calmed.items() if c.over > 1.0]
     out: list[str] = []
     if less:
         out.append(
