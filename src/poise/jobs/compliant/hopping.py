@@ -41,7 +41,8 @@ def hopping(tracker: Tracker, seconds: float = 8.0, yaw: float = 0.0, ways: Ways
     # Once above the ankle with the pelvis, then with the centre of mass.
     off = np.zeros(3)
     for _ in range(2):
-        clip = _hopping(tracker, ease, seconds, yaw, off, ways)
+        # The clip itself may end before the foot is lifted.
+        clip = _hopping(tracker, ease, LIFTS_S[1] + 0.5, yaw, off, ways)
         frame = round(LIFTS_S[1] * clip.fps)
         qpos = clip_to_qpos(clip.replaced(
             root_pos=clip.root_pos[frame : frame + 3], rot=clip.rot[frame : frame + 3]
