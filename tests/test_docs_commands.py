@@ -69,6 +69,8 @@ def _shortened(line: str) -> list[str]:
             at = argv.index("--seconds")
             del argv[at : at + 2]
         argv += ["--seconds", "3", "--port", "0"]
+    if argv[:2] == ["train", "compliant"]:
+        argv += ["--iterations", "1", "--envs", "8", "--ppo.horizon", "4", "--threads", "1"]
     if argv[:2] == ["train", "endless"]:
         argv += ["--iterations", "2", "--threads", "1", "--config", "endless.toml"]
     if argv[0] == "dream":
