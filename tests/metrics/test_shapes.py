@@ -151,3 +151,22 @@ def test_heights_agree_with_mujoco():
     low = geom_heights(torch.tensor(data.xpos), torch.tensor(data.xquat), shapes)
     want = [mujoco.mj_geomDistance(model, data, 0, g, 10.0, None) for g in (1, 2, 3)]
     assert low.tolist() == pytest.approx(want, abs=1e-4)
+
+
+def test_long_motions_are_placed_in_pieces(monkeypatch):
+    """What an hour needs on the way stays small, and the figures are the same to the last bit."""
+    generator = torch.Generator().manual_seed(3)
+    pos = torch.randn(2, 25, 2, 3, generator=generator, dtype=torch.float64)
+    quat = normalize(torch.randn(2, 25, 2, 4, generator=generator, dtype=torch.float64))
+    unit = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4)
+    body = Shapes(
+        torch.tensor([6, 3]), torch.full((2, 3), 0.1), torch.zeros(2, 3), unit, torch.tensor([0, 1])
+    )
+    figures = [
+        lambda p, q: geom_heights(p, q, body),
+        lambda p, q: foot_points(p, q, body, [1]),
+        lambda p, q: centre_of_mass(p, q, body),
+    ]
+    whole = [figure(pos, quat) for figure in figures]
+    monkeypatch.setattr("poise.metrics.shapes.PIECE", 7)
+    assert all(torch.equal(figure(pos, quat), want) for figure, want in zip(figures, whole, strict=True))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from itertools import product
-from typing import NamedTuple
+from typing import Concatenate, NamedTuple, ParamSpec
 
 import torch
 from torch import Tensor
@@ -14,6 +15,8 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.spatial import normalize, quat_mul, quat_rotate
 
+PIECE = 4096
+"""Frames whose geoms are placed at once."""
 SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 2, 3, 4, 5, 6
 """Geom kinds by MuJoCo's `mjtGeom` numbers."""
 KINDS = {"sphere": SPHERE, "capsule": CAPSULE, "ellipsoid": ELLIPSOID, "cylinder": CYLINDER, "box": BOX}
@@ -103,6 +106,28 @@ def _placed(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> _Placed:
     return _Placed(p + quat_rotate(q, pos.expand_as(p)), q, quat, size)
 
 
+P = ParamSpec("P")
+
+
+def _in_pieces(
+    of_poses: Callable[Concatenate[Tensor, Tensor, P], Tensor],
+) -> Callable[Concatenate[Tensor, Tensor, P], Tensor]:
+    """`of_poses(body_pos, body_quat, ...)`, `PIECE` frames at a time: what is made on the way would need
+    some 30 kB a frame, gigabytes for an hour."""
+
+    @wraps(of_poses)
+    def pieces(body_pos: Tensor, body_quat: Tensor, *rest: P.args, **more: P.kwargs) -> Tensor:
+        lead = body_pos.shape[:-2]
+        if math.prod(lead) <= PIECE or body_quat.shape[:-2] != lead:
+            return of_poses(body_pos, body_quat, *rest, **more)
+        flat = (x.reshape(-1, *x.shape[-2:]).split(PIECE) for x in (body_pos, body_quat))
+        out = torch.cat([of_poses(p, q, *rest, **more) for p, q in zip(*flat, strict=True)])
+        return out.reshape(*lead, *out.shape[1:])
+
+    return pieces
+
+
+@_in_pieces
 def geom_heights(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
     """Lowest world z of every geom, m, exact; `(..., B, 3)` and `(..., B, 4)` give `(..., G)`.
 
@@ -166,6 +191,7 @@ def _surface(kind: int, size: Tensor) -> Tensor:
     return (ends[:, None] + ball * r).reshape(-1, 3)
 
 
+@_in_pieces
 def foot_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes, feet: Sequence[int]) -> Tensor:
     """World positions `(..., F, 3)` m of material points on the geoms of the foot bodies `feet`.
 
@@ -184,6 +210,7 @@ def foot_points(body_pos: Tensor, body_quat: Tensor, shapes: Shapes, feet: Seque
     return torch.cat(points, -2)
 
 
+@_in_pieces
 def centre_of_mass(body_pos: Tensor, body_quat: Tensor, shapes: Shapes) -> Tensor:
     """Centre of mass `(..., 3)` m from the geoms' masses, or from their volumes (one density)."""
     centre, _, _, size = _placed(body_pos, body_quat, shapes)
