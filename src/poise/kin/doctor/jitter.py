@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import torch
-from scipy.ndimage import median_filter
 from torch import Tensor
 
 from poise.kin.doctor.faults import Fault, spell_faults
@@ -38,6 +37,9 @@ def trembling(path: Tensor, fps: float, limit: float) -> tuple[np.ndarray, np.nd
     half = max(WINDOW_FRAMES, round(WINDOW_S * fps))
     if frames < 2 * half + 1:
         return np.zeros(frames), np.zeros(frames, dtype=bool)
+    # Takes 0.2 s to load, which `poise info` need not wait for.
+    from scipy.ndimage import median_filter
+
     # A fourth difference is centred on its third frame, a second difference on its second.
     high, low = (
         median_filter(

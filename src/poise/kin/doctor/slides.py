@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter1d
 from torch import Tensor
 
 from poise.kin.doctor.faults import Fault
@@ -42,6 +41,9 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
         near[max(fault.start - 1, 0) : fault.stop + 1] = 1.0
     # The correction fades out over the averaging time beside the spells that slide.
     reach = max(1, round(COMMON_S * clip.fps))
+    # Takes 0.2 s to load, which `poise info` need not wait for.
+    from scipy.ndimage import maximum_filter1d
+
     hull = maximum_filter1d(near, 2 * reach + 1, mode="constant")
     window = gaussian(0.3 * COMMON_S * clip.fps)
     hull = np.convolve(np.pad(hull, len(window) // 2, mode="edge"), window, "valid")
