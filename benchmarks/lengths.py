@@ -28,7 +28,6 @@ from speed import machine
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip, read_clip, resample, write_clip
 from poise.spatial import quat_mul, slerp
-from poise.spatial.directions import heading_angle
 from poise.view.svg import line_plot
 
 RATE = 30.0
@@ -64,13 +63,12 @@ def joined(clips: list[Clip], minutes: float, seed: int) -> Clip:
 
 
 def _next(clip: Clip, root: np.ndarray, rot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The clip from that frame of its first half which is most like the last one, put there and turned."""
+    """The clip from that frame of its first half which is most like the last one, moved and turned."""
     half = max(1, clip.frames // 2)
     alike = np.abs((clip.rot[:half, 1:] * rot[-1, 1:]).sum(-1)).sum(-1)
     start = int(alike.argmax())
     pos, turn = clip.root_pos[start:], clip.rot[start:]
-    now, was = heading_angle(torch.tensor(turn[0, 0])), heading_angle(torch.tensor(rot[-1, 0]))
-    home = np.arctan2(-root[-1, 1], -root[-1, 0])
+    now, was, home = _way(pos[: SEAM + 1]), _way(root[-SEAM - 1 :]), _way([root[-1], np.zeros(3)])
     wish = (home - was + np.pi) % (2 * np.pi) - np.pi
     angle = was - now + np.clip(wish, -MOST_TURN, MOST_TURN)
     about = torch.tensor([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
@@ -80,6 +78,12 @@ def _next(clip: Clip, root: np.ndarray, rot: np.ndarray) -> tuple[np.ndarray, np
     moved = (pos - pos[0]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     step = (SEAM + 1) * (root[-1] - root[-2])
     return moved + np.array([*(root[-1] + step)[:2], pos[0, 2]]), turn
+
+
+def _way(path: Any) -> float:
+    """The direction about Z from the first to the last of some places, rad."""
+    x, y, _ = path[-1] - path[0]
+    return float(np.arctan2(y, x))
 
 
 def run(argv: list[str]) -> tuple[dict[str, Any], list[tuple[float, float]], str]:

@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.spatial import normalize, quat_mul, quat_rotate
 
 PIECE = 4096
-"""Frames whose geoms are placed at once."""
+"""Frames in which geoms are placed at once."""
 SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 2, 3, 4, 5, 6
 """Geom kinds by MuJoCo's `mjtGeom` numbers."""
 KINDS = {"sphere": SPHERE, "capsule": CAPSULE, "ellipsoid": ELLIPSOID, "cylinder": CYLINDER, "box": BOX}

@@ -18,6 +18,7 @@ from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
 from poise.kin.series import find_runs, gaussian
 from poise.kin.solids import centre_of_mass, poses_of
+from poise.metrics.shapes import PIECE
 from poise.motion import Clip
 from poise.spatial import GRAVITY
 
@@ -176,8 +177,13 @@ def hull_distance(points: np.ndarray, mask: np.ndarray, at: np.ndarray) -> np.nd
     """
     angle = 2 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS
     ways = np.stack((np.cos(angle), np.sin(angle)))
-    reach = np.where(mask[..., None], points @ ways, -np.inf).max(1)
-    return (at @ ways - reach).max(-1)
+    out = np.empty(len(at))
+    # All frames of an hour at once would take gigabytes.
+    for k in range(0, len(at), PIECE):
+        part = slice(k, k + PIECE)
+        reach = np.where(mask[part, :, None], points[part] @ ways, -np.inf).max(1)
+        out[part] = (at[part] @ ways - reach).max(-1)
+    return out
 
 
 def _beyond(points: np.ndarray, com: np.ndarray, fps: float, near: float) -> np.ndarray:
