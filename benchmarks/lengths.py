@@ -3,8 +3,8 @@
     python benchmarks/lengths.py --clips FOLDER --json benchmarks/lengths.json --svg docs/lengths.svg
 
 FOLDER holds walks and runs of one person. They are joined, one after another in an order drawn by the
-seed, each from its frame that is most like the end of the one before and turned by up to a quarter
-turn towards the origin, until the motion is long enough. Each command runs in a process of its own;
+seed, each from its frame that is most like the end of the one before and turned by up to 30
+degrees towards the origin, until the motion is long enough. Each command runs in a process of its own;
 `track` is the policy alone with recovery, and the plot is of its memory.
 """
 
@@ -32,7 +32,7 @@ from poise.view.svg import line_plot
 
 RATE = 30.0
 #: Frames from one clip to the next, and how far the next may be turned by, rad.
-SEAM, MOST_TURN = 12, np.pi / 2
+SEAM, MOST_TURN = 12, np.pi / 6
 #: s between two looks at the memory of a process.
 LOOK_S = 1.0
 PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 2**20

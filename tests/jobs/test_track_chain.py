@@ -222,3 +222,23 @@ def test_what_is_refused(tracker: Tracker, tmp_path: Path) -> None:
     able = replace(tracker, value=None)
     tracked = track([trim(clips[0], 0, 6), trim(clips[0], 5, 12)], able)
     assert tracked.controller == "policy" and any("without its critic" in n for n in tracked.notes)
+
+
+@pytest.mark.parametrize(("apart", "ends"), [(2, True), (12, False)])
+def test_a_motion_is_given_up_where_it_is_lost_again_and_again(apart: int, ends: bool) -> None:
+    """Nine losses within ten seconds of a motion end it; nine in a long one do not."""
+    goal = SimpleNamespace(rate_hz=1.0, chained=False, lost=[], doing=torch.tensor([TRACKS]))
+    goal.reference = SimpleNamespace(length=torch.tensor([1000]))
+    goal.clips, goal.frame = SimpleNamespace(clip=torch.tensor([0])), torch.tensor([0])
+    goal.aimed = lambda: torch.zeros(1, 7)
+    led = recovering._Led(cast("LedGoal", goal), torch.zeros(1, 7))
+    env, step = cast("ImitationEnv", SimpleNamespace(given=torch.zeros(1, 1))), 0
+    over = led.see(env, step)
+    for k in range(30):
+        for doing in (RETURNS, TRACKS):
+            if doing == RETURNS:
+                goal.lost.append((0, apart * k // 3))
+            goal.doing, step = torch.tensor([doing]), step + 1
+            over = over or led.see(env, step)
+        goal.frame = torch.tensor([apart * (k + 1) // 3])
+    assert over == ends

@@ -25,9 +25,9 @@ from poise.plan import Lookahead, SamplingConfig, SamplingControl, SamplingResul
 from poise.recipes.imitation import Imitation
 from poise.spatial import slerp
 
-#: A clip that is lost more often is given up, and so is one that the character has left for so many s;
-#: so many of them one after another that it does not even come to end the motion.
-LOSSES, AWAY_S, VAIN = 8, 30.0, 3
+#: A clip that is lost more often within so many s of it is given up, and so is one that the character
+#: has left for so many s; so many of them in a row that it does not even come to end the motion.
+LOSSES, WITHIN_S, AWAY_S, VAIN = 8, 10.0, 30.0, 3
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,8 @@ def led_along(
         how = tracker.recovery_clips, len(placed) > 1, returns
         goal = LedGoal(env.goal.clips, *how)
         led = _Led(goal, env.reference.coordinates(zero, zero)[0], show)
-        most = led.total + int((LOSSES + 1) * len(placed) * AWAY_S * led.rate)
+        losses = (LOSSES + 1) * (len(placed) + led.total / (WITHIN_S * led.rate))
+        most = led.total + int(losses * AWAY_S * led.rate)
         obs = env.set_goal(goal)
         if ahead is not None:
             ahead.copies.set_goal(LedGoal(ahead.copies.goal.clips, *how, plans=False))
@@ -152,9 +153,10 @@ class _Led:
         self.lost, self.back, self.given_up = list[float](), list[float](), list[float]()
         self.spans: list[tuple[int | None, int | None]] = [(None, None)] * len(self.last)
         # Whether it is on a motion, on which, and at which frame of it, before the next step; the s at
-        # which it left the last one, how often it lost this one, and how many it did not come to since.
+        # which it left the last one, how often it lost this one since a frame of it, and how many it did
+        # not come to since.
         self._here, self._clip, self._frame, self._left, self._losses = True, 0, 0, 0.0, 0
-        self._vain = 0
+        self._since, self._vain = 0, 0
 
     def see(self, env: ImitationEnv, step: int) -> bool:
         """Keeps what the step aimed at; True: the motions are over, or the last one is given up."""
@@ -172,7 +174,8 @@ class _Led:
             self.show(sum(self.last[:clip]) + self._frame, self.total)
         was, self._here = self._here, int(self.goal.doing) == TRACKS
         self._clip, self._frame = int(self.goal.clips.clip), int(self.goal.frame)
-        self._losses = self._losses if self._clip == clip else 0
+        if self._clip != clip or self._frame > self._since + WITHIN_S * self.rate:
+            self._losses, self._since = 0, self._frame
         self._left = now if was and not self._here else self._left
         if self._here:
             self._vain = 0
