@@ -26,7 +26,8 @@ from poise.recipes.imitation import Imitation
 from poise.spatial import slerp
 
 #: A clip that is lost more often within so many s of it is given up, and so is one that the character
-#: has left for so many s; so many of them in a row that it does not even come to end the motion.
+#: has left for so many s; so many of them in a row that it does not even come to end the motion, as
+#: does so many times that time away from a single clip.
 LOSSES, WITHIN_S, AWAY_S, VAIN = 8, 10.0, 30.0, 3
 
 
@@ -110,7 +111,7 @@ def led_along(
         goal = LedGoal(env.goal.clips, *how)
         led = _Led(goal, env.reference.coordinates(zero, zero)[0], show)
         losses = (LOSSES + 1) * (len(placed) + led.total / (WITHIN_S * led.rate))
-        most = led.total + int(losses * AWAY_S * led.rate)
+        most = led.total + int(losses * VAIN * AWAY_S * led.rate)
         obs = env.set_goal(goal)
         if ahead is not None:
             ahead.copies.set_goal(LedGoal(ahead.copies.goal.clips, *how, plans=False))
@@ -186,7 +187,8 @@ class _Led:
             self._losses += 1
         if self._here and len(self.back) < len(self.lost):
             self.back.append(now)
-        if self._losses <= LOSSES and (self._here or now <= self._left + AWAY_S):
+        patience = AWAY_S if self.goal.chained else VAIN * AWAY_S
+        if self._losses <= LOSSES and (self._here or now <= self._left + patience):
             return False
         # A clip that begins in full flight is hard to come to; what has fallen for good comes to none.
         self._vain += not self._losses
