@@ -210,7 +210,7 @@ def train(
     tensorboard: bool = True,
     device: str = "cpu",
     beginning: TrainingCallbacks | None = None,
-    save_s: float = 30.0,
+    save_s: float | None = None,
     trained: PolicyBundle | WarmStart | None = None,
 ) -> PerpetualResult:
     """Trains all stages, or goes on with them, until nothing fails or a limit is reached.
@@ -219,7 +219,7 @@ def train(
         until: limits of all stages together, over all resumed runs.
         on_iteration: called after each; returning False ends the call as Ctrl-C does.
         device: "cpu" or "cuda"; no part of the run.
-        save_s: seconds between checkpoints, beside those at evaluations.
+        save_s: seconds between checkpoints, beside those at evaluations; see `StageTrainer`.
         trained: a policy that a new run goes on from, with its critic if one is given, see
             `warm_start.widened`; a run in progress has its own.
 

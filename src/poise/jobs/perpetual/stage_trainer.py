@@ -61,6 +61,8 @@ from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.task import Perpetual
 from poise.sim import UnstableError
 
+#: Times that writing a checkpoint takes, after which the next may be written.
+SAVES = 50.0
 #: What is left of the policy's step size at the end of a stage that cools.
 COLD = 0.1
 #: Simulations that may go bad between two evaluations.
@@ -71,7 +73,9 @@ class StageTrainer:
     """A library's training in a run folder; begins it, or goes on from its checkpoint.
 
     until: limits of the whole training, of which every stage has its part. save_s: seconds between two
-    checkpoints, beside those after evaluations; 0 saves after every iteration. trained: a policy that a
+    checkpoints, beside those after evaluations; 0 saves after every iteration, and None as often as
+    that takes a fiftieth of the time at most (`SAVES`), which is after every iteration but for short
+    ones. trained: a policy that a
     new run goes on from.
     """
 
@@ -84,7 +88,7 @@ class StageTrainer:
         device: str = "cpu",
         tensorboard: bool = True,
         tell: TrainingCallbacks | None = None,
-        save_s: float = 30.0,
+        save_s: float | None = None,
         trained: PolicyBundle | WarmStart | None = None,
     ):
         self.imitation, self.folder, self.until = imitation, folder, until
@@ -111,7 +115,7 @@ class StageTrainer:
         self.history = History(folder, imitation.library.names, self.iteration)
         self.judge = Judge(imitation, self.stage_record, self.history, threads, device)
         self.log = Log(folder, self.iteration, tensorboard)
-        self._saved_at = time.monotonic()
+        self._saved_at, self._save_took = time.monotonic(), 0.0
         if not (folder / LATEST).exists():
             if trained is not None and first_recovers(self.config):
                 # It is the first primitive as it is: what it fails is for the next one.
@@ -194,7 +198,8 @@ class StageTrainer:
             if is_over(self.config, stage, judged.decision, share):
                 follows = self._advance(judged)
         self.log.write(row)
-        if judged is not None or time.monotonic() - self._saved_at >= self.save_s:
+        due = SAVES * self._save_took if self.save_s is None else self.save_s
+        if judged is not None or time.monotonic() - self._saved_at >= due:
             self.save()
         results, card = (judged.clips, judged.recovery) if judged is not None else (None, None)
         shown = (help_n, results, card, follows, trouble)
@@ -302,6 +307,7 @@ class StageTrainer:
 
     def save(self) -> None:
         """Writes the checkpoint: the trainer and everything that decides what comes next."""
+        began = time.monotonic()
         self.log.flush()
         self.trainer.metadata["course"] = {
             "stage": asdict(self.stage), "warm": self.warm, "before": self.before,
@@ -310,6 +316,7 @@ class StageTrainer:
         }  # fmt: skip
         self.trainer.save(self.folder / LATEST, prefixed("ledger", self.stage_record.state()))
         self._saved_at = time.monotonic()
+        self._save_took = self._saved_at - began
 
     def _load(self) -> None:
         path = self.folder / LATEST
