@@ -15,7 +15,7 @@ from poise.env import Acts, ImitationEnv
 from poise.eval.episodes import run_episodes
 from poise.eval.rolloutset import RolloutSet
 from poise.jobs.perpetual.evaluation import evaluate_clips
-from poise.jobs.track.recovering import look_for, replay
+from poise.jobs.track.searching import look_for, replay
 from poise.plan import SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.env import ImitationEnv, Reference
 from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
 from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.entry import entry
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
 from toy_library import PLAIN, lively, tiny
@@ -89,7 +90,7 @@ def test_a_motion_is_entered_where_the_way_is_short(made: Imitation) -> None:
     for there in (start[:2] - 5 * way, end[:2] + 5 * way):
         qpos = start.clone().double()
         qpos[:2] = there
-        entered.append(goal._entry(clip, 1, qpos))
+        entered.append(entry(goal.get_up, own, clip, 1, qpos))
     assert entered[0] < entered[1]
     env.close()
 

@@ -18,9 +18,9 @@ from poise.env.goals.clip import ClipGoal
 from poise.env.goals.goal import Goal
 from poise.env.plugins import Start
 from poise.env.recovery.clips import RecoveryClips
-from poise.env.recovery.get_up import GetUpPlanner, Poses
-from poise.env.recovery.planner import DOWN, STAY_S, plan_recovery, walk_of
-from poise.env.recovery.run_up import run_up
+from poise.env.recovery.entry import entry, way_into
+from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.recovery.planner import DOWN
 from poise.env.reference import Reference
 
 #: m between bodies and their reference, on average, beyond which it is lost; the field's failure.
@@ -29,13 +29,6 @@ LOST = 0.5
 REST, WAITS_S = 0.5, 1.5
 #: m between bodies and the first frame of the next clip, on average, with which that goes on at once.
 AT_HAND = 0.15
-#: s that is stood at ease before a motion is entered.
-CALM_S = 0.3
-#: Where a motion is entered again: m for each m/s of its bodies, and for each s of it that is left out
-#: or that is walked to it.
-MOVES, SKIPS = 0.3, 0.05
-#: s of it among which is chosen; more cost more than any pose can gain.
-FIRST_S = 30.0
 #: What a world does.
 TRACKS, FALLS, RETURNS = 0, 1, 2
 
@@ -76,7 +69,6 @@ class LedGoal(Goal):
         self.layout, self.num_envs, self.device = goal.layout, goal.num_envs, goal.device
         self.rng, self.notes, self.begins = goal.rng, goal.notes, goal.begins
         self.get_up = GetUpPlanner(recovery_clips, self.humanoid.table, self.rate_hz)
-        self._ease = Poses(self.humanoid.table, recovery_clips.ease[None])
         self.frame, self.lost = goal.frame.clone(), list[tuple[int, int]]()
         self.doing, self._since = torch.zeros_like(goal.clip), torch.zeros_like(goal.clip)
         # What each world follows: its recovery motion, if it is on one, and the frame of that or of its
@@ -230,31 +222,13 @@ class LedGoal(Goal):
 
     def _motion(self, world: int, qpos: Tensor, moves: Tensor | None) -> Reference:
         """From `qpos (7 + n)` that moves with `moves (2)` m/s to where the world's clip is entered."""
-        own, one = self.reference, slice(world, world + 1)
-        self.frame[world] = self._entry(int(self.goal.clip[world]), int(self.frame[world]), qpos)
+        own, one, clip = self.reference, slice(world, world + 1), int(self.goal.clip[world])
+        if self.frame[world] or not self.chained:
+            self.frame[world] = entry(self.get_up, own, clip, int(self.frame[world]), qpos)
         place, velocity = own.coordinates(self.goal.clip[one], self.frame[one])
-        into = run_up(self.get_up, place[0].cpu(), velocity[0].cpu())
-        way = plan_recovery(self.get_up, qpos, into[0], moves=moves)
-        way = way[: len(way) - round((STAY_S - CALM_S) * self.rate_hz)]
-        way = torch.cat((way[:-1], self.get_up.blend(way[-1], into[0]), into[1:]))
+        way = way_into(self.get_up, qpos, place[0].cpu(), velocity[0].cpu(), moves)
         found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"recovery {world}"])
         return found.to(self.device)
-
-    def _entry(self, clip: int, frame: int, qpos: Tensor) -> int:
-        """A frame of a clip, `frame` or a later one, that is easily come to from `qpos (7 + n)` and gone
-        on from."""
-        own = self.reference
-        if self.chained and not frame:
-            return 0
-        first, end = int(own.start[clip]) + frame, int(own.start[clip] + own.length[clip])
-        rows = slice(first, min(end, first + round(FIRST_S * own.rate_hz)))
-        if rows.stop - rows.start < 2:
-            return frame
-        apart = self._ease.apart(Poses(own.humanoid.table, own.qpos[rows].cpu()))[0]
-        speed = own.pose.linvel[rows].norm(dim=-1).mean(-1).cpu()
-        later = torch.arange(len(apart)) / own.rate_hz
-        walked = (own.qpos[rows, :2].cpu() - qpos[:2]).norm(dim=-1) / walk_of(self.get_up, 0)[1]
-        return frame + int((apart + MOVES * speed + SKIPS * (later + walked)).argmin())
 
     def where(self, env: int) -> str:
         kind = {TRACKS: "", FALLS: ", lost", RETURNS: ", on its recovery motion"}[int(self.doing[env])]

@@ -19,7 +19,8 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import Placed
 from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
-from poise.jobs.track.recovering import Led, Replay, led_along, look_for, replay, sentence
+from poise.jobs.track.recovering import Led, led_along
+from poise.jobs.track.searching import Replay, look_for, replay, sentence
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.tracker import Tracker
 from poise.metrics import mpjpe_global, success_rule

@@ -1,5 +1,4 @@
-"""What is done about a motion that is lost: it is looked for by many characters at once
-(`plan.sampling`), or the character gets up, comes back and goes on."""
+"""What is done about a motion that is lost: the character gets up, comes back and goes on."""
 
 from __future__ import annotations
 
@@ -12,16 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env import Acts, ImitationEnv, Reference
+from poise.env import ImitationEnv, Reference
 from poise.env.goals.led import TRACKS, LedGoal
 from poise.errors import PoiseError
 from poise.eval import simulate
 from poise.jobs.track.placement import Placed
+from poise.jobs.track.searching import Replay
 from poise.jobs.tracker import Tracker
 from poise.kin import FitReport, qpos_to_clip
 from poise.kin.feet.level import Levelled
 from poise.motion import Clip, ClipLibrary, resample
-from poise.plan import Lookahead, SamplingConfig, SamplingControl, SamplingResult
+from poise.plan import Lookahead
 from poise.recipes.imitation import Imitation
 from poise.spatial import slerp
 
@@ -237,57 +237,3 @@ def _held(clips: Sequence[Clip], rate: float, of: Sequence[tuple[int, int]]) -> 
     root, rot = ([getattr(c, name)[t] for c, t in rows] for name in ("root_pos", "rot"))
     name = ", ".join(c.name for c in clips)
     return timed[0].replaced(root_pos=np.stack(root), rot=np.stack(rot), name=name)
-
-
-def look_for(
-    tracker: Tracker,
-    imitation: Imitation,
-    config: SamplingConfig,
-    clip: int = 0,
-    threads: int = 0,
-    show: Callable[[int, int], None] | None = None,
-) -> SamplingResult:
-    """Looks for one of a task's motions with the tracker's policy, without help.
-
-    threads: of the physics; 0 is all cores. show: is told of the control steps done and of all of them.
-    """
-    # Worlds that lose the motion may go bad; they are left behind.
-    env = imitation.bare(rewards=True).env(
-        config.characters, auto_reset=False, threads=threads, help_scale=0.0, guard=False
-    )
-    try:
-        return SamplingControl(env, tracker.policy, config, tracker.value, clip).run(show)
-    finally:
-        env.close()
-
-
-def sentence(found: SamplingResult, config: SamplingConfig, rate_hz: float) -> str:
-    """What the search came to."""
-    much = f"{config.characters} characters looked for it, {found.tries:,} control steps, without help"
-    if found.whole:
-        return f"The motion was lost; {much}, and found it to its end."
-    at = found.reached / rate_hz
-    return f"The motion was lost; {much}, and came as far as {at:.1f} s."
-
-
-def replay(found: SamplingResult, policy: Acts) -> Replay:
-    """Does what was found, and from where it was lost what the policy does."""
-    return Replay(found.actions[: found.reached].clone(), policy)
-
-
-@dataclass(eq=False)
-class Replay:
-    """Actions `(T, A)` one after another, for the one character that they were made for; after them
-    acts the policy, if there is one. by: the controller that made them."""
-
-    actions: Tensor
-    policy: Acts | None = None
-    step: int = 0
-    by: str = "policy"
-
-    def act(self, obs: Tensor) -> Tensor:
-        """The next one, `(1, A)`; `obs` is looked at by the policy alone."""
-        at, self.step = self.step, self.step + 1
-        if at >= len(self.actions) and self.policy is not None:
-            return self.policy.act(obs)
-        return self.actions[at : at + 1]

@@ -1,0 +1,53 @@
+"""Where a motion that was lost is entered again, and the way into it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from poise.env.recovery.get_up import GetUpPlanner, Poses
+from poise.env.recovery.planner import STAY_S, plan_recovery, walk_of
+from poise.env.recovery.run_up import run_up
+from poise.env.reference import Reference
+
+#: s that is stood at ease before a motion is entered.
+CALM_S = 0.3
+#: Where a motion is entered: m for each m/s of its bodies, and for each s of it that is left out or that
+#: is walked to it.
+MOVES, SKIPS = 0.3, 0.05
+#: s of it among which is chosen; later frames cost more than any pose can gain.
+FIRST_S = 30.0
+
+
+def entry(get_up: GetUpPlanner, motions: Reference, clip: int, frame: int, qpos: Tensor) -> int:
+    """The frame of a clip, `frame` or a later one, that is most easily come to and gone on from: it
+    nearly stands at ease, hardly moves, and is near in time and on foot.
+
+    Args:
+        motions: the clips.
+        qpos: `(7 + n)`, where the character is.
+    """
+    first, end = int(motions.start[clip]) + frame, int(motions.start[clip] + motions.length[clip])
+    rows = slice(first, min(end, first + round(FIRST_S * motions.rate_hz)))
+    if rows.stop - rows.start < 2:
+        return frame
+    table, poses = motions.humanoid.table, motions.qpos[rows].cpu()
+    apart = Poses(table, get_up.recovery_clips.ease[None]).apart(Poses(table, poses))[0]
+    speed = motions.pose.linvel[rows].norm(dim=-1).mean(-1).cpu()
+    later = torch.arange(len(apart)) / motions.rate_hz
+    walked = (poses[:, :2] - qpos[:2]).norm(dim=-1) / walk_of(get_up, 0)[1]
+    return frame + int((apart + MOVES * speed + SKIPS * (later + walked)).argmin())
+
+
+def way_into(
+    get_up: GetUpPlanner, qpos: Tensor, place: Tensor, velocity: Tensor, moves: Tensor | None = None
+) -> Tensor:
+    """The frames `(T, 7 + n)` from `qpos (7 + n)` to `place (7 + n)`, at which a motion moves with
+    `velocity (6 + n)`; over standing at ease for `CALM_S` before it.
+
+    moves: m/s `(2)`, how the body moves at the start.
+    """
+    into = run_up(get_up, place, velocity)
+    way = plan_recovery(get_up, qpos, into[0], moves=moves)
+    way = way[: len(way) - round((STAY_S - CALM_S) * get_up.rate_hz)]
+    return torch.cat((way[:-1], get_up.blend(way[-1], into[0]), into[1:]))
