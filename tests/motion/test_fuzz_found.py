@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from handmade_gltf_files import Gltf, walker
 from handmade_numpy_files import odd_clip
+from test_opensim_files import mot
 
 from poise.errors import PoiseError
 from poise.motion import read_clip, write_clip
@@ -83,3 +84,9 @@ def test_a_signalling_nan_is_no_warning(tmp_path: Path) -> None:
     bare[:4] = np.frombuffer(struct.pack("<I", 0x7F800001), dtype=np.uint8)
     file.data[:] = bare.tobytes()
     refusal(tmp_path / "a.glb", file.glb())
+
+
+@pytest.mark.parametrize("time", ["inf", "nan", "1e300"])
+def test_times_of_opensim_that_are_no_seconds(tmp_path: Path, time: str) -> None:
+    data = mot().replace("0.01000000\t", f"{time}\t", 1).encode()
+    assert "times are no usable numbers" in refusal(tmp_path / "a.mot", data)
