@@ -21,7 +21,7 @@ from pathlib import Path
 from .corpus import Case, hash_of, pack
 from .mutate import mutate
 from .oracle import Verdict
-from .seeds import NATIVE, Seed, seeds
+from .seeds import FITTED, NATIVE, Seed, seeds
 from .tally import Tally, record
 from .worker import Worker
 
@@ -36,7 +36,8 @@ BATCH = 64
 class Parents:
     """What is damaged next: the sound file, one that was read or one that was refused.
 
-    A refused file is seldom refused elsewhere when it is damaged further, so most are not.
+    A refused file is seldom refused elsewhere when it is damaged further, so not all are. Files grow,
+    and large ones take time and tell no more: those above twice the sound one are left.
     """
 
     def __init__(self, sound: dict[str, bytes]) -> None:
@@ -45,13 +46,14 @@ class Parents:
     def some(self, rng: random.Random) -> dict[str, bytes]:
         """One of them."""
         share = rng.random()
-        if share < 0.4 and self.refused:
+        if share < 0.45 and self.refused:
             return rng.choice(self.refused)
         return rng.choice(self.read) if share < 0.7 and self.read else self.sound
 
     def add(self, verdict: Verdict, files: dict[str, bytes]) -> None:
         """Another one, where it is sound and small."""
-        if verdict.sound and sum(map(len, files.values())) < 20_000:
+        most = 1000 + 2 * sum(map(len, self.sound.values()))
+        if verdict.sound and sum(map(len, files.values())) < most:
             (self.read if verdict.kind == "read" else self.refused).append(files)
 
 
@@ -61,18 +63,19 @@ def fuzz(
     seed: int,
     most: int | None = None,
     save: Callable[[Tally], None] = lambda tally: None,
+    found: Callable[[Case], None] = lambda case: None,
 ) -> tuple[Tally, dict[str, list[Case]]]:
     """The tally, and the kept cases by outcome.
 
-    save: is given the tally now and then.
+    save: is given the tally now and then. found: is given what is wrong in a new way, at once.
 
     What is read slowly is damaged less often: a sound file gets time by the inverse square root of what
-    its children cost, one for a native library a fifth of that.
+    its children cost, one for a native library or of keypoints a fifth of that.
     """
     rng, worker, tally = random.Random(seed), Worker({s.format for s in sound}), Tally()
     kept, tried, end = dict[str, list[Case]](), 0, time.monotonic() + 60 * minutes
     parents = {s.name: Parents(s.files) for s in sound}
-    share = {s.name: 0.2 if s.format in NATIVE else 1.0 for s in sound}
+    share = {s.name: 0.2 if s.format in NATIVE or s.name in FITTED else 1.0 for s in sound}
     cost = {s.name: 0.05 if s.format in NATIVE else 0.005 for s in sound}
     spent, number = Counter(cost), Counter({s.name: 1 for s in sound})
     while time.monotonic() < end and (most is None or tried < most):
@@ -97,6 +100,7 @@ def fuzz(
             number[one.name] += 1
             if new:
                 print(f"{tried}: {key}\n    {verdict.text}", flush=True)
+                found((one.format, one.name, files))
             same = kept.setdefault(key, [])
             if len(same) < (SAME if verdict.kind == "refused" else 40):
                 same.append((one.format, one.name, files))
@@ -129,10 +133,16 @@ def main() -> None:
         parser.error(f"no such format: {', '.join(sorted(wrong))}; there are {', '.join(known)}")
     sound = [s for s in every if s.format in (args.formats or known)]
     save = record(args.json, sys.argv[1:]) if args.json is not None else lambda tally: None
-    tally, kept = fuzz(sound, args.minutes, args.seed, args.files, save)
-    print(json.dumps(tally.told(), indent=1))
+
+    def found(case: Case) -> None:
+        if args.keep is not None:
+            pack([case], args.keep / f"odd_{hash_of(case[2])}.tar.xz")
+
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)
+    tally, kept = fuzz(sound, args.minutes, args.seed, args.files, save, found)
+    print(json.dumps(tally.told(), indent=1))
+    if args.keep is not None:
         small = (c for some in kept.values() for c in some if sum(map(len, c[2].values())) < 50_000)
         cases = {hash_of(c[2]): c for c in small}
         count = pack(cases.values(), args.keep / f"kept_{args.seed}.tar.xz")

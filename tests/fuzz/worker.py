@@ -38,8 +38,12 @@ def _stop(number: int, frame: FrameType | None) -> None:
     raise _TooLongError(at[-1] if at else "?")
 
 
-def work(pipe: Connection, formats: Iterable[str]) -> None:
-    """Reads what comes through the pipe, list by list; answers each file with a verdict and seconds."""
+def work(pipe: Connection, parents: Connection, formats: Iterable[str]) -> None:
+    """Reads what comes through the pipe, list by list; answers each file with a verdict and seconds.
+
+    parents: the pipe's other end, closed here, so that this process ends with its parent.
+    """
+    parents.close()
     fork_instead(formats)
     # The libraries' own objects are many: they are never looked through for garbage again.
     gc.freeze()
@@ -76,6 +80,14 @@ def work(pipe: Connection, formats: Iterable[str]) -> None:
                 pipe.send((verdict.kind, verdict.text, _busy() - begun))
 
 
+def _orders(pipe: Connection) -> list[Order]:
+    """The next files; none where the parent has ended."""
+    try:
+        return pipe.recv()
+    except EOFError:
+        return []
+
+
 def _busy() -> float:
     """Seconds of the processor that this process and its children have taken."""
     took = os.times()
@@ -102,7 +114,9 @@ class Worker:
 
     def start(self) -> None:
         self.pipe, other = self.context.Pipe()
-        self.process = self.context.Process(target=work, args=(other, self.formats), daemon=True)
+        self.process = self.context.Process(
+            target=work, args=(other, self.pipe, self.formats), daemon=True
+        )
         self.process.start()
         other.close()
 
