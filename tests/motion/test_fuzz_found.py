@@ -128,3 +128,13 @@ def test_a_note_that_never_ends_is_cut(tmp_path: Path, table: str) -> None:
     (tmp_path / "a.csv").write_text(table.replace("One thing.", "One " + "_" * 9000))
     notes = read_clip(tmp_path / "a.csv").skeleton.source.notes
     assert len(notes[0]) == 2000 and notes[0].endswith("_...") and len(notes) == 2
+
+
+def test_a_shape_beyond_all_numbers(tmp_path: Path) -> None:
+    text = b"{'descr': '<f8', 'fortran_order': False, 'shape': (" + b"9" * 400 + b", 3), }\n"
+    header = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+    with zipfile.ZipFile(tmp_path / "sound.npz", "w") as archive:
+        for key in ("positions", "names", "fps"):
+            archive.writestr(f"{key}.npy", header)
+    said = refusal(tmp_path / "a.npz", (tmp_path / "sound.npz").read_bytes())
+    assert "1e+09 GB and more than the limit" in said or "more than the limit" in said
