@@ -35,6 +35,8 @@ _MOST, _PLACE, _WORD = 300, 100, 100
 
 def printable(text: str, kept: str = "") -> str:
     """The text with "?" for what a terminal would obey instead of showing it, but for `kept`."""
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() or c in kept else "?" for c in text)
 
 

@@ -37,7 +37,8 @@ def judge(
     again: writes what was read and reads it once more.
     """
     for path in folder.iterdir():
-        if path.is_file():
+        # What is written anew need not be removed.
+        if path.name not in files and path.is_file():
             path.unlink()
     for other, data in files.items():
         (folder / other).write_bytes(data)

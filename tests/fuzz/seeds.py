@@ -24,7 +24,9 @@ class Seed:
 
 
 #: Formats whose readers start a process for each file.
-NATIVE = ("usda", "usdc", "c3d", "mjcf")
+NATIVE = ("usda", "usdc", "c3d", "fbx", "mjcf")
+#: Seeds of keypoints, to which a body is fitted: ten times as slow as the others where they are read.
+FITTED = ("a.trc", "a.csv", "keys.npz", "joints.npy", "mdm.npy")
 
 
 def seeds(folder: Path) -> list[Seed]:
@@ -66,7 +68,44 @@ def seeds(folder: Path) -> list[Seed]:
         kind = kinds.get(name, name.rsplit(".", 1)[-1])
         beside = {p.name: p.read_bytes() for p in folder.glob("own*.bin")} if kind == "gltf" else {}
         out.append(Seed(kind, name, {name: (folder / name).read_bytes(), **beside}))
-    return out + _native(folder)
+    return out + _generated(folder) + _native(folder)
+
+
+def _generated(folder: Path) -> list[Seed]:
+    """What generators, pose estimators and avatars write."""
+    import handmade_numpy_files as arrays
+    import test_generated_files as made
+    import test_gltf_vrm as vrm
+    from handmade_gltf_files import put
+
+    frames, body = 6, made.LAYOUTS[0]
+    places = made._moved(body.names, body.parents, body.offsets)[0][:frames]
+    names, _ = made.SKELETONS[min(made.SKELETONS)]
+    turns = np.tile(np.eye(3), (frames, len(names), 1, 1))
+    joints = np.linspace((0, 0, 0), (0, 1.7, 0.1), len(names)) + np.arange(frames)[:, None, None] * 0.01
+    smpl = arrays.amass(66, frames)
+    out = dict[str, bytes]()
+    for name, write in {
+        "joints.npy": lambda p: np.save(p, places),
+        "mdm.npy": lambda p: arrays.save_npy(
+            p,
+            {
+                "motion": places.transpose(1, 2, 0)[None],
+                "text": ["walks"],
+                "lengths": np.array([frames]),
+            },
+        ),
+        "kimodo.npz": lambda p: np.savez(p, posed_joints=joints, global_rot_mats=turns),
+        "gvhmr.npz": lambda p: np.savez(
+            p, fps=30, body_pose=smpl["poses"][:, 3:], global_orient=smpl["poses"][:, :3],
+            transl=smpl["trans"], betas=np.zeros((frames, 10)),
+        ),
+    }.items():  # fmt: skip
+        write(folder / name)
+        out[name] = (folder / name).read_bytes()
+    named = {bone: f"node {k}" for k, (bone, _, _) in enumerate(vrm.BONES)}
+    out["a.vrm"] = put(folder, "avatar.glb", vrm.model("VRMC_vrm", named)).read_bytes()
+    return [Seed("vrm" if n[-3:] == "vrm" else n[-3:], n, {n: data}) for n, data in out.items()]
 
 
 def _native(folder: Path) -> list[Seed]:
@@ -77,6 +116,10 @@ def _native(folder: Path) -> list[Seed]:
     from test_points_files import NAMES, walking, write_c3d
 
     out = [Seed("mjcf", "own.xml", {"own.xml": test_mjcf.mjcf().encode()})]
+    if find_spec("ufbx") is not None:
+        from handmade_fbx_files import fbx_text
+
+        out.append(Seed("fbx", "a.fbx", {"a.fbx": fbx_text(4).encode()}))
     if find_spec("ezc3d") is not None:
         write_c3d(folder / "a.c3d", walking() * 1000, NAMES)
         out.append(Seed("c3d", "a.c3d", {"a.c3d": (folder / "a.c3d").read_bytes()}))

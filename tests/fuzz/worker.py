@@ -2,22 +2,54 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
+import os
+import signal
 import tempfile
 import time
+import traceback
+from collections.abc import Iterable
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import FrameType
 
+from .native import fork_instead
 from .oracle import Verdict, judge
 
-#: Bytes that reading a file may take beside four times its size, and seconds until it is a hang.
-BYTES, HANG = 200 << 20, 60.0
+#: Bytes that reading a file may take beside four times its size.
+BYTES = 200 << 20
+#: Seconds of the processor until Python code is stopped, and of the clock until the process is.
+BUSY, HANG = 15.0, 240.0
 #: What is read, its files, and whether it is written and read again.
 Order = tuple[str, dict[str, bytes], bool]
 
 
-def work(pipe: Connection) -> None:
-    """Reads what comes through the pipe, list by list; answers each file with a verdict and seconds."""
+class _TooLongError(BaseException):
+    """A file took more than `BUSY` seconds: where it was."""
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    at = [
+        f"{Path(f.filename).name}:{f.lineno}"
+        for f in traceback.extract_stack(frame)
+        if "poise" in f.filename
+    ]
+    raise _TooLongError(at[-1] if at else "?")
+
+
+def work(pipe: Connection, parents: Connection, formats: Iterable[str]) -> None:
+    """Reads what comes through the pipe, list by list; answers each file with a verdict and seconds.
+
+    parents: the pipe's other end, closed here, so that this process ends with its parent.
+    """
+    parents.close()
+    fork_instead(formats)
+    # The libraries' own objects are many: they are never looked through for garbage again.
+    gc.freeze()
+    timed = hasattr(signal, "setitimer")
+    if timed:
+        signal.signal(signal.SIGPROF, _stop)
     try:
         import resource
     except ImportError:
@@ -32,13 +64,34 @@ def work(pipe: Connection) -> None:
     with tempfile.TemporaryDirectory(dir=_fast()) as folder:
         while (orders := pipe.recv()) is not None:
             for name, files, again in orders:
-                begun = time.process_time()
-                verdict = judge(Path(folder), name, files, again)
+                begun = _busy()
+                if timed:
+                    signal.setitimer(signal.ITIMER_PROF, BUSY)
+                try:
+                    verdict = judge(Path(folder), name, files, again)
+                except _TooLongError as late:
+                    verdict = Verdict("hang", f"{late} after {BUSY:.0f} s")
+                if timed:
+                    signal.setitimer(signal.ITIMER_PROF, 0)
                 after = peak()
                 if (after - before) * 1024 > BYTES + 4 * sum(map(len, files.values())):
                     verdict = Verdict("memory", f"{(after - before) / 1024:.0f} MB")
                 before = after
-                pipe.send((verdict.kind, verdict.text, time.process_time() - begun))
+                pipe.send((verdict.kind, verdict.text, _busy() - begun))
+
+
+def _orders(pipe: Connection) -> list[Order]:
+    """The next files; none where the parent has ended."""
+    try:
+        return pipe.recv()
+    except EOFError:
+        return []
+
+
+def _busy() -> float:
+    """Seconds of the processor that this process and its children have taken."""
+    took = os.times()
+    return time.process_time() + took.children_user + took.children_system
 
 
 def _fast() -> str | None:
@@ -55,13 +108,15 @@ def _address_space() -> int:
 class Worker:
     """The process that reads, started again after a crash."""
 
-    def __init__(self) -> None:
-        self.context = multiprocessing.get_context("fork")
+    def __init__(self, formats: Iterable[str] = ()) -> None:
+        self.context, self.formats = multiprocessing.get_context("fork"), tuple(formats)
         self.start()
 
     def start(self) -> None:
         self.pipe, other = self.context.Pipe()
-        self.process = self.context.Process(target=work, args=(other,), daemon=True)
+        self.process = self.context.Process(
+            target=work, args=(other, self.pipe, self.formats), daemon=True
+        )
         self.process.start()
         other.close()
 

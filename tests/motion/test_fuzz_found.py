@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from handmade_gltf_files import Gltf, walker
 from handmade_numpy_files import odd_clip
+from test_opensim_files import mot
 
 from poise.errors import PoiseError
 from poise.motion import read_clip, write_clip
@@ -83,3 +84,57 @@ def test_a_signalling_nan_is_no_warning(tmp_path: Path) -> None:
     bare[:4] = np.frombuffer(struct.pack("<I", 0x7F800001), dtype=np.uint8)
     file.data[:] = bare.tobytes()
     refusal(tmp_path / "a.glb", file.glb())
+
+
+@pytest.mark.parametrize("time", ["inf", "nan", "1e300"])
+def test_times_of_opensim_that_are_no_seconds(tmp_path: Path, time: str) -> None:
+    data = mot().replace("0.01000000\t", f"{time}\t", 1).encode()
+    assert "times are no usable numbers" in refusal(tmp_path / "a.mot", data)
+
+
+def test_keypoints_that_are_one_place_but_for_an_outlier(tmp_path: Path) -> None:
+    still = np.zeros((6, 22, 3))
+    still[2, 12] = 1e5, 2e5, 3e5
+    np.save(tmp_path / "sound.npy", still)
+    said = refusal(tmp_path / "a.npy", (tmp_path / "sound.npy").read_bytes())
+    assert "all keypoints lie in one place" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"parents": np.array([-1.0, np.nan, 0.0])},
+            "array 'parents' holds a number that is no joint's",
+        ),
+        (
+            {"end_joints": np.array([1e300, 1, 2])},
+            "array 'end_joints' holds a number that is no joint's",
+        ),
+        ({"offsets": np.full((3, 3), 1e-300)}, "no bone of the skeleton has any length"),
+    ],
+)
+def test_arrays_of_poises_own_that_make_no_body(
+    tmp_path: Path, change: dict[str, np.ndarray], said: str
+) -> None:
+    write_clip(odd_clip(), tmp_path / "sound.poise.npz")
+    with np.load(tmp_path / "sound.poise.npz") as file:
+        np.savez(tmp_path / "changed.npz", **{**file, **change})
+    assert said in refusal(tmp_path / "a.npz", (tmp_path / "changed.npz").read_bytes())
+
+
+def test_a_note_that_never_ends_is_cut(tmp_path: Path, table: str) -> None:
+    assert "One thing." in table
+    (tmp_path / "a.csv").write_text(table.replace("One thing.", "One " + "_" * 9000))
+    notes = read_clip(tmp_path / "a.csv").skeleton.source.notes
+    assert len(notes[0]) == 2000 and notes[0].endswith("_...") and len(notes) == 2
+
+
+def test_a_shape_beyond_all_numbers(tmp_path: Path) -> None:
+    text = b"{'descr': '<f8', 'fortran_order': False, 'shape': (" + b"9" * 400 + b", 3), }\n"
+    header = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+    with zipfile.ZipFile(tmp_path / "sound.npz", "w") as archive:
+        for key in ("positions", "names", "fps"):
+            archive.writestr(f"{key}.npy", header)
+    said = refusal(tmp_path / "a.npz", (tmp_path / "sound.npz").read_bytes())
+    assert "1e+09 GB and more than the limit" in said or "more than the limit" in said

@@ -83,7 +83,8 @@ def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
             say nothing and a folded rest pose.
 
     Raises:
-        PoiseError: where a foot or a hand can be told neither by name nor by shape.
+        PoiseError: where a foot or a hand can be told neither by name nor by shape; an arm that
+            hangs on a leg.
     """
     roles = find_roles(skeleton)
     legs, arms = _limbs(roles, ("thigh", "shin", "foot")), _limbs(roles, _ARM)
@@ -114,6 +115,7 @@ def find_anatomy(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Anatomy:
             # A heel bone or the like may hang beside the toes.
             named = [c for c in below if any(w in skeleton.names[c].lower() for w in ("toe", "ball"))]
             toes.append((side, (named or below)[0]))
+    _check_apart(skeleton, kinds, legs, arms)
     kinds |= _neck_and_head(roles, chest, kinds, pose)
     parts = tuple(Part(j, *kinds[j]) for j in subtree(skeleton, 0) if j in kinds)
     return Anatomy(parts, tuple(toes), evidence)
@@ -139,6 +141,23 @@ def _limbs(roles: Roles, kinds: tuple[str, str, str]) -> _Lines:
         if a is not None and b is not None and c is not None:
             out[side] = (a, b, c)
     return out
+
+
+def _check_apart(
+    skeleton: Skeleton, kinds: dict[int, tuple[str, str]], legs: _Lines, arms: _Lines
+) -> None:
+    """Refuses a tree in which a joint of a limb is another part as well."""
+    for lines, names in ((legs, ("thigh", "shin", "foot")), (arms, _ARM)):
+        for side, line in lines.items():
+            for j, kind in zip(line, names, strict=True):
+                if kinds[j] != (kind, side):
+                    other = " ".join(reversed(kinds[j])).replace("_", " ").strip()
+                    own = f"{side} {kind.replace('_', ' ')}"
+                    raise PoiseError(
+                        f"joint '{skeleton.names[j]}' is the {own} by its name and the {other} by its "
+                        "place in the tree",
+                        skeleton.source.path,
+                    )
 
 
 def _missing(roles: Roles, legs: _Lines, arms: _Lines) -> PoiseError:

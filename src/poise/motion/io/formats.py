@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -168,8 +169,10 @@ def read_clip(
 
 
 def _reader_of(path: Path) -> Reader:
-    if path.is_dir():
-        refuse_folder(path)
+    with suppress(OSError):
+        # A name that is too long, say; reading tells why.
+        if path.is_dir():
+            refuse_folder(path)
     head = read_head(path)
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     for reader in READERS:

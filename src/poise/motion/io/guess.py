@@ -182,13 +182,14 @@ def root_jumps(root_pos: np.ndarray, fps: float) -> list[tuple[int, float]]:
     Such a step exceeds 6 m/s and five times the usual step of the frames around it.
     """
     step = np.linalg.norm(np.diff(root_pos, axis=0), axis=-1)
-    if len(step) < 3:
+    fast = step * fps > _TELEPORT_SPEED
+    if len(step) < 3 or not fast.any():
         return []
     half = max(3, round(0.25 * fps))
     padded = np.pad(step, half, mode="reflect" if len(step) > half else "edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
     usual = np.concatenate([np.median(part, axis=-1) for part in np.array_split(windows, 16)])
-    found = np.flatnonzero((step * fps > _TELEPORT_SPEED) & (step > 5.0 * usual))
+    found = np.flatnonzero(fast & (step > 5.0 * usual))
     return [(int(f) + 1, float(step[f])) for f in found]
 
 

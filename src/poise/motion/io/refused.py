@@ -47,14 +47,12 @@ def refuse_robot(path: Path, options: ReadOptions) -> NoReturn:
             path,
             _HUMAN_HINT,
         )
-    if head.startswith(_HDF5_MAGIC):
-        raise PoiseError(
-            "HDF5 files of motion (dm_control, MuJoCo) hold the joint angles of one fixed model, which "
-            "mean nothing without it",
-            path,
-            _HUMAN_HINT,
-        )
-    raise PoiseError("it is no motion that is known", path)
+    raise PoiseError(
+        "HDF5 files of motion (dm_control, MuJoCo) hold the joint angles of one fixed model, which "
+        "mean nothing without it",
+        path,
+        _HUMAN_HINT,
+    )
 
 
 def _robot_columns(head: bytes) -> int | None:

@@ -64,6 +64,9 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     if not _span(tracks) > 1e-6:
         raise PoiseError("all keypoints lie in one place", points.source.path or points.name)
     rest = measure(tracks, spine, notes)
+    if bad := next((n for n, offset in rest.offsets.items() if not np.isfinite(offset).all()), None):
+        what = f"its keypoints give the bone to '{bad}' no length that is a number"
+        raise PoiseError(what, points.source.path or points.name)
     tracks = hold_lengths(tracks, bones_of(rest))
     root_pos, rot = Solver(rest, tracks, points.fps).run()
     names = tuple(rest.parents)
@@ -100,8 +103,9 @@ def _cut(points: Keypoints, start: int, stop: int) -> Keypoints:
 
 
 def _span(tracks: dict[str, Tensor]) -> float:
+    """How far the body reaches (m) in half of the frames at least."""
     every = torch.stack([tracks["left_hip"], tracks["left_ankle"], tracks["right_shoulder"]])
-    return float((every - every[:1]).norm(dim=-1).max())
+    return float((every - every[:1]).norm(dim=-1).amax(0).median())
 
 
 def bones_of(rest: Rest) -> list[tuple[str, str, float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,8 @@ from poise.spatial import euler_to_quat
 
 ROTATIONS = ("rx", "ry", "rz")
 TRAVEL = ("tx", "ty", "tz")
+#: What begins a comment; "1.#INF" is how Windows writes an open limit.
+_COMMENT = re.compile(r"#(?!inf)", re.IGNORECASE)
 
 
 @dataclass
@@ -71,7 +74,7 @@ _Line = tuple[int, list[str]]
 
 def _lines(path: Path) -> Iterator[_Line]:
     for i, raw in enumerate(read_bytes(path, MAX_SKELETON_BYTES).splitlines(), 1):
-        words = decode(raw, path, i).split("#", 1)[0].split()
+        words = _COMMENT.split(decode(raw, path, i), maxsplit=1)[0].split()
         if words:
             yield i, words
 

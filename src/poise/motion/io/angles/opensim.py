@@ -18,7 +18,7 @@ from poise.motion.clip import Clip, check_frames
 from poise.motion.io.numpy.arrays import numeric, refuse_bad, require
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.tables import number_table
-from poise.motion.io.text import CUT_OFF, decode, listed, read_bytes, shown
+from poise.motion.io.text import CUT_OFF, MAX_VALUE, decode, listed, read_bytes, shown
 from poise.motion.skeleton import Channel
 from poise.spatial import axis_angle_to_quat, quat_mul
 
@@ -100,6 +100,8 @@ def read_mot(path: Path, options: ReadOptions) -> Clip:
     columns = dict(zip(names, table.T, strict=True))
     require(columns, ("time", *_PELVIS), path, "this OpenSim motion")
     check_frames(len(table), path)
+    if not (np.abs(columns["time"]) <= MAX_VALUE).all():
+        raise PoiseError("its times are no usable numbers", path, "Write them as seconds")
     steps = np.diff(columns["time"])
     step = float(steps.mean())
     if not (step > 0 and np.abs(steps / step - 1).max() < 0.05):

@@ -136,8 +136,8 @@ def read_npy(file: IO[bytes], where: str | Path, unpickle: Unpickle | None = Non
     size = math.prod(header.shape) * header.dtype.itemsize
     if size > MAX_ARRAY_BYTES:
         raise PoiseError(
-            f"it states the shape {header.shape}, which is {size / 1e9:.3g} GB and more than the limit "
-            f"of {MAX_ARRAY_BYTES / 1e9:.2f} GB",
+            f"it states the shape {header.shape}, which is {min(size, 10**18) / 1e9:.3g} GB and more "
+            f"than the limit of {MAX_ARRAY_BYTES / 1e9:.2f} GB",
             where,
             "Cut it into shorter clips",
         )

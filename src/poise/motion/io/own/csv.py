@@ -128,7 +128,14 @@ def _quoted(name: str) -> str:
 
 def _header(lines: list[bytes], path: Path) -> tuple[dict[str, str], int]:
     """The `# key: value` lines, and the index of the line with the column names."""
-    version = decode(lines[0] if lines else b"", path, 1).removeprefix(MARK).strip(" ,\t")
+    first = decode(lines[0] if lines else b"", path, 1)
+    if not first.startswith(MARK):
+        raise PoiseError(
+            f"it is no table of keypoints and no CSV of Poise, which begins with '{MARK} {VERSION}'",
+            path,
+            "Name the columns of keypoints NAME_x, NAME_y, NAME_z",
+        )
+    version = first.removeprefix(MARK).strip(" ,\t")
     if version != str(VERSION):
         raise PoiseError(
             f"the file has version {shown(version)} of Poise's CSV; this Poise reads version {VERSION}",

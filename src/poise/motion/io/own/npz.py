@@ -18,7 +18,7 @@ from poise.motion.io.own.record import (
     source_to_json,
 )
 from poise.motion.io.raw import ReadOptions
-from poise.motion.io.text import write_whole
+from poise.motion.io.text import MAX_JOINTS, write_whole
 
 VERSION = 1
 """The version of the format that is written; newer ones are refused."""
@@ -84,9 +84,9 @@ def read_poise_npz(data: Mapping[str, Any], path: Path, options: ReadOptions) ->
     refuse_bad(rot, "the rotation", path, labels)
     skeleton = make_skeleton(
         labels,
-        numeric(data, "parents", (None,), path).astype(int),
+        _joints(data, "parents", path),
         numeric(data, "offsets", (None, 3), path),
-        numeric(data, "end_joints", (None,), path).astype(int),
+        _joints(data, "end_joints", path),
         numeric(data, "ends", (None, 3), path),
         source_from_json(text_of(data["source"]), path),
         path,
@@ -96,3 +96,11 @@ def read_poise_npz(data: Mapping[str, Any], path: Path, options: ReadOptions) ->
     fps = options.fps or one_number(data, "fps", path)
     # What a clip refuses is told with the file, once the clip bears the file's name.
     return Clip(skeleton, root_pos, rot, fps, path.stem, cyclic).replaced(name=name)
+
+
+def _joints(data: Mapping[str, Any], key: str, path: Path) -> np.ndarray:
+    """Indices of joints."""
+    value = numeric(data, key, (None,), path)
+    if not (np.abs(value) <= MAX_JOINTS).all():
+        raise PoiseError(f"array '{key}' holds a number that is no joint's", path)
+    return value.astype(int)

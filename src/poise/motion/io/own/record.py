@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -17,6 +17,9 @@ from poise.motion.skeleton import Skeleton, Source, triple
 
 MAX_RECORD = 16 << 20
 """Longer records are refused, characters."""
+MAX_NOTE = 2000
+LEAST_BONE_M = 1e-6
+"""A skeleton of several joints has one bone at least that is as long."""
 
 
 def source_to_json(source: Source) -> str:
@@ -28,10 +31,13 @@ def source_to_json(source: Source) -> str:
 def source_from_json(text: str, path: Path) -> Source:
     """The `Source` that `source_to_json` wrote; a damaged one is refused in one sentence.
 
-    Fields that this version does not know are left out, fields that are not there get defaults.
+    Fields that this version does not know are left out, fields that are not there get defaults. Notes
+    longer than Poise writes are cut.
     """
     try:
-        return fitted(loads(text, path, "source"), Source)
+        source = fitted(loads(text, path, "source"), Source)
+        cut = (n if len(n) <= MAX_NOTE else n[: MAX_NOTE - 3] + "..." for n in source.notes)
+        return replace(source, notes=tuple(cut))
     except (KeyError, TypeError, ValueError) as error:
         raise PoiseError(
             f"the record of the clip's source is damaged ({shown(error)})", path, CUT_OFF
@@ -97,6 +103,8 @@ def make_skeleton(
     for what, table in (("offsets", offsets), ("ends", ends)):
         if not (np.abs(table) <= MAX_VALUE).all():
             raise PoiseError(f"array '{what}' holds a number that is not usable", path)
+    if count > 1 and not np.abs(offsets[1:]).max() >= LEAST_BONE_M:
+        raise PoiseError("no bone of the skeleton has any length", path)
     if not ((end_joints >= 0) & (end_joints < count)).all():
         raise PoiseError("array 'end_joints' names a joint that does not exist", path)
     tips = tuple((int(j), triple(e)) for j, e in zip(end_joints, ends.tolist(), strict=True))
