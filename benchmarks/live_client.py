@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,9 +41,16 @@ def pose_message(person: str, time_s: float, root: np.ndarray, rot: np.ndarray) 
     return json.dumps({"v": 1, "type": "pose", "person": person, **told})
 
 
-async def play(url: str, clips: Sequence[Clip], seconds: float, seed: int, faults: bool) -> Sent:
-    """Sends each clip as a person at 30 Hz."""
-    rng, sent, loops = np.random.default_rng(seed), Sent(), [Loop(c) for c in clips]
+async def play(
+    url: str,
+    clips: Sequence[Clip],
+    seconds: float,
+    seed: int,
+    faults: bool,
+    sent: Sent | None = None,
+) -> Sent:
+    """Sends each clip as a person at 30 Hz; counts in `sent`."""
+    rng, sent, loops = np.random.default_rng(seed), sent or Sent(), [Loop(c) for c in clips]
     async with connect(url, max_size=None, ping_interval=None) as socket:
         drain = asyncio.create_task(_drain(socket))
         names = [f"p{k}" for k in range(len(clips))]
@@ -90,16 +97,22 @@ async def _drain(socket: Any) -> None:
         pass
 
 
-async def watch(url: str, seconds: float) -> list[dict[str, Any]]:
-    """The figures that pages are told, about four a second."""
+async def watch(
+    url: str, seconds: float, heard: Callable[[dict[str, Any]], None] | None = None
+) -> list[dict[str, Any]]:
+    """The figures that pages are told, about four a second.
+
+    heard: is told them as they come, in place of keeping them.
+    """
     out, end = list[dict[str, Any]](), time.perf_counter() + seconds
+    heard = heard or out.append
     async with connect(url, max_size=None, ping_interval=None) as socket:
         while time.perf_counter() < end:
             try:
                 told = await asyncio.wait_for(socket.recv(), 5.0)
             except TimeoutError:
-                out.append({"silent": True})
+                heard({"silent": True})
                 continue
             if isinstance(told, str) and (said := json.loads(told)).get("type") == "figures":
-                out.append(said)
+                heard(said)
     return out

@@ -7,6 +7,7 @@ it stands now through the offsets by which it acts anyway meanwhile; what is tri
 
 from __future__ import annotations
 
+import os
 import queue
 import signal
 import threading
@@ -36,6 +37,8 @@ from poise.plan.lookahead import PAST, Choice
 QUICK = LookaheadConfig(candidates=8, horizon=6, hold_steps=3, smoothing=(0.0, 0.7), corrections=(1.0,))
 #: Control steps after which a decision that is made beside the loop counts.
 LEAD = 3
+#: By how much the other process comes after the loop, as `nice` counts.
+NICE = 5
 #: s that the other process has to end.
 ENDS_S = 2.0
 
@@ -264,6 +267,8 @@ def _decide_all(line: Connection, tracker: Tracker, seed: int) -> None:
     # Ctrl-C is for the loop, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    # The loop comes first, where there is not a core for each.
+    os.nice(NICE)
     lookahead = tries_of(tracker, QUICK, seed)
     while True:
         try:

@@ -102,7 +102,7 @@ class Aims:
         """The newest frame that character k's goal knows, and where its bodies are, if that is told."""
         world, person = self.world, self.people.of(k)
         character, endless = world.characters[k], self.endless.get(k)
-        qpos, own, places = None, None, None
+        qpos, own, places, stalled = None, None, None, False
         follows = endless or self.people.follows[k]
         if self._was[k] != follows:
             self._was[k] = follows
@@ -115,13 +115,14 @@ class Aims:
             if pose is not None:
                 if pose.jumped:
                     character.jump()
+                stalled = pose.stalled
                 onto = person.onto
                 if pose.places is not None:
                     places = onto.where.points(pose.places)
                 made, places = self._noisy(k, onto(pose.root_pos, pose.rot), places)
                 qpos, where = tensor(made), replace(onto.where)
                 own = Own(onto.passage.source, pose.root_pos, pose.rot, where, onto.scale)
-        frame = character.next(qpos, world.body(k), world.lead[k])
+        frame = character.next(qpos, world.body(k), stalled)
         follows_it = frame is qpos
         self._own[k].append(own if follows_it else None)
         return frame, places if follows_it else None
@@ -166,7 +167,7 @@ class Aims:
     def set_lead(self) -> None:
         """How many frames goals are behind what is read, by the length of the buffer."""
         lead = 1 + int(max(0.0, self.people.delay_s - MARGIN_S) * self.world.rate_hz + 1e-6)
-        self.world.lead = [lead] * self.world.count
+        self.world.set_lead(lead)
 
     def dream(self, k: int, on: bool) -> None:
         """A character begins endless motion, or goes back to its person."""

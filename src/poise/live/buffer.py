@@ -13,6 +13,8 @@ from poise.live.quats import slerp
 MARGIN_S = 0.05
 #: s in which motion that has stopped coming comes to rest: its velocity falls by e in each.
 FADE_S = 0.1
+#: s without a new pose after which motion is known to have stopped coming.
+STALLS_S = 0.2
 #: m/s and m beyond which a person did not move but is elsewhere, or is another one.
 JUMP, LEAP_M = 12.0, 0.4
 #: Packets by which the way's shortest time is known, and those that are kept.
@@ -28,6 +30,7 @@ class Pose(NamedTuple):
         stale_s: for how long nothing has come.
         jumped: whether the person is elsewhere since the pose that was read before.
         places: `(B, 3)` m of the character's bodies, where the source tells them.
+        stalled: whether it is extrapolated by more than `STALLS_S`.
     """
 
     root_pos: np.ndarray
@@ -35,6 +38,7 @@ class Pose(NamedTuple):
     stale_s: float
     jumped: bool
     places: np.ndarray | None = None
+    stalled: bool = False
 
 
 class _Frame(NamedTuple):
@@ -103,6 +107,7 @@ class JitterBuffer:
         at = now_s - self._way - min(self.delay_s, MARGIN_S)
         jumped, self._jumped = self._jumped, False
         stale = max(0.0, now_s - self._arrived)
+        stalled = at - frames[-1].time_s > STALLS_S
         after = next((k for k in range(len(frames) - 1, -1, -1) if frames[k].time_s <= at), -1)
         if after == len(frames) - 1:
             a, b, share = self._beyond(at)
@@ -112,12 +117,12 @@ class JitterBuffer:
             a, b = frames[after], frames[after + 1]
             share = 0.0 if b.leaps else (at - a.time_s) / (b.time_s - a.time_s)
         if share == 0.0:
-            return Pose(a.root_pos, a.rot, stale, jumped, a.places)
+            return Pose(a.root_pos, a.rot, stale, jumped, a.places, stalled)
         places = None
         if a.places is not None and b.places is not None:
             places = a.places + share * (b.places - a.places)
         root = a.root_pos + share * (b.root_pos - a.root_pos)
-        return Pose(root, slerp(a.rot, b.rot, share), stale, jumped, places)
+        return Pose(root, slerp(a.rot, b.rot, share), stale, jumped, places, stalled)
 
     def _beyond(self, at: float) -> tuple[_Frame, _Frame, float]:
         """The last two frames and a share of the way between them, beyond 1: q_0 + v_0 tau

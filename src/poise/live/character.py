@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
@@ -13,19 +13,21 @@ import torch
 from torch import Tensor
 
 from poise.env.goals.led import LOST, REST, WAITS_S
-from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
-from poise.env.recovery.planner import DOWN, plan_recovery
+from poise.env.recovery.get_up import GetUpPlanner
+from poise.env.recovery.planner import DOWN
+from poise.live.passing import Passing
+from poise.live.ways import Way
 from poise.spatial.directions import facing, heading_angle
 
 #: What a character does.
 EASE, TRACKS, FALLS, RETURNS = "at ease", "tracks", "falls", "gets up"
-#: s in which one motion passes into another.
-BLEND_S = 0.7
 #: m that a standing person may be away for the character to walk there; m/s of one that stands.
 WALKS_M, STANDS = 4.0, 0.5
 #: m and rad between where a character has come back and its person, from which the person's motion is
 #: moved there.
 HERE_M, TURNED = 0.25, 0.5
+#: s after a recovery motion began in which it is not lost.
+GRACE_S = 0.3
 
 
 class Body(NamedTuple):
@@ -58,6 +60,9 @@ class Character:
         doing: `EASE`, `TRACKS`, `FALLS` or `RETURNS`.
         lost: how often it lost its goal; `falls`, how often it lay then; `recovered`, how often it was
             back.
+        anew: whether the last frame begins a motion from where the body is, so that no frames before it
+            count any more.
+        still: whether the last two frames were the same.
     """
 
     def __init__(
@@ -67,17 +72,19 @@ class Character:
         executor: Executor | None = None,
         move: Callable[[Tensor, Tensor], None] | None = None,
     ):
-        self.get_up, self._executor, self._move = get_up, executor, move
+        self.get_up, self._move = get_up, move
         self.ease = get_up.recovery_clips.ease.clone()
         self.ease[:2] = torch.tensor(place, dtype=torch.float64)
         self.doing = EASE
         self.lost = self.falls = self.recovered = 0
         self.last = self.ease.clone()
-        self._from, self._share, self._step = self.last, 1.0, 0
-        self._way: Tensor | None = None
-        self._plan: Future[Tensor] | None = None
+        self.anew, self.still = False, True
+        self._way, self._passing, self._step = Way(get_up, executor), Passing(get_up.rate_hz), 0
         self._grace = 0
         self._person: Tensor | None = None
+        self._drift = torch.zeros(2, dtype=torch.float64)
+        # Whether it is lost and not back yet, whether the person leapt, and how the last step broke.
+        self._lost, self._jumped, self._was = False, False, ""
 
     def on_move(self, move: Callable[[Tensor, Tensor], None]) -> None:
         """Says what moves the person's motion, see `move`."""
@@ -86,81 +93,149 @@ class Character:
     def begin(self, frame: Tensor) -> None:
         """The character was set down on a frame."""
         self.last, self.doing = frame.clone(), EASE
-        self._way = self._plan = None
+        self._way.leave()
         self._stand(frame)
+        self._drift = torch.zeros(2, dtype=torch.float64)
         self.blend()
 
     def follow(self, frame: Tensor) -> None:
         """The character is on its person's motion already, `frame` the last that its goal knows."""
-        self.last, self.doing, self._share = frame.clone(), TRACKS, 1.0
+        self.last, self.doing = frame.clone(), TRACKS
+        self._passing.end()
 
     def jump(self) -> None:
-        """The person is elsewhere of a sudden: the character stays, and then goes on from there."""
-        if self.doing == TRACKS:
-            self.lost += 1
-            self.doing, self._step, self._way, self._plan = FALLS, 0, None, None
+        """The person is elsewhere of a sudden."""
+        self._jumped = self.doing == TRACKS
 
     def blend(self) -> None:
         """What comes next is passed into from the last frame: a new person, a jump."""
-        self._from, self._share = self.last, 0.0
+        self._passing.begin(self.last, self._drift)
 
-    def next(self, person: Tensor | None, body: Body, lead: int = 0) -> Tensor:
+    def next(self, person: Tensor | None, body: Body, stalled: bool = False) -> Tensor:
         """The goal's next frame `(7 + n)`.
 
         Args:
             person: the person's motion now, None without one.
-            lead: control steps after which the frame is the goal.
+            stalled: nothing new has come of the person, who rests meanwhile.
         """
+        before, self.anew = self.last, False
+        self.last = self._next(person, body, stalled)
+        self._drift = torch.zeros_like(self._drift) if self.anew else self.last[:2] - before[:2]
+        self.still = bool((self.last - before).abs().max() < 1e-9)
+        return self.last
+
+    def _next(self, person: Tensor | None, body: Body, stalled: bool) -> Tensor:
         rate, self._step = self.get_up.rate_hz, self._step + 1
-        speed = self._speed(person)
-        if self.doing in (EASE, TRACKS, RETURNS) and body.off_m > LOST and self._step > self._grace:
-            self.lost += self.doing != RETURNS
-            self.doing, self._step, self._way = FALLS, 0, None
+        step = self._moved(person)
+        stands = float(step.norm()) * rate < STANDS
+        if self.doing != FALLS and body.off_m > LOST and self._step > self._grace:
+            self.lost, self._lost = self.lost + (not self._lost), True
+            self._fall()
         if self.doing == FALLS:
             down = float(body.qpos[2]) < DOWN * float(self.ease[2])
             rests = body.speed < REST or self._step > WAITS_S * rate or not down
-            if rests and self._plan is None:
+            if rests and not self._way.planned:
                 self.falls += down
-                self._begin(person if speed < STANDS else None, body)
-            if self._plan is not None and self._plan.done():
-                self._way, self._plan = self._plan.result(), None
-                self.doing, self._step = RETURNS, 0
-                self._grace = lead + round(0.3 * rate)
-            if self.doing == FALLS:
+                near = person is not None and float((person[:2] - body.qpos[:2]).norm()) < WALKS_M
+                self._way.plan(body.qpos.clone(), person if near and stands else None, body.moves)
+            if not self._sets_out(RETURNS):
                 return self.last
-        if self.doing == RETURNS and self._way is not None:
-            if self._step < len(self._way):
-                self.last = self._way[self._step]
-                return self.last
-            self.recovered += 1
+        if self.doing == RETURNS:
+            if (frame := self._way.next()) is not None:
+                return frame
+            self.recovered, self._lost = self.recovered + self._lost, False
             self._stand(self.last)
-            self.doing, self._way = TRACKS, None
-            self.blend()
-            if person is not None and self._away(person) and self._move is not None:
-                self._move(person, self.last)
-                # What was read is of the old place.
-                return self.last
+            self.doing = TRACKS
+            return self._join(person, step)
+        if stalled and self.doing == TRACKS and float(body.moves.norm()) > STANDS:
+            # It walks to a halt.
+            self._way.plan(body.qpos.clone(), None, body.moves)
+            self.doing = EASE
+            self._stand(self.last)
+        if stalled and self.doing == EASE:
+            person, step = None, torch.zeros_like(step)
         if (person is None) != (self.doing == EASE):
-            if person is None:
-                self._stand(self.last)
+            self._stand(self.last)
             self.doing = EASE if person is None else TRACKS
-            self.blend()
-            if person is not None and self._away(person) and self._move is not None:
-                self._move(person, self.last)
+            self._way.leave()
+            return self._join(person, step)
+        if self.doing == EASE and (self._way.on or self._way.planned):
+            if not self._way.on and not self._sets_out(EASE):
                 return self.last
+            if (frame := self._way.next()) is not None:
+                return frame
+            self._stand(self.last)
+            self._join(None, step)
+        if person is not None and (why := self._broke(stalled)):
+            if why == "leaps":
+                # Whether the person stands there is known a step later.
+                return self._on()
+            if why == "leapt" and stands and self._away(person):
+                self._fall()
+                return self._on()
+            return self._join(person, step)
         target = self.ease if person is None else person
-        if self._share < 1.0:
-            self._share = min(1.0, self._share + 1.0 / (BLEND_S * rate))
-            share = smooth(torch.tensor([self._share], dtype=torch.float64))
-            target = mixed(self._from[None], target[None], share)[0]
-        self.last = target
+        if self._passing.on:
+            target = self._passing.next(target, step)
+            if person is None:
+                self.ease[:2] = target[:2]
+            else:
+                there = person.clone()
+                there[:2] = target[:2]
+                self._put(person, there)
         return target
 
-    def _speed(self, person: Tensor | None) -> float:
+    def _broke(self, stalled: bool) -> str:
+        """Why the person's motion does not go on from what was read of it before; "" where it does."""
+        before, self._was = self._was, "leaps" if self._jumped else "stalls" if stalled else ""
+        self._jumped = False
+        if self._was == "leaps":
+            return self._was
+        if before == "leaps":
+            return "leapt"
+        return "stalled" if before == "stalls" and not stalled else ""
+
+    def _fall(self) -> None:
+        self.doing, self._step = FALLS, 0
+        self._way.leave()
+
+    def _sets_out(self, doing: str) -> bool:
+        """Whether a recovery motion begins now."""
+        if not self._way.begins():
+            return False
+        self.doing, self._step, self.anew = doing, 0, True
+        self._grace = round(GRACE_S * self.get_up.rate_hz)
+        return True
+
+    def _on(self) -> Tensor:
+        """The last frame a step further."""
+        out = self.last.clone()
+        out[:2] += self._drift
+        return out
+
+    def _join(self, person: Tensor | None, step: Tensor) -> Tensor:
+        """Begins to pass into what the person does, or to ease, from how the goal moves."""
+        self.blend()
+        if person is None:
+            return self._on()
+        there = self._on() if self._away(person) else person.clone()
+        there[:2] = self._on()[:2]
+        self._put(person, there)
+        return self._on()
+
+    def _put(self, person: Tensor, there: Tensor) -> None:
+        """Lets the person's motion go on from elsewhere."""
+        if self._move is not None:
+            self._move(person, there)
+        turns = heading_angle(there[3:7]) - heading_angle(person[3:7])
+        self._person = there if abs(turns) < 1e-6 else None
+
+    def _moved(self, person: Tensor | None) -> Tensor:
+        """m `(2)` by which the person's root moved since the last step, wherever it was put since."""
         before, self._person = self._person, person
         if person is None or before is None:
-            return 0.0
-        return float((person[:2] - before[:2]).norm()) * self.get_up.rate_hz
+            return torch.zeros(2, dtype=torch.float64)
+        return person[:2] - before[:2]
 
     def _away(self, person: Tensor) -> bool:
         """Whether a person is elsewhere than the character's goal, or faces another way."""
@@ -173,29 +248,6 @@ class Character:
         ease = facing(self.get_up.recovery_clips.ease, heading_angle(like[3:7]))
         ease[:2] = like[:2]
         self.ease = ease
-
-    def _begin(self, person: Tensor | None, body: Body) -> None:
-        """Plans how to get up: to the person that stands near, else on the spot."""
-        start = body.qpos.clone()
-        near = person is not None and float((person[:2] - start[:2]).norm()) < WALKS_M
-        place = person.clone() if near and person is not None else None
-        moves = body.moves if float(start[2]) >= DOWN * float(self.ease[2]) else None
-        if self._executor is None:
-            self._plan = Future()
-            self._plan.set_result(_planned(self.get_up, start, place, moves))
-        else:
-            self._plan = self._executor.submit(_planned, self.get_up, start, place, moves)
-
-
-def _planned(get_up: GetUpPlanner, start: Tensor, place: Tensor | None, moves: Tensor | None) -> Tensor:
-    """A recovery motion to standing at `place (7 + n)`, on the spot for None."""
-    if place is None:
-        low = float(start[2]) < DOWN * float(get_up.recovery_clips.ease[2])
-        end = get_up.up(start)[-1] if low else start
-        place, moves = end, None
-    stand = facing(get_up.recovery_clips.ease, heading_angle(place[3:7]))
-    stand[:2] = place[:2]
-    return plan_recovery(get_up, start, stand, moves=moves)
 
 
 def tensor(qpos: np.ndarray) -> Tensor:

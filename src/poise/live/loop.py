@@ -17,6 +17,7 @@ from poise.live.config import LiveConfig
 from poise.live.figures import Times, figures
 from poise.live.orders import Orders
 from poise.live.packet import Inbox
+from poise.live.phase import Phase
 from poise.live.world import Seen, World
 from poise.synth.generator import Kinematic
 
@@ -68,6 +69,7 @@ class Live:
         self.commands = self.orders.waiting
         self.rate_hz, self.clock = self.world.rate_hz, clock
         self.behind, self._hurry, self.times = 0, 0, Times()
+        self._phase = Phase(1.0 / self.rate_hz)
 
     @property
     def steps(self) -> int:
@@ -95,6 +97,7 @@ class Live:
                 self._hurry = self.steps + round(HURRIES_S * self.rate_hz)
             due += period
             self.step(now)
+            due += self._phase.shift(due)
 
     def step(self, now_s: float) -> Seen | None:
         """One control step at `now_s`; None while paused."""
@@ -111,7 +114,9 @@ class Live:
             self.people.tidy(now_s)
         for show in self.shows:
             show.show(seen, self)
-        self.times.add(began, self.clock(), [t for line in packets.values() for t, _ in line[-1:]])
+        arrived = [t for line in packets.values() for t, _ in line[-1:]]
+        self._phase.add(arrived)
+        self.times.add(began, self.clock(), arrived)
         return seen
 
     def figures(self) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -27,8 +29,9 @@ from poise.live.sources.vmc import VmcSource
 from poise.motion import Clip
 from poise.synth.generator import Kinematic
 
-#: Steps that are made at least.
-FEWEST = 3
+#: Steps that are made at least; s for which a thread beside the loop has the interpreter, where both
+#: want it.
+FEWEST, SWITCH_S = 3, 0.0005
 
 
 @dataclass(frozen=True)
@@ -113,14 +116,22 @@ class Session:
     def run(self, until_s: float | None = None) -> None:
         """Steps in real time, until a moment of `time.perf_counter` where one is given; on a machine
         that is busy, at least so many steps that there is something to record."""
-        live = self.live
-        self.live.run(
-            lambda: (
-                until_s is not None
-                and time.perf_counter() >= until_s
-                and (live.steps >= FEWEST or live.paused)
+        live, usual = self.live, sys.getswitchinterval()
+        # What is there stays, and need not be looked through for garbage again and again.
+        gc.collect()
+        gc.freeze()
+        sys.setswitchinterval(SWITCH_S)
+        try:
+            live.run(
+                lambda: (
+                    until_s is not None
+                    and time.perf_counter() >= until_s
+                    and (live.steps >= FEWEST or live.paused)
+                )
             )
-        )
+        finally:
+            sys.setswitchinterval(usual)
+            gc.unfreeze()
 
     def close(self) -> list[Path]:
         """Ends everything; the files of the recordings."""

@@ -67,6 +67,7 @@ class World:
         characters: what each is to do.
         hands: what pushes them.
         yielding: their dials of compliance.
+        lead: frames by which each one's goal is behind the newest that is known.
         resets: how often the simulation went bad and all were set down anew.
         hurries: whether there is no time to look ahead; all act at once then.
         looked: control steps in which a character looked ahead.
@@ -113,7 +114,8 @@ class World:
         spots = [(APART_M * (k // wide), APART_M * (k % wide)) for k in range(count)]
         self.characters = [Character(planner, spot, executor) for spot in spots]
         self.substeps, self.resets, self.steps = sim.substeps, 0, 0
-        self.lead, self.hurries, self.looked = [1] * count, False, 0
+        self.lead, self._full = [1] * count, 1
+        self.hurries, self.looked = False, 0
         self._act = tracker.policy.act
         self._ahead: Ahead | None = None
         self._look: Callable[[], Ahead] = lambda: (AheadBeside if beside else AheadAtOnce)(tracker, seed)
@@ -183,12 +185,27 @@ class World:
             self._moves[character],
         )
 
+    def set_lead(self, lead: int) -> None:
+        """By how many frames goals are behind the newest ones."""
+        self.lead, self._full = [lead] * self.count, lead
+
+    def _lead_on(self) -> None:
+        """A motion that begins from where a body is has nothing before it, and counts at once; what lies
+        ahead of it grows again while it stands still."""
+        for k, character in enumerate(self.characters):
+            if character.anew:
+                self.goal.clear(torch.tensor([k]))
+                self.lead[k] = 1
+            elif character.still:
+                self.lead[k] = min(self._full, self.lead[k] + 1)
+
     def step(self, frames: Tensor, places: Tensor | None = None) -> Seen:
         """One control step toward the frames `(K, 7 + n)`, the newest that the goals know.
 
         places: see `StreamGoal.push`.
         """
         env, goal = self.env, self.goal
+        self._lead_on()
         goal.push(frames, places=places)
         lead = torch.tensor(self.lead)
         goal.at.copy_((goal.count - 1 - lead).clamp_min(0))

@@ -174,7 +174,10 @@ class BufferedGoal(Goal):
         at, known = self.at[ids], self.count[ids] - 1
         # Where nothing follows, what `ahead` tells, which is extrapolated.
         last = torch.maximum(known, at + 1)
-        return torch.stack([self.packed(ids, torch.minimum(at + k, last)) for k in steps], 1)
+        index = torch.minimum(at[:, None] + torch.tensor(steps, device=self.device), last[:, None])
+        # All of them at once: each look-up costs as much for one frame as for many.
+        found = self.packed(ids.repeat_interleave(len(steps)), index.flatten())
+        return found.view(len(ids), len(steps), -1)
 
     def targets(self) -> tuple[Tensor, Tensor]:
         self._look()
