@@ -71,6 +71,8 @@ class LedGoal(Goal):
         self.get_up = GetUpPlanner(recovery_clips, self.humanoid.table, self.rate_hz)
         self.frame, self.lost = goal.frame.clone(), list[tuple[int, int]]()
         self.doing, self._since = torch.zeros_like(goal.clip), torch.zeros_like(goal.clip)
+        # How many recovery motions in a row each world has lost.
+        self._vain = torch.zeros_like(goal.clip)
         # What each world follows: its recovery motion, if it is on one, and the frame of that or of its
         # clip. Recovery motions lie one after another in a table that grows.
         self._on, self.at = torch.zeros_like(goal.clip, dtype=torch.bool), goal.frame.clone()
@@ -98,6 +100,7 @@ class LedGoal(Goal):
     def _begin(self, ids: Tensor) -> None:
         self.frame[ids] = self.at[ids] = self.goal.frame[ids]
         self.doing[ids], self._since[ids], self._on[ids] = TRACKS, 0, False
+        self._vain[ids] = 0
 
     def start(self, ids: Tensor | None) -> Start:
         ids = torch.arange(self.num_envs, device=self.device) if ids is None else ids
@@ -162,10 +165,12 @@ class LedGoal(Goal):
         ref = self.layout.unpacked(self.now()).pos
         off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
         lost = off & (returns | (tracks & self.returns))
+        self._vain[returns & off] += 1
         self.lost += [(i, int(self.frame[i])) for i in (lost & tracks).nonzero().squeeze(-1).tolist()]
         ends = torch.where(self._on, self._length, self.reference.length[self.goal.clip]) - 1
         back = returns & ~lost & (self.at >= ends)
         self.doing[back], self._on[back], self.at[back] = TRACKS, False, self.frame[back]
+        self._vain[back] = 0
         more = self.goal.clip < len(self.reference.length) - 1
         over = tracks & ~lost & (self.at >= ends) & more & (self.chained and self.plans)
         self.goal.clip[over] += 1
@@ -226,7 +231,8 @@ class LedGoal(Goal):
         if self.frame[world] or not self.chained:
             self.frame[world] = entry(self.get_up, own, clip, int(self.frame[world]), qpos)
         place, velocity = own.coordinates(self.goal.clip[one], self.frame[one])
-        way = way_into(self.get_up, qpos, place[0].cpu(), velocity[0].cpu(), moves)
+        there, again = (place[0].cpu(), velocity[0].cpu()), int(self._vain[world])
+        way = way_into(self.get_up, qpos, *there, moves, again)
         found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"recovery {world}"])
         return found.to(self.device)
 
@@ -249,7 +255,7 @@ class LedGoal(Goal):
     def _own(self) -> dict[str, Tensor]:
         return {
             "own_frame": self.frame, "doing": self.doing, "since": self._since, "on": self._on,
-            "at": self.at, "first": self._first, "length": self._length,
+            "at": self.at, "first": self._first, "length": self._length, "vain": self._vain,
         }  # fmt: skip
 
     def rows(self) -> dict[str, Tensor]:

@@ -40,14 +40,19 @@ def entry(get_up: GetUpPlanner, motions: Reference, clip: int, frame: int, qpos:
 
 
 def way_into(
-    get_up: GetUpPlanner, qpos: Tensor, place: Tensor, velocity: Tensor, moves: Tensor | None = None
+    get_up: GetUpPlanner,
+    qpos: Tensor,
+    place: Tensor,
+    velocity: Tensor,
+    moves: Tensor | None = None,
+    again: int = 0,
 ) -> Tensor:
     """The frames `(T, 7 + n)` from `qpos (7 + n)` to `place (7 + n)`, at which a motion moves with
     `velocity (6 + n)`; over standing at ease for `CALM_S` before it.
 
-    moves: m/s `(2)`, how the body moves at the start.
+    moves, again: see `plan_recovery`.
     """
     into = run_up(get_up, place, velocity)
-    way = plan_recovery(get_up, qpos, into[0], moves=moves)
+    way = plan_recovery(get_up, qpos, into[0], moves=moves, again=again)
     way = way[: len(way) - round((STAY_S - CALM_S) * get_up.rate_hz)]
     return torch.cat((way[:-1], get_up.blend(way[-1], into[0]), into[1:]))

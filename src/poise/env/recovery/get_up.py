@@ -41,22 +41,31 @@ class GetUpPlanner:
             height = up.pos[:, 0, 2]
             up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
 
-    def up(self, start: Tensor) -> Tensor:
-        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up."""
+    def up(self, start: Tensor, again: int = 0) -> Tensor:
+        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up.
+
+        again: how often that was lost in a row. What was lost is tried half as fast at its begin, and
+            then by the clip that is next nearest: the same would be lost the same way for ever.
+        """
         lying, clips = Poses(self.table, start[None]), self.ups
         costs = [
             # Of two frames alike the later one is up sooner.
             lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
             for up, clip in zip(self._ups, clips, strict=True)
         ]
-        which = min(range(len(clips)), key=lambda k: float(costs[k].min()))
+        nearest = sorted(range(len(clips)), key=lambda k: float(costs[k].min()))
+        which, slower = nearest[again // 2 % len(clips)], 1 + again % 2
         entry = int(self._ups[which].rows[int(costs[which].argmin())])
         clip = self._laid(start, clips[which][entry:])
-        return torch.cat((self._lifted(self.blend(start, clip[0]))[:-1], clip))
+        return torch.cat((self._lifted(self.blend(start, clip[0], slower))[:-1], clip))
 
-    def blend(self, a: Tensor, b: Tensor) -> Tensor:
-        """`(T, 7 + n)` from one pose to another, the longer the farther they are apart."""
-        return self.out_of(a, b.expand(self._between(a, b), -1))
+    def blend(self, a: Tensor, b: Tensor, slower: int = 1) -> Tensor:
+        """`(T, 7 + n)` from one pose to another, the longer the farther they are apart.
+
+        slower: factor of the time that it takes.
+        """
+        frames = self.out_of(a, b.expand(self._between(a, b), -1))
+        return frames if slower == 1 else _sooner(frames, 1.0 / slower)
 
     def out_of(self, pose: Tensor, frames: Tensor, moves: Tensor | None = None) -> Tensor:
         """Frames of which the first ones come out of a pose, more of them the farther it is apart.
