@@ -47,6 +47,24 @@ def test_a_library_knows_a_walk_and_how_to_get_up(built: Built) -> None:
     assert up[0, 2] < 0.4 * height and up[-1, 2] > 0.9 * height
 
 
+def test_what_was_lost_is_tried_in_another_way(built: Built) -> None:
+    """Slower at its begin, then by the clip that is next nearest, and round again."""
+    reference, planner = built
+    one = planner.recovery_clips.ups[0]
+    planner = GetUpPlanner(
+        replace(planner.recovery_clips, ups=(one, one.repeat_interleave(2, 0))),
+        reference.humanoid.table, reference.rate_hz,
+    )  # fmt: skip
+    lies = one[0].clone()
+    lies[7:] += 0.4
+    ways = [planner.up(lies, again) for again in range(5)]
+    lengths = [len(way) for way in ways]
+    assert lengths[1] > lengths[0] and lengths[3] > lengths[2] and torch.equal(ways[4], ways[0])
+    assert lengths[2] != lengths[0]
+    for way in ways:
+        assert torch.allclose(way[0, 7:], lies[7:]) and torch.allclose(way[-1, 7:], one[-1, 7:])
+
+
 def test_nobody_walks_or_nobody_gets_up() -> None:
     for clips in (
         [swing(1.2, speed=1.0, name="walk"), swing(1.2, name="calm")],
