@@ -11,12 +11,11 @@ is written with `poise.jobs.tracker.save_tracker` and measured by `perpetual.py`
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 from dataclasses import replace
 from pathlib import Path
 
-from tracker import BACKWARDS, HELD_OUT, SIXTY, TWINS
+from tracker import BACKWARDS, HELD_OUT, SIXTY, TWINS, parser_of
 
 from poise.body import BodyConfig
 from poise.cli.perpetual_report import shown
@@ -48,17 +47,11 @@ def longer(earlier: Perpetual, step: float, seed: int) -> Perpetual:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--library", type=Path, required=True)
+    parser = parser_of(__doc__, minutes=96.0)
     parser.add_argument("--teacher", type=Path, default=SHIPPED, help="a policy for rotations")
     parser.add_argument("--from", type=Path, dest="earlier", help="the policy of keypoints that goes on")
     parser.add_argument("--step", type=float, default=1.5e-5, help="of a policy that goes on")
     parser.add_argument("--rounds", type=int, default=24, help="of teaching, beside the teacher's own")
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, default=96.0)
-    parser.add_argument("--threads", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resume", action="store_true")
     a = parser.parse_args()
     teacher = open_run(a.earlier or a.teacher).tracker
     settings = (

@@ -91,9 +91,20 @@ def finer(
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def parser_of(about: str, minutes: float) -> argparse.ArgumentParser:
+    """The options that all trainings of a policy that comes with Poise have."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("--library", type=Path, required=True)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--minutes", type=float, default=minutes)
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--resume", action="store_true")
+    return parser
+
+
+def main() -> None:
+    parser = parser_of(__doc__, minutes=60.0)
     parser.add_argument("--onto", type=Path, help="a clip on the skeleton of the body that is made")
     parser.add_argument("--from", type=Path, dest="earlier", help="the policy that goes on")
     parser.add_argument("--step", type=float, default=1e-4)
@@ -101,11 +112,6 @@ def main() -> None:
     parser.add_argument("--filter", type=float, default=0.0)
     parser.add_argument("--hips", action="store_true")
     parser.add_argument("--recovery", type=float, default=0.4)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--threads", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resume", action="store_true")
     a = parser.parse_args()
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")

@@ -8,8 +8,9 @@ import torch
 from poise.kin.doctor.doctor import examine
 from poise.motion import Clip
 from poise.spatial import forward_kinematics
-from poise.synth.footsteps import planned, stepped
+from poise.synth.footsteps import stepped
 from poise.synth.limits import Motion, excess, fastest, standing_heights
+from poise.synth.step_plans import planned
 from toy_human import swing
 
 FPS = 30.0

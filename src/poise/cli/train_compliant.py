@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli.answer import Answer
-from poise.cli.console import say
 from poise.cli.output import claimed
 from poise.cli.progress import training as progress
 from poise.cli.progress import working
-from poise.cli.training import held_already
+from poise.cli.training import finished, refuse_held
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 
@@ -27,8 +26,7 @@ def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
 
     if training.device != "cpu":
         raise PoiseError("the recipe compliant trains on the CPU", hint="Leave --device out")
-    if (out / RUN_FILE).exists() and not training.resume:
-        raise held_already(out)
+    refuse_held(out, RUN_FILE, training)
     with working("opening the policy"):
         tracker = open_run(None).tracker
     until = Until(minutes=training.minutes, iterations=training.iterations)
@@ -36,11 +34,6 @@ def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
         result = train(config, tracker, out, until, show, training.threads)
     if result.interrupted:
         return interrupted(out, again)
-    last = result.last
-    if last is None:
-        say(f"{out} had reached its limit before; nothing was trained.")
-    else:
-        say(f"Trained {last.seconds:.0f} s, {last.samples:,} samples")
-        say(f"poise play compliant {config.scene} --learned {out} -o OUT shows it")
-    told = None if last is None else {"seconds": last.seconds, "samples": last.samples}
+    then = f"poise play compliant {config.scene} --learned {out} -o OUT shows it"
+    told = finished(out, result.last, "limit", "samples", then)
     return Answer(told, {"run": out, "checkpoint": out / LATEST})

@@ -11,7 +11,7 @@ from poise.cli.library_options import Library
 from poise.cli.output import claimed
 from poise.cli.progress import showing
 from poise.cli.train_inbetween import times
-from poise.cli.training import held_already
+from poise.cli.training import finished, refuse_held
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 from poise.machine import cores
@@ -43,8 +43,7 @@ def run(
             hint = "Leave it out; --from POLICY chooses the body" if name == "onto" else "Leave it out"
             raise PoiseError(f"the recipe endless has no --{name}", hint=hint)
     labels = read_labels(folder)
-    if (out / RUN_FILE).exists() and not training.resume:
-        raise held_already(out)
+    refuse_held(out, RUN_FILE, training)
     torch.set_num_threads(training.threads or cores())
     if training.iterations is not None:
         from poise.cli.settings import configured
@@ -66,12 +65,8 @@ def run(
         )  # fmt: skip
     if stopped:
         return interrupted(out, again)
-    if stats is None:
-        say(f"{out} had reached its last step before; nothing was trained.")
-    else:
-        say(f"Trained {stats.seconds:.0f} s, {stats.samples:,} windows")
-        say(f"poise dream --generator {out} -o OUT lets a character go about by it")
-    result = None if stats is None else {"seconds": stats.seconds, "samples": stats.samples}
+    then = f"poise dream --generator {out} -o OUT lets a character go about by it"
+    result = finished(out, stats, "last step", "windows", then)
     return Answer(result, {"run": out, "generator": out / GENERATOR})
 
 

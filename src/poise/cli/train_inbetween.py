@@ -14,7 +14,7 @@ from poise.cli.library_options import Library
 from poise.cli.output import claimed
 from poise.cli.progress import clock, showing
 from poise.cli.settings import derived
-from poise.cli.training import held_already
+from poise.cli.training import finished, refuse_held
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
 from poise.machine import cores
@@ -48,8 +48,7 @@ def run(library: Library, config: Inbetween, out: Path, training: Training, agai
     folder = library.folder("inbetween")
     if library.backwards:
         raise PoiseError("the recipe inbetween has no --backwards", hint="Leave it out")
-    if (out / RUN_FILE).exists() and not training.resume:
-        raise held_already(out)
+    refuse_held(out, RUN_FILE, training)
     torch.set_num_threads(training.threads or cores())
     dropout = config.between_training.dropout
     if not 0 <= dropout < 1:
@@ -76,11 +75,7 @@ def run(library: Library, config: Inbetween, out: Path, training: Training, agai
         )
     if stopped:
         return interrupted(out, again)
-    if stats is None:
-        say(f"{out} had reached its last step before; nothing was trained.")
-    else:
-        say(f"Trained {stats.seconds:.0f} s, {stats.samples:,} windows")
-    result = None if stats is None else {"seconds": stats.seconds, "samples": stats.samples}
+    result = finished(out, stats, "last step", "windows")
     return Answer(result, {"run": out}, task.notes)
 
 

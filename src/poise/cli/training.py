@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from poise.cli import progress
 from poise.cli.answer import INTERRUPTED, Answer
@@ -112,6 +112,38 @@ class Job:
 def held_already(out: Path) -> PoiseError:
     """What is said of a run that is there and was not asked to go on."""
     return PoiseError("already holds a run", out, "Go on with --resume, or choose another folder")
+
+
+def refuse_held(out: Path, run_file: str, training: Training) -> None:
+    """Refuses a folder that holds a run, unless that is to go on."""
+    if (out / run_file).exists() and not training.resume:
+        raise held_already(out)
+
+
+class Trained(Protocol):
+    """What a training says of itself in the end."""
+
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def samples(self) -> int: ...
+
+
+def finished(
+    out: Path, last: Trained | None, limit: str, what: str, then: str = ""
+) -> dict[str, float] | None:
+    """Says how a training of one process ended, and what to do next; gives that for --json.
+
+    last: None where nothing was trained. limit: what ended it before. what: `samples` are counted.
+    then: the command that uses the result.
+    """
+    if last is None:
+        say(f"{out} had reached its {limit} before; nothing was trained.")
+        return None
+    say(f"Trained {last.seconds:.0f} s, {last.samples:,} {what}")
+    if then:
+        say(then)
+    return {"seconds": last.seconds, "samples": last.samples}
 
 
 def stopped(run: Path, again: str, where: str = "") -> Answer:

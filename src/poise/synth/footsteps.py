@@ -1,15 +1,13 @@
 """Feet led over a gap from the places that its keyframes give them: planted, or in a swing, and nothing
 between. For gaps in which feet that the network holds could not be where they must be in time.
 
-Each foot is known by its toes, about which it rolls. A plan (`planned`) says which foot swings when;
-between swings the toes do not move at all.
+A plan (`step_plans`) says which foot swings when, `foot_paths` how it gets there; legs follow here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,28 +18,11 @@ from poise.errors import PoiseError
 from poise.kin.limbs import limb_of, match_positions
 from poise.kin.series import smooth_lift
 from poise.motion import Skeleton
-from poise.spatial import (
-    axis_angle_to_quat,
-    forward_kinematics,
-    normalize,
-    quat_between,
-    quat_mul,
-    quat_rotate,
-    shortest_arc,
-    slerp,
-)
-from poise.synth.flight import hermite
+from poise.spatial import forward_kinematics, quat_between, quat_mul
+from poise.synth.foot_paths import ROLL_S, Way, ends_of, path_of, smooth
 from poise.synth.limits import Motion
-from poise.synth.steps import CLEAR_M, LEAST_M, SWING_S, SWING_S_PER_M
+from poise.synth.step_plans import Swing, planned
 
-#: m above where feet stand from which on toes and ankle are in the air.
-UP_M = 0.04
-#: m that one step goes at most, and s that it has at least; most steps of a gap.
-STRIDE_M, LEAST_S, MOST = 1.7, 0.22, 12
-#: m; steps have time by their length and this.
-SHORT_M = 0.4
-#: rad by which a heel rises before a step, s in which it does, and in which a foot gets level; at least.
-ROLL, ROLL_S, LEAST_ROLL_S = 0.4, 0.12, 0.08
 #: The share of its length that a leg is stretched to, and m that hips come down for it at most.
 REACH, DOWN_M = 0.985, 0.2
 #: m/s that feet should not be faster than, and what a step more costs, as a share of too much.
@@ -49,93 +30,6 @@ FAST, STEP_COST = 6.0, 0.02
 #: Plans that are carried out at most.
 TRIED = 4
 _SOFT = 0.003
-
-
-class Swing(NamedTuple):
-    """One foot in the air from `start` to `stop` s."""
-
-    foot: int
-    start: float
-    stop: float
-
-
-class Ends(NamedTuple):
-    """How feet are in both keyframes: toes `(2, K, 3)` m, rotations `(2, K, 4)` in the world, whether
-    each is in the air `(2, K)`, and where the toes of a foot that is level there would be `(2, K, 3)`,
-    with its rotation `(2, K, 4)`."""
-
-    toe: Tensor
-    quat: Tensor
-    up: Tensor
-    level_toe: Tensor
-    level_quat: Tensor
-
-
-class _Way(NamedTuple):
-    """Ankle `(T, 3)` m and rotation `(T, 4)` of a foot, and that which it had if no heel rose."""
-
-    ankle: Tensor
-    turn: Tensor
-    flat: Tensor
-
-
-def planned(
-    ways: Sequence[float], up: Tensor, seconds: float, first: int, more: tuple[int, int] = (0, 0)
-) -> tuple[Swing, ...] | None:
-    """Which foot swings when, as few steps as there may be; None where two feet cannot walk it.
-
-    Args:
-        ways: m that either foot must go. up: `(2, 2)` bool, in the air in either keyframe, by foot.
-        first: the foot that steps first. more: steps more than it takes, of either foot.
-    """
-    if bool(up.all(1).any()):
-        return None
-    need = [
-        max(int(np.ceil(way / STRIDE_M)) if way > LEAST_M else 0, int(up[0, k]), int(up[1, k]))
-        for k, way in enumerate(ways)
-    ]
-    # A foot that is in the air at both ends comes down between them, if there is time.
-    need = [
-        m + 1 if bool(up[:, k].all()) and m < 2 and seconds > 2 * SWING_S else m
-        for k, m in enumerate(need)
-    ]
-    need = [m + x for m, x in zip(need, more, strict=True)]
-    for n in range(MOST + 1):
-        order = [first if i % 2 == 0 else 1 - first for i in range(n)]
-        fits = all(order.count(k) >= need[k] for k in (0, 1))
-        starts = not bool(up[0].any()) or (n > 0 and bool(up[0, order[0]]))
-        ends = not bool(up[1].any()) or (n > 0 and bool(up[1, order[-1]]))
-        if fits and starts and ends:
-            return _timed(order, ways, up, seconds)
-    return None
-
-
-def _timed(
-    order: list[int], ways: Sequence[float], up: Tensor, seconds: float
-) -> tuple[Swing, ...] | None:
-    n = len(order)
-    # A longer step has more of the time, one that is under way in a keyframe about half of it.
-    shares = [SHORT_M + ways[k] / order.count(k) for k in order]
-    if n and bool(up[0].any()):
-        shares[0] *= 0.6
-    if n and bool(up[1].any()):
-        shares[-1] *= 0.6
-    slot = seconds / max(sum(shares), 1e-9)
-    if (n and slot * min(shares) < 0.6 * LEAST_S) or seconds < n * LEAST_S:
-        return None
-    out, at = [], 0.0
-    for i, (foot, share) in enumerate(zip(order, shares, strict=True)):
-        each = ways[foot] / order.count(foot)
-        whole = slot * share
-        lasts = min(0.98 * whole, SWING_S + SWING_S_PER_M * each)
-        start = at + 0.5 * (whole - lasts)
-        if i == 0 and bool(up[0].any()):
-            start = 0.0
-        if i == n - 1 and bool(up[1].any()):
-            start = seconds - lasts
-        out.append(Swing(foot, start, start + lasts))
-        at += whole
-    return tuple(out)
 
 
 def stepped(
@@ -166,7 +60,7 @@ def stepped(
     offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
     pos, quat = forward_kinematics(skeleton.parents, offsets, root, rot)
     soles = offsets[[toes[a] for a in ankles]]
-    ends = _ends(pos[[0, -1]], quat[[0, -1]], ankles, [toes[a] for a in ankles], soles, floor)
+    ends = ends_of(pos[[0, -1]], quat[[0, -1]], ankles, [toes[a] for a in ankles], soles, floor)
     seconds = (len(root) - 1) / fps
     ways = [float(w[:2].norm()) for w in ends.level_toe[1] - ends.level_toe[0]]
     past_toes = None
@@ -175,7 +69,7 @@ def stepped(
         past_toes = [(pos[0, toes[a]] - was[toes[a]]) * fps for a in ankles]
     t = torch.arange(len(root), dtype=rot.dtype) / fps
     tried: set[tuple[Swing, ...]] = set()
-    ways_to_go: list[tuple[float, list[_Way]]] = []
+    ways_to_go: list[tuple[float, list[Way]]] = []
     for first, *more in product((0, 1), (0, 1), (0, 1)):
         plan = planned(ways, ends.up, seconds, first, (more[0], more[1]))
         if plan is None or plan in tried:
@@ -185,7 +79,7 @@ def stepped(
         for k in range(2):
             mine = [s for s in plan if s.foot == k]
             leaves = None if past_toes is None else past_toes[k]
-            paths.append(_path(t, k, mine, ends, soles[k], leaves))
+            paths.append(path_of(t, k, mine, ends, soles[k], leaves))
         cost = _cost(skeleton, pos, ankles, paths, fps) + STEP_COST * len(plan)
         ways_to_go.append((cost, paths))
     best: tuple[float, Motion] | None = None
@@ -201,7 +95,7 @@ def stepped(
 
 def _walked(
     skeleton: Skeleton, motion: Motion, pos: Tensor, quat: Tensor, ankles: Sequence[int],
-    toes: Mapping[int, int], paths: Sequence[_Way], fps: float,
+    toes: Mapping[int, int], paths: Sequence[Way], fps: float,
 ) -> Motion:  # fmt: skip
     """The motion with its feet on their paths."""
     root, rot = motion[0], motion[1].clone()
@@ -218,105 +112,8 @@ def _walked(
     return root, out
 
 
-def _ends(
-    pos: Tensor, quat: Tensor, ankles: Sequence[int], toes: Sequence[int], soles: Tensor,
-    floor: tuple[float, float],
-) -> Ends:  # fmt: skip
-    """The feet of both keyframes, `(2, J, 3)` m and `(2, J, 4)`."""
-    tip, turn = pos[:, list(toes)], quat[:, list(ankles)]
-    off = pos[:, list(ankles), 2] - floor[0], tip[..., 2] - floor[1]
-    up = torch.minimum(*off) > UP_M
-    # A level foot points where it does, with its toes as much under the ankle as those that stand.
-    way = tip - pos[:, list(ankles)]
-    drop = min(max(floor[0] - floor[1], 0.0), 0.9 * float(soles.norm(dim=-1).min()))
-    length = way.norm(dim=-1, keepdim=True)
-    flat = normalize(way * way.new_tensor((1.0, 1.0, 0.0))) * (length.square() - drop**2).sqrt()
-    level = flat - way.new_tensor((0.0, 0.0, drop))
-    level_quat = quat_mul(shortest_arc(way, level), turn)
-    # It gets level about its heel where that stands, about its toes otherwise.
-    on_heel = (off[0] < off[1]).unsqueeze(-1)
-    level_toe = torch.where(on_heel, pos[:, list(ankles)] + level, tip)
-    return Ends(tip, turn, up, level_toe, level_quat)
-
-
-def _path(
-    t: Tensor, k: int, swings: Sequence[Swing], ends: Ends, sole: Tensor, leaves: Tensor | None
-) -> _Way:
-    """The path of one foot; toes are at `sole (3,)` m in its own frame, which leave at `leaves` m/s."""
-    n, seconds = len(swings), float(t[-1])
-    up = bool(ends.up[0, k]), bool(ends.up[1, k])
-    share = torch.arange(n + 1, dtype=t.dtype)[:, None] / max(n, 1)
-    places = torch.lerp(ends.level_toe[0, k], ends.level_toe[1, k], share)
-    places[:, 2] = torch.minimum(places[:, 2], ends.level_toe[:, :, 2].min() + 0.5 * UP_M)
-    turns = slerp(
-        ends.level_quat[0, k].expand(n + 1, 4), ends.level_quat[1, k].expand(n + 1, 4), share[:, 0]
-    )
-    if up[0]:
-        places[0], turns[0] = ends.toe[0, k], ends.quat[0, k]
-    if up[1]:
-        places[-1], turns[-1] = ends.toe[1, k], ends.quat[1, k]
-    if n == 0:
-        u = _smooth(t / max(seconds, 1e-9))[:, None]
-        tip = torch.lerp(ends.level_toe[0, k], ends.level_toe[1, k], u)
-        turn = slerp(
-            ends.level_quat[0, k].expand(len(t), 4), ends.level_quat[1, k].expand(len(t), 4), u[:, 0]
-        )
-    else:
-        tip, turn = places[:1].expand(len(t), 3).clone(), turns[:1].expand(len(t), 4).clone()
-    flat = turn
-    for i, swing in enumerate(swings):
-        if not (i == 0 and up[0]):
-            tilt = ROLL * (1.0 + (t - swing.start) / ROLL_S).clamp(0.0, 1.0).square()
-            rolled = quat_mul(axis_angle_to_quat(_left(turn, sole), tilt), turn)
-            turn = torch.where((t <= swing.start)[:, None], rolled, turn)
-        lasts = swing.stop - swing.start
-        u = ((t - swing.start) / lasts).clamp(0.0, 1.0)
-        here, there = places[i], places[i + 1]
-        start = torch.zeros(3, dtype=t.dtype)
-        if i == 0 and up[0] and leaves is not None:
-            start = leaves * t.new_tensor((1.0, 1.0, 0.0))
-        stop = 1.5 * (there - here) if i == n - 1 and up[1] else torch.zeros(3, dtype=t.dtype)
-        swung = hermite(u[:, None], here, there, start * lasts, stop * t.new_tensor((1.0, 1.0, 0.0)))
-        clear = CLEAR_M * torch.sin(torch.pi * u).square()
-        swung = swung + torch.stack((0.0 * clear, 0.0 * clear, clear), -1)
-        at_start = turn[int((t <= swing.start + 1e-9).nonzero()[-1])]
-        turned = slerp(at_start.expand(len(t), 4), turns[i + 1].expand(len(t), 4), _smooth(u))
-        later = (t > swing.start)[:, None]
-        tip, turn = torch.where(later, swung, tip), torch.where(later, turned, turn)
-        even = slerp(turns[i].expand(len(t), 4), turns[i + 1].expand(len(t), 4), _smooth(u))
-        flat = torch.where(later, even, flat)
-    tip, flat = _from_and_to(t, k, swings, up, ends, tip, flat)
-    turn = _from_and_to(t, k, swings, up, ends, tip, turn)[1]
-    return _Way(tip - quat_rotate(turn, sole.expand_as(tip)), turn, flat)
-
-
-def _from_and_to(
-    t: Tensor, k: int, swings: Sequence[Swing], up: tuple[bool, bool], ends: Ends, tip: Tensor,
-    turn: Tensor,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """A foot that stands in a keyframe and is not level there gets level beside it."""
-    seconds = float(t[-1])
-    for end, since in ((0, t), (1, seconds - t)):
-        if up[end]:
-            continue
-        room = seconds / 2
-        if swings:
-            room = swings[0].start if end == 0 else seconds - swings[-1].stop
-        left = 1.0 - _smooth((since / max(min(ROLL_S, room), LEAST_ROLL_S)).clamp(0.0, 1.0))
-        tip = tip + left[:, None] * (ends.toe[end, k] - ends.level_toe[end, k])
-        turn = slerp(turn, ends.quat[end, k].expand_as(turn), left)
-    return tip, turn
-
-
-def _left(turn: Tensor, sole: Tensor) -> Tensor:
-    """`(T, 3)`, the level axis about which a heel rises; toes are at `sole (3,)` in the foot's frame."""
-    way = quat_rotate(turn, sole.expand(len(turn), 3))
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=way.dtype).expand_as(way)
-    return normalize(torch.linalg.cross(up, way))
-
-
 def _cost(
-    skeleton: Skeleton, pos: Tensor, ankles: Sequence[int], paths: Sequence[_Way], fps: float
+    skeleton: Skeleton, pos: Tensor, ankles: Sequence[int], paths: Sequence[Way], fps: float
 ) -> float:
     """How hard a plan is: by how much legs are too short for it, and feet faster than `FAST`."""
     worst = 0.0
@@ -349,9 +146,5 @@ def _lowered(
     t = torch.arange(len(root), dtype=root.dtype) / fps
     near = (torch.minimum(t, t[-1] - t) / ROLL_S).clamp(0.0, 1.0)
     out = root.clone()
-    out[:, 2] -= down * _smooth(near)
+    out[:, 2] -= down * smooth(near)
     return out
-
-
-def _smooth(u: Tensor) -> Tensor:
-    return u * u * (3.0 - 2.0 * u)
