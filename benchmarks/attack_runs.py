@@ -29,7 +29,6 @@ OLD, said, held = strange.OLD, strange.said, strange.held
 NAN = float("nan")
 RESUME = strange.RESUME | {
     "help that is no number": held("env/help", lambda x: x * NAN),
-    "frames behind the clip": held("env/frame", lambda x: x + 1_000_000),
     "iteration -5": said("iteration", to=-5),
     "seconds that are no number": held(
         "trainer/counters", lambda x: x * NAN if x.is_floating_point() else x

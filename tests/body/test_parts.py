@@ -187,3 +187,15 @@ def test_what_is_missing_is_told():
     for tree, message in cases.items():
         with pytest.raises(PoiseError, match=message):
             find_anatomy(skeleton_of(tree))
+
+
+def test_an_arm_that_hangs_on_a_leg_is_told() -> None:
+    tree = (
+        "Hips(LeftUpLeg(LeftLeg(LeftFoot) RightArm(RightForeArm(RightHand)))"
+        " RightUpLeg(RightLeg(RightFoot))"
+        " Spine(Neck(Head) LeftShoulder(LeftArm(LeftForeArm(LeftHand)))))"
+    )
+    with pytest.raises(
+        PoiseError, match="joint 'LeftUpLeg' is the left thigh by its name and the right clav"
+    ):
+        find_anatomy(skeleton_of(tree))
