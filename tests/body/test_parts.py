@@ -10,6 +10,7 @@ import pytest
 from poise.body import find_anatomy, generate_table, make_humanoid
 from poise.errors import PoiseError
 from poise.motion import Skeleton
+from poise.motion.role_words import without_rig
 from toy_human import human
 
 #: Hierarchies as their files have them, and how many spine, neck, head and clavicle parts they hold.
@@ -187,3 +188,34 @@ def test_what_is_missing_is_told():
     for tree, message in cases.items():
         with pytest.raises(PoiseError, match=message):
             find_anatomy(skeleton_of(tree))
+
+
+def test_an_arm_that_hangs_on_a_leg_is_told() -> None:
+    tree = (
+        "Hips(LeftUpLeg(LeftLeg(LeftFoot) RightArm(RightForeArm(RightHand)))"
+        " RightUpLeg(RightLeg(RightFoot))"
+        " Spine(Neck(Head) LeftShoulder(LeftArm(LeftForeArm(LeftHand)))))"
+    )
+    with pytest.raises(
+        PoiseError, match="joint 'LeftUpLeg' is the left thigh by its name and the right clav"
+    ):
+        find_anatomy(skeleton_of(tree))
+
+
+@pytest.mark.parametrize("prefix", ["Armature_", "Armature|", "Armature.001_", "Hero_", "my-rig."])
+def test_the_name_of_a_rig_before_the_joints_names(prefix: str) -> None:
+    """Blender's exporters write "Armature_Hips"; the rig's own joint may stand above all."""
+    for dialect in ("hips beside spine", "unreal", "motionbuilder", "deepmimic"):
+        tree = DIALECTS[dialect][0]
+        named = re.sub(r"[^\s()]+", lambda m: prefix + m.group(), tree)
+        below = f"{prefix.rstrip('_|.')}({named})"
+        plain, *others = (
+            [(p.kind, p.side) for p in find_anatomy(skeleton_of(t)).parts] for t in (tree, named, below)
+        )
+        assert others == [plain, plain]
+
+
+def test_words_that_all_joints_share_stay_where_they_are_a_part() -> None:
+    names = ("Hips", "Spine_1", "Spine_2", "Spine_3", "Spine_4", "Spine_5")
+    assert without_rig(names) == names and without_rig(names[1:]) == names[1:]
+    assert without_rig(("A_x", "A_y")) == ("A_x", "A_y")

@@ -58,6 +58,7 @@ RESUME = {
     "short random state": held("env/rng", lambda x: x[:7]),
     "zero random state": held("env/rng", torch.zeros_like),
     "frames before the clip": held("env/frame", lambda x: x - 1_000_000),
+    "frames behind the clip": held("env/frame", lambda x: x + 1_000_000),
     "short counters": held("trainer/counters", lambda x: x[:3]),
     "negative counters": held("trainer/counters", lambda x: -1 - x),
     "moments of another shape": held("adam/policy/0/exp_avg", lambda x: x[:1]),

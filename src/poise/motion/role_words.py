@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -91,8 +93,12 @@ class NameWords:
 
 @cache
 def name_words(name: str) -> NameWords:
-    """The words in a joint's name: "mixamorig:LeftUpLeg" is left and upleg, "lfemur" left and femur."""
+    """The words in a joint's name: "mixamorig:LeftUpLeg" is left and upleg, "lfemur" left and femur.
+
+    Blender's exports may put the armature's name before it ("Armature_Hips", "Armature|Hips").
+    """
     text = re.split(r"[:|]", name)[-1]
+    text = re.sub(r"^armature(?:[._]?\d+)?[_. -](?=.)", "", text, flags=re.IGNORECASE)
     text = re.sub(r"^(mixamorig|character|cc_base)\d*_?(?=.)", "", text, flags=re.IGNORECASE)
     # Character Creator calls its necks so; they are no twist bones.
     text = re.sub(r"^NeckTwist", "Neck", text)
@@ -109,6 +115,25 @@ def name_words(name: str) -> NameWords:
     core = "".join(bare)
     helper = core in _HELPERS or any(t in _HELPERS for t in tokens)
     return NameWords(side, core, tuple(bare), numbers[-1] if numbers else "", helper)
+
+
+#: What stands between a rig's name and a joint's, and how many joints must share the rig's name.
+_BREAKS, _SHARED = "_.:|- ", 5
+
+
+def without_rig(names: Sequence[str]) -> tuple[str, ...]:
+    """Joints' names without the rig's name before each of them ("Armature_hips", "Hero.001_spine").
+
+    A joint that is called like the rig keeps its name.
+    """
+    below = [n for n in names if not all(other.startswith(n) for other in names)]
+    if len(below) < _SHARED:
+        return tuple(names)
+    shared = os.path.commonprefix(below)  # noqa: RUF071  (letters are wanted)
+    cut = max(shared.rfind(mark) for mark in _BREAKS) + 1
+    if not cut or name_words(shared[:cut]).core in _KNOWN:
+        return tuple(names)
+    return tuple(n[cut:] if n in below and len(n) > cut else n for n in names)
 
 
 def _side_of(token: str) -> tuple[str, str]:
@@ -184,6 +209,12 @@ CONVENTIONS: dict[str, frozenset[str]] = {
 
 def convention_of(names: tuple[str, ...]) -> tuple[str, int]:
     """The naming convention of these names ("" if none), and how many of them it has."""
+    found = _best_convention(names)
+    # A rig's name before the joints' hides a convention; in some it is part of one ("Bip01 Spine").
+    return found if found[0] else _best_convention(without_rig(names))
+
+
+def _best_convention(names: tuple[str, ...]) -> tuple[str, int]:
     bare = {
         re.sub(r"^(mixamorig\d*_?|Character\d*_|DEF-)(?=.)", "", n.rsplit(":", 1)[-1]) for n in names
     }

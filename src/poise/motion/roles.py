@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.role_words import FINGERS, convention_of, name_words
+from poise.motion.role_words import FINGERS, convention_of, name_words, without_rig
 from poise.motion.skeleton import Skeleton, line_to_root
 
 SIDES = ("left", "right")
@@ -170,7 +170,7 @@ class _Finder:
 
     def __init__(self, skeleton: Skeleton, said: Mapping[int, str], written: Mapping[int, str]) -> None:
         self.skeleton, self.said, self.fixed = skeleton, said, {**written, **said}
-        self.words = [name_words(name) for name in skeleton.names]
+        self.words = [name_words(name) for name in without_rig(skeleton.names)]
         self.lengths = np.linalg.norm(skeleton.offsets, axis=-1)
         self.found: dict[str, Role] = {}
         self.lines = [self._line(j) for j in range(len(skeleton)) if not skeleton.children(j)]

@@ -12,6 +12,7 @@ from poise.env.goals.goal import Goal, Group
 from poise.env.plugins import Start
 from poise.env.reference import Reference
 from poise.env.starts import Starts
+from poise.errors import PoiseError
 
 
 class ClipGoal(Goal):
@@ -124,10 +125,22 @@ class ClipGoal(Goal):
         }
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
+        self._check(state["clip"], state["frame"])
         self.seek(state["clip"], state["frame"])
         if "weights" in state:  # States of former versions are without; their odds never changed.
             self.starts.weights = state["weights"]
         self.rng.set_state(state["rng"])
+
+    def _check(self, clip: Tensor, frame: Tensor) -> None:
+        """Refuses places that the clips do not have; those of cyclic clips have no end."""
+        clip, frame = clip.to(self.device), frame.to(self.device)
+        known = (clip >= 0) & (clip < len(self.reference.length)) & (frame >= 0)
+        place = clip * known
+        known &= self.reference.cyclic[place] | (frame <= self.reference.length[place] + 1)
+        if not known.all():
+            at = int((~known).nonzero()[0, 0])
+            what = f"frame {int(frame[at])} of clip {int(clip[at])}"
+            raise PoiseError(f"environment {at} stands at {what}, which is not there")
 
     def rows(self) -> dict[str, Tensor]:
         return {"clip": self.clip, "frame": self.frame}

@@ -10,7 +10,7 @@ import torch
 from poise.body import Anatomy
 from poise.motion import Clip
 from poise.motion.info import sampled
-from poise.motion.role_words import name_words
+from poise.motion.role_words import name_words, without_rig
 from poise.spatial import quat_rotate
 
 #: Share of frames by which the votes of the geometry must agree before they contradict the names.
@@ -61,7 +61,7 @@ def exchanged_sides(clip: Clip, anatomy: Anatomy) -> bool:
 def swap_sides(clip: Clip) -> Clip:
     """The clip with the names of left and right joints exchanged; joints without a twin keep theirs."""
     names = clip.skeleton.names
-    words = [name_words(n) for n in names]
+    words = [name_words(n) for n in without_rig(names)]
     keys = [(w.side, w.tokens, w.number) for w in words]
     twin = {"left": "right", "right": "left"}
     out = list(names)
