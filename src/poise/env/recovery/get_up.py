@@ -41,15 +41,18 @@ class GetUpPlanner:
             height = up.pos[:, 0, 2]
             up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
 
-    def up(self, start: Tensor) -> Tensor:
-        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up."""
+    def up(self, start: Tensor, other: int = 0) -> Tensor:
+        """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up.
+
+        other: the best clip for 0, the next best for 1, and so on round.
+        """
         lying, clips = Poses(self.table, start[None]), self.ups
         costs = [
             # Of two frames alike the later one is up sooner.
             lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
             for up, clip in zip(self._ups, clips, strict=True)
         ]
-        which = min(range(len(clips)), key=lambda k: float(costs[k].min()))
+        which = sorted(range(len(clips)), key=lambda k: float(costs[k].min()))[other % len(clips)]
         entry = int(self._ups[which].rows[int(costs[which].argmin())])
         clip = self._laid(start, clips[which][entry:])
         return torch.cat((self._lifted(self.blend(start, clip[0]))[:-1], clip))

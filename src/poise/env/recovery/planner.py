@@ -54,6 +54,7 @@ def plan_recovery(
     which: int = 0,
     phase: float = 0.0,
     moves: Tensor | None = None,
+    other: int = 0,
 ) -> Tensor:
     """The frames `(T, 7 + n)` from `start (7 + n)` to standing at ease at `place (7 + n)`.
 
@@ -62,10 +63,11 @@ def plan_recovery(
         which: of the walks.
         phase: 0 to 1, where in its cycle the walk begins.
         moves: m/s `(2)`, how the body moves at the start; it walks on if that is how it faces.
+        other: which of the clips that get up, see `GetUpPlanner.up`.
     """
     recovery_clips, body = get_up.recovery_clips, start[None]
     if float(start[2]) < DOWN * float(recovery_clips.ease[2]):
-        body, moves = get_up.up(start), None
+        body, moves = get_up.up(start, other), None
     stand = facing(recovery_clips.ease, heading_angle(body[-1, 3:7]))
     stand[:2] = body[-1, :2]
     pace = 0.0 if moves is None else _pace(get_up, body[-1], moves, which)
