@@ -118,7 +118,7 @@ class Character:
 
         Args:
             person: the person's motion now, None without one.
-            stalled: nothing new has come of the person, who rests meanwhile.
+            stalled: nothing new has come of the person; its pose rests meanwhile.
         """
         before, self.anew = self.last, False
         self.last = self._next(person, body, stalled)

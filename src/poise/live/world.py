@@ -20,7 +20,8 @@ from poise.errors import PoiseError
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
-from poise.live.ahead import Ahead, AheadAtOnce, AheadBeside
+from poise.live.ahead import Ahead, AheadAtOnce
+from poise.live.ahead_beside import AheadBeside
 from poise.live.character import FALLS, Body, Character
 from poise.live.hands import Hands
 from poise.sim import Character as Actor
