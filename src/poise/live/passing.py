@@ -49,7 +49,7 @@ class Passing:
         self._share = 1.0
 
     def next(self, target: Tensor, step: Tensor) -> Tensor:
-        """The next frame toward `target (7 + n)`; the root there moved by `step (2)` m since the last."""
+        """The next frame toward `target (7 + n)`, which moved by `step (2)` m since the last one."""
         apart = float((step - self._drift).norm()) * self.rate_hz
         self._share = min(1.0, self._share + 1.0 / (max(PASSES_S, apart / SPEEDS_UP) * self.rate_hz))
         share = smooth(torch.tensor([self._share], dtype=torch.float64))
