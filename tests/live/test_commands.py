@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
-from poise.live.commands import DEPTH, MOST_BYTES, command, parse, turned
+from poise.live.commands import DEPTH, MOST_BYTES, _shallow, command, parse, turned
 from poise.live.packet import PEOPLE, WAIT, Inbox
 from poise.live.page.guard import ALL, BURST, EACH, Bucket, Guard
 from poise.live.sources.stream import JsonStream
@@ -173,3 +173,36 @@ def test_connections_are_capped() -> None:
     assert guard.enter("c") == "too many connections"
     bucket = Bucket()
     assert sum(bucket.takes() for _ in range(2 * int(BURST))) < 1.2 * BURST
+
+
+def test_depth_is_told_as_by_reading_letter_by_letter() -> None:
+    """The naive twin goes through the letters."""
+
+    def naive(text: str) -> bool:
+        depth, quoted, skip = 0, False, False
+        for c in text:
+            if skip:
+                skip = False
+            elif quoted:
+                skip, quoted = c == "\\", c != '"'
+            elif c == '"':
+                quoted = True
+            elif c in "[{":
+                depth += 1
+                if depth > DEPTH:
+                    return False
+            elif c in "]}":
+                depth -= 1
+        return True
+
+    rng, deep = np.random.default_rng(0), 0
+    for _ in range(4000):
+        text = "".join(rng.choice(list('[[[{{]}"\\a\n'), int(rng.integers(0, 24))))
+        try:
+            _shallow(text)
+            shallow = True
+        except PoiseError:
+            shallow = False
+        assert shallow == naive(text), text
+        deep += not shallow
+    assert 50 < deep < 3950

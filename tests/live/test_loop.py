@@ -267,3 +267,24 @@ def test_characters_take_the_proportions_of_an_avatar(tracker: Tracker, walk: Cl
         assert np.allclose(long, np.linalg.norm([r.pos for r in rows[1:]], axis=-1), atol=2e-3)
         assert long.sum() < 0.85 * whole.sum()
     live.close()
+
+
+def test_whole_turns_of_a_fallen_character_are_left_out(tracker: Tracker, walk: Clip) -> None:
+    """The pose stays where it is, and so do the bodies."""
+    played = Played(tracker, walk, LiveConfig())
+    played.run(0.3)
+    world = played.live.world
+    joint = int((world.humanoid.model.jnt_range[1:, 0] < -8.0).nonzero()[0][0])
+    state = world.rows.state
+    qpos, qvel = state.qpos.clone(), state.qvel.clone()
+    qpos[0, 7 + joint] -= 2 * np.pi
+    world.rows.write(None, qpos, qvel)
+    before = state.xpos.clone()
+    world._unwind()
+    assert world.unwound == 0
+    world.characters[0].doing = FALLS
+    world._unwind()
+    assert world.unwound == 1
+    assert np.allclose(state.qpos[0, 7 + joint], qpos[0, 7 + joint] + 2 * np.pi, atol=1e-5)
+    assert np.allclose(state.xpos, before, atol=1e-4) and np.allclose(state.qvel, qvel)
+    played.live.close()

@@ -126,8 +126,9 @@ class OntoBody:
         return self.where(qpos)
 
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """See `Elsewhere.move`."""
+        """See `Elsewhere.move`. Whole turns that hinges have made before do not count any more."""
         self.where.move(seen, to)
+        self._last = None
 
 
 class Standing:

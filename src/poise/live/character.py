@@ -80,7 +80,7 @@ class Character:
         self.last = self.ease.clone()
         self.anew, self.still = False, True
         self._way, self._passing, self._step = Way(get_up, executor), Passing(get_up.rate_hz), 0
-        self._grace = 0
+        self._grace = self._tries = 0
         self._person: Tensor | None = None
         self._drift = torch.zeros(2, dtype=torch.float64)
         # Whether it is lost and not back yet, whether the person leapt, and how the last step broke.
@@ -116,7 +116,7 @@ class Character:
 
         Args:
             person: the person's motion now, None without one.
-            stalled: nothing new has come of the person, who rests meanwhile.
+            stalled: nothing new has come of the person; its pose rests meanwhile.
         """
         before, self.anew = self.last, False
         self.last = self._next(person, body, stalled)
@@ -137,13 +137,16 @@ class Character:
             if rests and not self._way.planned:
                 self.falls += down
                 near = person is not None and float((person[:2] - body.qpos[:2]).norm()) < WALKS_M
-                self._way.plan(body.qpos.clone(), person if near and stands else None, body.moves)
+                place = person if near and stands else None
+                # What has failed several times is not tried for ever.
+                self._way.plan(body.qpos.clone(), place, body.moves, self._tries)
+                self._tries += down
             if not self._sets_out(RETURNS):
                 return self.last
         if self.doing == RETURNS:
             if (frame := self._way.next()) is not None:
                 return frame
-            self.recovered, self._lost = self.recovered + self._lost, False
+            self.recovered, self._lost, self._tries = self.recovered + self._lost, False, 0
             self._stand(self.last)
             self.doing = TRACKS
             return self._join(person, step)

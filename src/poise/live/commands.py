@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,6 +18,8 @@ from poise.motion import Skeleton
 #: Version of the protocol; bytes and depth of a message; joints of a skeleton.
 VERSION, MOST_BYTES, DEPTH, JOINTS = 1, 65_536, 5, 256
 _MOST = 1e6
+#: Words in quotes, the last of which may not end, and brackets.
+_MARKS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\\?\Z)|[\[\]{}]', re.DOTALL)
 #: Verticals; -Y is that of cameras, with x to the right and z into the picture.
 UPS = ("Y", "Z", "-Y")
 
@@ -51,19 +54,14 @@ def _none(word: str) -> float:
 
 
 def _shallow(text: str) -> None:
-    depth, quoted, skip = 0, False, False
-    for c in text:
-        if skip:
-            skip = False
-        elif quoted:
-            skip, quoted = c == "\\", c != '"'
-        elif c == '"':
-            quoted = True
-        elif c in "[{":
+    depth = 0
+    for found in _MARKS.finditer(text):
+        mark = found[0][0]
+        if mark in "[{":
             depth += 1
             if depth > DEPTH:
                 raise PoiseError("too deep", "message")
-        elif c in "]}":
+        elif mark != '"':
             depth -= 1
 
 

@@ -20,7 +20,7 @@ class Passing:
 
         x' = (1 - s) v + s v_target,
 
-    so that at the end it moves as the target does, from elsewhere: whoever asks moves the target there.
+    so that at the end it moves as the target does, from elsewhere: the caller moves the target there.
 
     Args:
         rate_hz: frames a second.
@@ -41,7 +41,7 @@ class Passing:
         return self._share < 1.0
 
     def begin(self, frame: Tensor, drift: Tensor) -> None:
-        """From a frame `(7 + n)` whose root moves by `drift (2)` m a step."""
+        """From a frame `(7 + n)`; the root there moves by `drift (2)` m a step."""
         self._frame, self._drift, self._at, self._share = frame, drift, frame[:2].clone(), 0.0
 
     def end(self) -> None:
@@ -49,7 +49,7 @@ class Passing:
         self._share = 1.0
 
     def next(self, target: Tensor, step: Tensor) -> Tensor:
-        """The next frame toward `target (7 + n)`, whose root moved by `step (2)` m since the last."""
+        """The next frame toward `target (7 + n)`, which moved by `step (2)` m since the last one."""
         apart = float((step - self._drift).norm()) * self.rate_hz
         self._share = min(1.0, self._share + 1.0 / (max(PASSES_S, apart / SPEEDS_UP) * self.rate_hz))
         share = smooth(torch.tensor([self._share], dtype=torch.float64))

@@ -37,19 +37,20 @@ class Way:
         """Whether it is followed."""
         return self._frames is not None
 
-    def plan(self, start: Tensor, place: Tensor | None, moves: Tensor | None) -> None:
+    def plan(self, start: Tensor, place: Tensor | None, moves: Tensor | None, again: int = 0) -> None:
         """Begins to plan from `start (7 + n)` to standing at `place (7 + n)`, None for on the spot.
 
         moves: m/s `(2)` of a body that does not lie.
+        again: how often a motion from there was lost in a row.
         """
         if self._low(start):
             moves = None
         self._frames = None
         if self._executor is None:
             self._plan = Future()
-            self._plan.set_result(_planned(self.get_up, start, place, moves))
+            self._plan.set_result(_planned(self.get_up, start, place, moves, again))
         else:
-            self._plan = self._executor.submit(_planned, self.get_up, start, place, moves)
+            self._plan = self._executor.submit(_planned, self.get_up, start, place, moves, again)
 
     def begins(self) -> bool:
         """Whether it is planned by now, and followed from this step on."""
@@ -74,13 +75,15 @@ class Way:
         return float(start[2]) < DOWN * float(self.get_up.recovery_clips.ease[2])
 
 
-def _planned(get_up: GetUpPlanner, start: Tensor, place: Tensor | None, moves: Tensor | None) -> Tensor:
+def _planned(
+    get_up: GetUpPlanner, start: Tensor, place: Tensor | None, moves: Tensor | None, again: int
+) -> Tensor:
     if place is None:
         low = float(start[2]) < DOWN * float(get_up.recovery_clips.ease[2])
-        place = (get_up.up(start)[-1] if low else start).clone()
+        place = (get_up.up(start, again)[-1] if low else start).clone()
         if moves is not None:
             # x = v |v| / 2a: where what moves can stand.
             place[:2] += moves * float(moves.norm()) / (2 * STOPS)
     stand = facing(get_up.recovery_clips.ease, heading_angle(place[3:7]))
     stand[:2] = place[:2]
-    return plan_recovery(get_up, start, stand, moves=moves)
+    return plan_recovery(get_up, start, stand, moves=moves, again=again)

@@ -20,8 +20,9 @@ from poise.errors import PoiseError
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
-from poise.live.ahead import Ahead, AheadAtOnce, AheadBeside
-from poise.live.character import Body, Character
+from poise.live.ahead import Ahead, AheadAtOnce
+from poise.live.ahead_beside import AheadBeside
+from poise.live.character import FALLS, Body, Character
 from poise.live.hands import Hands
 from poise.sim import Character as Actor
 from poise.sim import CharacterRows, Scene, SceneSim, alone
@@ -69,6 +70,7 @@ class World:
         yielding: their dials of compliance.
         lead: frames by which each one's goal is behind the newest that is known.
         resets: how often the simulation went bad and all were set down anew.
+        unwound: how often a fallen character's hinges were whole turns off.
         hurries: whether there is no time to look ahead; all act at once then.
         looked: control steps in which a character looked ahead.
 
@@ -113,7 +115,8 @@ class World:
         wide = int(np.ceil(np.sqrt(count)))
         spots = [(APART_M * (k // wide), APART_M * (k % wide)) for k in range(count)]
         self.characters = [Character(planner, spot, executor) for spot in spots]
-        self.substeps, self.resets, self.steps = sim.substeps, 0, 0
+        self.substeps, self.resets, self.steps, self.unwound = sim.substeps, 0, 0, 0
+        self._range = torch.from_numpy(body.model.jnt_range[1:].T.copy()).to(self.rows.state.qpos)
         self.lead, self._full = [1] * count, 1
         self.hurries, self.looked = False, 0
         self._act = tracker.policy.act
@@ -220,10 +223,28 @@ class World:
         env.controls.step(env.backend, self.substeps)
         env.renew(env.judge())
         self.steps += 1
+        self._unwind()
         if bool(self.rows.unstable().any()) or not bool(self.rows.state.qpos.isfinite().all()):
             self.resets += 1
             self._set_down()
         return self._seen()
+
+    def _unwind(self) -> None:
+        """Whole turns that a fall has made of a hinge are left out: the pose is the same, and nothing is
+        turned back all round where the character gets up."""
+        state = self.rows.state
+        for k, character in enumerate(self.characters):
+            if character.doing != FALLS:
+                continue
+            hinges = state.qpos[k, 7:]
+            turns = 2 * torch.pi * ((hinges - character.ease[7:].to(hinges)) / (2 * torch.pi)).round()
+            low, high = self._range
+            turns[(hinges - turns < low) | (hinges - turns > high)] = 0.0
+            if bool(turns.any()):
+                qpos = state.qpos[k].clone()
+                qpos[7:] -= turns
+                self.unwound += 1
+                self.rows.write(torch.tensor([k]), qpos[None], state.qvel[k].clone()[None])
 
     def _seen(self) -> Seen:
         pose, goal, state = self.env.pose(), self.env.goal_pose(), self.scene.backend.state
