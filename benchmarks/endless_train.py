@@ -32,8 +32,8 @@ def shown(stats: BlockStats) -> None:
 
 def settings(args: argparse.Namespace) -> Endless:
     """Those of the training."""
-    config = Endless(steps=args.steps, seed=args.seed)
-    how = replace(config.training, lr=args.lr, held=args.held, batch=args.batch)
+    config = Endless(steps=args.steps, seed=args.seed, balance=args.balance)
+    how = replace(config.training, lr=args.lr, held=args.held, batch=args.batch, shorter=args.shorter)
     return replace(config, training=how)
 
 
@@ -46,6 +46,8 @@ def main() -> None:
     parser.add_argument("--lr", type=float, default=1e-3)
     parser.add_argument("--held", type=float, default=0.3)
     parser.add_argument("--batch", type=int, default=128)
+    parser.add_argument("--balance", type=float, default=0.0)
+    parser.add_argument("--shorter", action="store_true")
     parser.add_argument("--minutes", type=float)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)

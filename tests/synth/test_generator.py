@@ -13,11 +13,11 @@ from torch import Tensor
 from poise.env.goals import GeneratorGoal
 from poise.errors import PoiseError
 from poise.jobs.endless.model import GeneratorModel, load_generator
-from poise.jobs.endless.training import Endless, Motions, motions_of, train_generator
+from poise.jobs.endless.training import Endless, Motions, balanced, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.cvae import CVAETraining, Frames, falling, settling
+from poise.learn.cvae import CVAEObjective, CVAETraining, Frames, falling, settling
 from poise.motion import ClipLibrary
 from poise.nets.cosine_cvae import CosineCVAE, cosines
 from poise.nets.cvae import CVAE, Code, CVAEConfig
@@ -75,17 +75,54 @@ def test_windows_lie_within_clips() -> None:
         frames.draw(1, 21, torch.Generator())
 
 
+def test_windows_are_drawn_by_weights_and_end_with_their_clip() -> None:
+    frames = Frames(torch.arange(30.0)[:, None], torch.tensor([0, 20, 30]), torch.tensor([1.0, 9.0]))
+    starts = frames.starts(2000, 10, torch.Generator().manual_seed(0))
+    # Eleven windows of weight 1, one of weight 9.
+    assert abs(float((starts == 20).float().mean()) - 9 / 20) < 0.05
+    assert set(starts.tolist()) == {*range(11), 20}
+    assert frames.taken(torch.tensor([17, 20]), 5)[..., 0].tolist() == [
+        [17, 18, 19, 19, 19], [20, 21, 22, 23, 24],
+    ]  # fmt: skip
+
+
+def test_labels_are_drawn_more_evenly(motions: Motions) -> None:
+    windows = torch.tensor([90, 20, 10]).repeat_interleave(1)
+    first = torch.cat((torch.zeros(1, dtype=torch.long), (windows + 29).cumsum(0)))
+    many = replace(motions, frames=Frames(torch.zeros(int(first[-1]), 3), first))
+    kinds = torch.tensor([0, 1, 1])
+    for balance, share in ((0.5, 3**0.5 / (1 + 3**0.5)), (1.0, 0.5)):
+        even = balanced(many, kinds, Endless(replace(SMALL, past=10, future=20), balance=balance))
+        starts = even.frames.starts(4000, 30, torch.Generator().manual_seed(1))
+        assert float((starts < first[1]).float().mean()) == pytest.approx(share, abs=0.03)
+    assert balanced(many, kinds, Endless(SMALL)) is many
+    with pytest.raises(PoiseError, match="balance must lie in 0 to 1"):
+        Endless(balance=2.0)
+
+
+def test_short_clips_teach_from_their_own_past_too() -> None:
+    net = CosineCVAE(ROOT + 1, replace(COSINE, past=6), generator=torch.Generator().manual_seed(0))
+    frames = torch.randn(60, ROOT + 1, generator=torch.Generator().manual_seed(1))
+    # The first clip has room for a segment that follows half of one, not for one that follows a whole.
+    sampler = Frames(frames, torch.tensor([0, 25, 60]), torch.tensor([1.0, 0.001]))
+    learner = CVAEObjective(net, CVAETraining(batch=8, own_past=1.0, shorter=True), 100)
+    rng = torch.Generator().manual_seed(2)
+    parts = [learner.step(sampler, k, rng) for k in range(12)]
+    assert all(bool(p["loss"].isfinite()) for p in parts)
+    assert 0 < sum("own_square" in p for p in parts) < 12
+
+
 def test_divergence_and_step_sizes_by_hand() -> None:
     code = Code(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, np.log(4.0)]]))
     assert float(code.divergence()) == pytest.approx(0.5 * (1 + 3 - np.log(4.0)))
     assert [falling(k, 100, 0.2) for k in (0, 19, 60, 100)] == pytest.approx([1, 1, 0.5, 0])
 
 
-@pytest.mark.parametrize("net", [SMALL, COSINE])
+@pytest.mark.parametrize(("net", "shorter"), [(SMALL, False), (COSINE, True)])
 def test_training_lowers_the_loss_and_goes_on_bit_for_bit(
-    motions: Motions, tmp_path: Path, net: CVAEConfig
+    motions: Motions, tmp_path: Path, net: CVAEConfig, shorter: bool
 ) -> None:
-    config = Endless(net, CVAETraining(batch=8), steps=100, ema=0.9)
+    config = Endless(net, CVAETraining(batch=8, shorter=shorter), steps=100, ema=0.9)
     losses: list[float] = []
     whole, _, _ = train_generator(
         motions, tmp_path / "a", config, on_block=lambda s: losses.append(s.parts["square"])

@@ -46,6 +46,9 @@ class CVAETraining:
             them frames of short trainings tremble.
         own_past: share of batches in which further segments follow what was made of the first.
         segments: the most of them; the paper's n is 5.
+        shorter: windows of clips that end before the last of the segments are drawn, too, and have
+            fewer; in half of the batches the next segment follows the first half of one. Without it
+            short clips are in batches of one segment alone.
         noise: deviation of what is added to pasts, the same to all frames of one, in deviations.
         mix: the most of another window in a past, as a share; in half of the pasts.
         settle: frames in which what is off dies down by e, s above.
@@ -61,6 +64,7 @@ class CVAETraining:
     smooth: float = 10.0
     own_past: float = 0.7
     segments: int = 3
+    shorter: bool = False
     noise: float = 0.05
     mix: float = 0.4
     settle: float = 5.0
@@ -84,18 +88,24 @@ class CVAETraining:
 
 
 class Frames:
-    """Windows of packed frames, drawn evenly.
+    """Windows of packed frames.
 
     Args:
         frames: `(F, D)` of all clips, one after another.
         first: `(C + 1)` rows where clips begin.
+        weights: `(C,)` how often windows of each clip are drawn, for each window; by default all are
+            drawn evenly.
+
+    Attributes:
+        clip: `(F,)` the clip of each frame.
+        room: `(F,)` frames of the clip from each one on.
     """
 
-    def __init__(self, frames: Tensor, first: Tensor):
-        self.frames, self.first = frames, first
+    def __init__(self, frames: Tensor, first: Tensor, weights: Tensor | None = None):
+        self.frames, self.first, self.weights = frames, first, weights
         sizes = first[1:] - first[:-1]
-        clip = torch.repeat_interleave(torch.arange(len(sizes)), sizes)
-        self.room = first[1:][clip] - torch.arange(len(frames))
+        self.clip = torch.repeat_interleave(torch.arange(len(sizes)), sizes)
+        self.room = first[1:][self.clip] - torch.arange(len(frames))
 
     def count(self, window: int) -> int:
         """How many different windows of `window` frames there are."""
@@ -107,13 +117,25 @@ class Frames:
         Raises:
             PoiseError: no clip is long enough.
         """
+        return self.taken(self.starts(count, window, generator), window)
+
+    def starts(self, count: int, window: int, generator: torch.Generator) -> Tensor:
+        """`(count,)` rows from which `window` frames of a clip follow; errors as those of `draw`."""
         usable = (self.room >= window).nonzero()[:, 0]
         if not len(usable):
             raise PoiseError(
                 f"no clip has {window} frames in a row", hint="Give longer clips, or see fewer frames"
             )
-        start = usable[torch.randint(len(usable), (count,), generator=generator)]
-        return self.frames[start[:, None] + torch.arange(window)]
+        if self.weights is None:
+            return usable[torch.randint(len(usable), (count,), generator=generator)]
+        share = self.weights[self.clip[usable]].double().cumsum(0)
+        drawn = torch.rand(count, generator=generator, dtype=torch.double) * share[-1]
+        return usable[torch.searchsorted(share, drawn, right=True).clamp_max(len(usable) - 1)]
+
+    def taken(self, starts: Tensor, window: int) -> Tensor:
+        """`(N, window, D)` from rows `(N,)` on; where a clip ends before, its last frame stays."""
+        ends = starts + self.room[starts] - 1
+        return self.frames[torch.minimum(starts[:, None] + torch.arange(window), ends[:, None])]
 
 
 class CVAEObjective:
@@ -144,23 +166,32 @@ class CVAEObjective:
     def step(self, sampler: Frames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         """One update; the parts of the loss."""
         c, p, f = self.config, self.net.config.past, self.net.config.future
-        segments = 1
+        segments, stride = 1, f
         if c.segments > 1 and bool(torch.rand((), generator=generator) < c.own_past):
             segments = int(torch.randint(2, c.segments + 1, (), generator=generator))
-        while segments > 1 and not sampler.count(p + segments * f):
+            if c.shorter and f >= 2 * p and bool(torch.rand((), generator=generator) < 0.5):
+                stride = f // 2
+        while segments > 1 and not c.shorter and not sampler.count(p + segments * f):
             segments -= 1
-        x = self.net.scaled(sampler.draw(c.batch, p + segments * f, generator))
+        whole = p + (segments - 1) * stride + f
+        starts = sampler.starts(c.batch, p + f if c.shorter else whole, generator)
+        room, x = sampler.room[starts], self.net.scaled(sampler.taken(starts, whole))
         past = self.disturbed(x[:, :p], generator)
-        losses, parts = list[Tensor](), dict[str, Tensor]()
-        for k in range(segments):
-            true, at = x[:, k * f : k * f + p], p + k * f
-            future = settling(past, true, x[:, at : at + f], c.settle)
+        losses, sizes, parts = list[Tensor](), list[int](), dict[str, Tensor]()
+        for at in range(0, segments * stride, stride):
+            goes_on = room >= at + p + f
+            if not bool(goes_on.any()):
+                break
+            x, past, room = x[goes_on], past[goes_on], room[goes_on]
+            future = settling(past, x[:, at : at + p], x[:, at + p : at + p + f], c.settle)
             loss, of_it, made = self.loss(past, future, generator)
             losses.append(loss)
-            parts |= of_it if k == 0 else {f"own_{n}": v for n, v in of_it.items()}
+            sizes.append(len(x))
+            parts |= of_it if at == 0 else {f"own_{n}": v for n, v in of_it.items()}
             # What is no motion at all teaches nothing, and might grow from segment to segment.
-            past = torch.cat((past, made.detach().clamp(-FAR, FAR)), 1)[:, -p:]
-        loss = torch.stack(losses).mean()
+            past = torch.cat((past, made[:, :stride].detach().clamp(-FAR, FAR)), 1)[:, -p:]
+        share = torch.tensor(sizes) / max(sizes)
+        loss = (torch.stack(losses) * share).mean() / share.mean()
         optimizer = self.optimizers["net"]
         for group in optimizer.param_groups:
             group["lr"] = c.lr * falling(step, self.steps, c.held)

@@ -47,6 +47,8 @@ class Endless:
         ema: how much of the averaged weights stays at each step.
         codes: windows of the library that are kept as codes, from which z is drawn; 0 draws z from
             N(0, I), as the paper does.
+        balance: how evenly labels are drawn where a library has any: 0 draws all windows evenly, 1 all
+            labels, and what is between draws each label by its windows to the power of 1 - balance.
         seed: seed of everything random.
     """
 
@@ -55,10 +57,13 @@ class Endless:
     steps: int = 20_000
     ema: float = 0.999
     codes: int = 4096
+    balance: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         validate(self)
+        if not 0 <= self.balance <= 1:
+            raise PoiseError(f"balance must lie in 0 to 1, got {self.balance:g}", "Endless")
 
     @classmethod
     def paper(cls) -> Endless:
@@ -178,6 +183,8 @@ def train_generator(
         PoiseError: the folder holds a training with other settings or of another library.
     """
     c = config or Endless()
+    kinds = kinds_of(motions.clips, labels)
+    motions = balanced(motions, kinds, c)
     trainer = InbetweenTrainer(
         learner_of(motions, c), motions.frames, c.seed, c.steps, c.training.batch, ema=c.ema,
         metadata={"config": to_data(c), "clips": list(motions.clips)},
@@ -189,7 +196,6 @@ def train_generator(
         "clips": list(motions.clips), "frames": len(motions.frames.frames), "steps": trainer.step,
         "of": c.steps, "seconds": round(trainer.seconds, 1), "seed": c.seed,
     }  # fmt: skip
-    kinds = kinds_of(motions.clips, labels)
     codes = codes_of(made, motions, c.codes, kinds) if c.codes else None
     model = GeneratorModel(
         made, motions.seeds, motions.bounds, motions.hinges, motions.fps, about, codes,
@@ -197,6 +203,18 @@ def train_generator(
     )  # fmt: skip
     model.save(folder / GENERATOR)
     return model, stats, stopped
+
+
+def balanced(motions: Motions, kinds: Tensor, config: Endless) -> Motions:
+    """The motions with windows drawn as `Endless.balance` says; `kinds (C,)` are the clips' labels, all
+    without one count as one more label."""
+    if not config.balance or not bool((kinds >= 0).any()):
+        return motions
+    frames, window = motions.frames, config.net.past + config.net.future
+    windows = torch.bincount(frames.clip[frames.room >= window], minlength=len(kinds)).double()
+    many = torch.zeros(int(kinds.max()) + 2).double().index_add(0, kinds + 1, windows)
+    weights = many.clamp_min(1.0).pow(-config.balance)[kinds + 1]
+    return replace(motions, frames=Frames(frames.frames, frames.first, weights))
 
 
 def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
@@ -209,12 +227,16 @@ def learner_of(motions: Motions, config: Endless) -> CVAEObjective:
 
 @torch.no_grad()
 def codes_of(net: CVAE | CosineCVAE, motions: Motions, count: int, kinds: Tensor | None = None) -> Codes:
-    """Codes of windows of the library, evenly spread; `kinds (C,)` are the clips' labels."""
+    """Codes of windows of the library, spread as they are drawn; `kinds (C,)` are the clips' labels."""
     p, window = net.config.past, net.config.past + net.config.future
     frames, room = motions.frames.frames, motions.frames.room
     usable = (room >= window).nonzero()[:, 0]
     start = usable[torch.linspace(0, len(usable) - 1, min(count, len(usable))).long()]
-    clip = torch.searchsorted(motions.frames.first, start, right=True) - 1
+    if motions.frames.weights is not None:
+        share = motions.frames.weights[motions.frames.clip[usable]].double().cumsum(0)
+        at = (torch.arange(count) + 0.5).double() / count * share[-1]
+        start = usable[torch.searchsorted(share, at).clamp_max(len(usable) - 1).unique()]
+    clip = motions.frames.clip[start]
     codes = Codes(torch.empty(0), torch.empty(0), torch.empty(0), motions.weights.sqrt())
     parts = list[tuple[Tensor, Tensor, Tensor]]()
     for some in start.split(512):
