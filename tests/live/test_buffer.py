@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from poise.live import quats as q
-from poise.live.buffer import FADE_S, MARGIN_S, JitterBuffer
+from poise.live.buffer import FADE_S, JitterBuffer, margin
 
 STILL = np.array([[1.0, 0, 0, 0]])
 
@@ -30,7 +30,7 @@ def test_a_steady_motion_is_read_steadily(rate: float, late: float) -> None:
     for now in (103.6, 103.8, 103.9):
         pose = buffer.read(now)
         assert pose is not None
-        assert pose.root_pos[0] == pytest.approx(now - 100 - MARGIN_S, abs=late + 1 / rate + 1e-9)
+        assert pose.root_pos[0] == pytest.approx(now - 100 - margin(0.4), abs=late + 1 / rate + 1e-9)
 
 
 def test_without_a_buffer_it_is_extrapolated_and_comes_to_rest() -> None:
@@ -59,6 +59,19 @@ def test_jumps_are_told_once_and_not_walked_through() -> None:
     seen = [buffer.read(100 + t) for t in np.arange(0.1, 0.35, 0.01)]
     assert {float(p.root_pos[0]) for p in seen if p} == {0.0, 5.0}
     assert [p.jumped for p in seen if p].count(True) == 1 and buffer.jumps == 1
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.4])
+def test_a_leap_is_told_with_the_first_pose_after_it(delay: float) -> None:
+    buffer, told = JitterBuffer(delay), list[tuple[bool, bool]]()
+    for k in range(60):
+        buffer.add(k / 30, 100 + k / 30, np.array([0.0 if k < 20 else 5.0, 0, 0]), STILL)
+        pose = buffer.read(100 + (k + 0.5) / 30)
+        assert pose is not None
+        told.append((pose.jumped, float(pose.root_pos[0]) > 2.5))
+    first = [there for _, there in told].index(True)
+    assert [jumped for jumped, _ in told].index(True) == first
+    assert sum(jumped for jumped, _ in told) == 1
 
 
 def test_what_comes_late_or_twice_is_left_out_and_a_new_clock_begins_anew() -> None:

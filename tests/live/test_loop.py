@@ -134,7 +134,7 @@ def test_buffer_noise_and_pause_are_set_while_it_runs(tracker: Tracker, walk: Cl
     assert live.world.lead == [1]
     live.commands.append({"type": "set", "buffer": 0.4, "noise": 0.5, "lookahead": 1})
     played.run(0.5)
-    assert live.world.lead == [11] and live.aims.noise == 0.5 and live.world.ahead_of == (0,)
+    assert live.world.lead == [7] and live.aims.noise == 0.5 and live.world.ahead_of == (0,)
     steps = live.steps
     live.commands.append({"type": "pause", "on": True})
     played.run(0.3)
@@ -246,6 +246,20 @@ def test_a_clip_is_played_on_without_a_jump(walk: Clip) -> None:
     assert np.linalg.norm(loop(3 * walk.frames)[0][:2] - loop(0)[0][:2]) > 2.2 * np.linalg.norm(
         walk.root_pos[-1, :2] - walk.root_pos[0, :2]
     )
+
+
+def test_a_clip_passes_over_where_its_ends_are_most_alike(walk: Clip) -> None:
+    """A walk that ends in the middle of a step goes on in step."""
+
+    def apart(a: int, b: int) -> float:
+        return float((1.0 - np.abs((walk.rot[a, 1:] * walk.rot[b, 1:]).sum(-1))).sum())
+
+    loop = Loop(walk)
+    assert 0 <= loop._first < loop._last - loop.fade and loop._last + loop.fade <= walk.frames
+    assert apart(loop._first, loop._last) < apart(0, walk.frames - loop.fade)
+    for frames in (2, 3, 7):
+        short = Loop(walk.replaced(root_pos=walk.root_pos[:frames], rot=walk.rot[:frames]))
+        assert all(np.isfinite(short(k)[0]).all() for k in range(20))
 
 
 def test_characters_take_the_proportions_of_an_avatar(tracker: Tracker, walk: Clip) -> None:

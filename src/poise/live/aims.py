@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.live.buffer import MARGIN_S
+from poise.live.buffer import margin
 from poise.live.calibration import OntoBody, calibrated
 from poise.live.character import FALLS, RETURNS, tensor
 from poise.live.config import LiveConfig
@@ -166,7 +166,8 @@ class Aims:
 
     def set_lead(self) -> None:
         """How many frames goals are behind what is read, by the length of the buffer."""
-        lead = 1 + int(max(0.0, self.people.delay_s - MARGIN_S) * self.world.rate_hz + 1e-6)
+        delay = self.people.delay_s
+        lead = 1 + int((delay - margin(delay)) * self.world.rate_hz + 1e-6)
         self.world.set_lead(lead)
 
     def dream(self, k: int, on: bool) -> None:

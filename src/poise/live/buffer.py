@@ -9,8 +9,9 @@ import numpy as np
 
 from poise.live.quats import slerp
 
-#: s of the buffer that evens out how packets come; what is more of it may be looked ahead at.
-MARGIN_S = 0.05
+#: s of the buffer that even out how packets come at least, and share of it that does where that is more;
+#: the rest may be looked ahead at.
+MARGIN_S, MARGIN = 0.05, 0.5
 #: s in which motion that has stopped coming comes to rest: its velocity falls by e in each.
 FADE_S = 0.1
 #: s without a new pose after which motion is known to have stopped coming.
@@ -19,6 +20,11 @@ STALLS_S = 0.2
 JUMP, LEAP_M = 12.0, 0.4
 #: Packets by which the way's shortest time is known, and those that are kept.
 SEEN, KEPT = 240, 320
+
+
+def margin(delay_s: float) -> float:
+    """s by which motion is read later than it comes, of a buffer of `delay_s`."""
+    return min(delay_s, max(MARGIN_S, MARGIN * delay_s))
 
 
 class Pose(NamedTuple):
@@ -53,7 +59,7 @@ class JitterBuffer:
     """The poses of one person.
 
     A source's clock is its own; the shortest way that a packet took is when it was made. What is read at
-    `now` is as it was `min(delay_s, MARGIN_S)` before, so that with no delay at all motion is
+    `now` is as it was `margin(delay_s)` before, so that with no delay at all motion is
     extrapolated, and with one it is between two packets.
 
     Args:
@@ -67,7 +73,8 @@ class JitterBuffer:
         self._ways: deque[float] = deque(maxlen=SEEN)
         self._way = 0.0
         self._arrived = -np.inf
-        self._jumped = False
+        # The moment that was read last.
+        self._read = -np.inf
 
     def add(
         self,
@@ -88,6 +95,7 @@ class JitterBuffer:
             self._ways.clear()
             self._ways.append(arrived_s - time_s)
             self._way = arrived_s - time_s
+            self._read = -np.inf
         if frames and time_s <= frames[-1].time_s:
             self.late += 1
             return
@@ -96,7 +104,6 @@ class JitterBuffer:
             far = float(np.linalg.norm(root_pos - frames[-1].root_pos))
             leaps = far > LEAP_M and far > JUMP * (time_s - frames[-1].time_s)
             self.jumps += leaps
-            self._jumped |= leaps
         frames.append(_Frame(time_s, root_pos, rot, leaps, places))
 
     def read(self, now_s: float) -> Pose | None:
@@ -104,8 +111,10 @@ class JitterBuffer:
         frames = self._frames
         if not frames:
             return None
-        at = now_s - self._way - min(self.delay_s, MARGIN_S)
-        jumped, self._jumped = self._jumped, False
+        at = now_s - self._way - margin(self.delay_s)
+        # A leap is told when it is read, which is later than it comes.
+        jumped = any(f.leaps and self._read < f.time_s <= at for f in frames)
+        self._read = max(self._read, at)
         stale = max(0.0, now_s - self._arrived)
         stalled = at - frames[-1].time_s > STALLS_S
         after = next((k for k in range(len(frames) - 1, -1, -1) if frames[k].time_s <= at), -1)

@@ -14,8 +14,8 @@ class LiveConfig:
 
     Attributes:
         characters: in one world.
-        buffer_s: s, 0 to 0.4: evens out how packets come; what of it exceeds 0.05 s is known ahead. With
-            0 the goal is extrapolated.
+        buffer_s: s, 0 to 0.4: half of it, and 0.05 s at least, evens out how packets come; the rest is
+            known ahead. With 0 the goal is extrapolated.
         lookahead: how many characters look ahead before they act, the first ones.
         noise: 0 to 1, what is added to goals as a video estimator errs: 0.1 rad and 30 mm for 1,
             which wander within 0.3 s.

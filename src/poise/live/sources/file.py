@@ -14,28 +14,35 @@ from poise.motion import Clip
 
 #: s in which the end of a clip passes into its beginning.
 FADE_S = 0.4
+#: Share of a clip at either end in which it may pass over, and frames a second that are looked at.
+SEAM, SEAM_HZ = 0.2, 30.0
 
 
 class Loop:
-    """A clip without end: each time it begins where it ended, facing the same way."""
+    """A clip without end: each time it begins where it ended, facing the same way.
+
+    It is played from its first frame on. From one near its end it passes over to one near its
+    beginning, those two of them that are most alike, so that a walk goes on in step.
+    """
 
     def __init__(self, clip: Clip):
         self.clip = clip
         self.fade = min(round(FADE_S * clip.fps), (clip.frames - 1) // 2)
-        self._length = clip.frames - self.fade
+        self._first, self._last = _seam(clip, self.fade)
         # By how much each round is turned and moved against the one before.
-        first, last = 0, clip.frames - self.fade if self.fade else clip.frames - 1
-        self._turn = q.heading(clip.rot[last, 0]) - q.heading(clip.rot[first, 0])
+        self._turn = q.heading(clip.rot[self._last, 0]) - q.heading(clip.rot[self._first, 0])
         turn = q.yaw(self._turn)
-        move = clip.root_pos[last] - q.rotate(turn, clip.root_pos[first])
+        move = clip.root_pos[self._last] - q.rotate(turn, clip.root_pos[self._first])
         self._move = np.array([move[0], move[1], 0.0])
 
     def __call__(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Root `(3)` m and local rotations `(J, 4)` of frame 0, 1, 2, ..."""
-        rounds, at = divmod(frame, self._length)
-        root, rot = self._of(rounds, at)
-        if rounds and at < self.fade:
-            was, turned = self._of(rounds - 1, self._length + at)
+        if frame < self._last:
+            return self._of(0, frame)
+        rounds, at = divmod(frame - self._last, max(1, self._last - self._first))
+        root, rot = self._of(rounds + 1, self._first + at)
+        if at < self.fade:
+            was, turned = self._of(rounds, self._last + at)
             share = (at + 1) / (self.fade + 1)
             root = was + share * (root - was)
             rot = q.slerp(turned, rot, share)
@@ -55,6 +62,31 @@ class Loop:
         z = np.exp(1j * self._turn)
         m = complex(self._move[0], self._move[1]) * (1 - z**rounds) / (1 - z)
         return np.array([m.real, m.imag, 0.0])
+
+
+def _seam(clip: Clip, fade: int) -> tuple[int, int]:
+    """Frames of the first and of the last fifth of a clip that are most alike, in their poses, how these
+    change and how high they are; `fade` frames follow the second."""
+    end = clip.frames - fade if fade else clip.frames - 1
+    step = max(1, round(clip.fps / SEAM_HZ))
+    firsts = np.arange(0, max(1, int(SEAM * clip.frames)), step)
+    lasts = np.arange(end, max(int((1 - SEAM) * clip.frames), int(firsts[-1]) + fade), -step)
+    if not len(lasts):
+        return 0, end
+
+    def told(at: np.ndarray) -> np.ndarray:
+        """Poses now and a tenth of a second later, without places and headings."""
+        rows = list[np.ndarray]()
+        for frame in np.concatenate((at, np.minimum(at + round(0.1 * clip.fps), clip.frames - 1))):
+            rot = clip.rot[frame].copy()
+            rot[0] = q.mul(q.yaw(-q.heading(rot[0])), rot[0])
+            rot *= np.where(rot[:, :1] < 0, -1.0, 1.0)
+            rows.append(np.append(rot, clip.root_pos[frame, 2]))
+        return np.stack(rows).reshape(2, len(at), -1).swapaxes(0, 1).reshape(len(at), -1)
+
+    apart = np.linalg.norm(told(firsts)[:, None] - told(lasts)[None], axis=-1)
+    i, j = np.unravel_index(int(apart.argmin()), apart.shape)
+    return int(firsts[i]), int(lasts[j])
 
 
 class FileSource:
