@@ -1,12 +1,11 @@
-"""Live motion: for how long, how late, and against strangers.
+"""Live motion: the loop by a clock of its own, and strangers.
 
-    python benchmarks/live.py endure --minutes 8 --data FOLDER --json benchmarks/live_endure.json
     python benchmarks/live.py loop --minutes 50 --data FOLDER --json benchmarks/live_loop.json
     python benchmarks/live.py strangers --json benchmarks/live_strangers.json
 
 FOLDER holds motion files of persons. Success by the length of the buffer, and torn messages:
-`live_buffers.py` and `live_fuzz.py`. Times are of the machine as it was: where others work on it they
-are upper bounds.
+`live_buffers.py` and `live_fuzz.py`; in real time: `live_endure.py`; in browsers: `live_page.py`.
+Times are of the machine as it was: where others work on it they are upper bounds.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from live_client import Sent, play, watch
+from live_client import Sent, watch
 from speed import machine
 
 from poise.jobs.open import open_run
@@ -58,62 +57,6 @@ def memory_mb(pid: int) -> float:
     """What a process holds."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
-def endure(
-    clips: Sequence[Clip], minutes: float, seed: int, ahead: int, buffer: float
-) -> dict[str, Any]:
-    """Four people of a client that errs, for some minutes."""
-    seconds, four = 60 * minutes, [clips[k % len(clips)] for k in range(4)]
-    process, host = serve(
-        "--stream", "--characters", "4", "--lookahead", str(ahead), "--buffer", str(buffer)
-    )
-    held: list[tuple[float, float]] = []
-
-    async def both() -> tuple[Any, list[dict[str, Any]]]:
-        async def remember() -> None:
-            began = time.perf_counter()
-            while True:
-                held.append((round(time.perf_counter() - began), round(memory_mb(process.pid), 1)))
-                await asyncio.sleep(10)
-
-        task = asyncio.create_task(remember())
-        out = await asyncio.gather(
-            play(f"ws://{host}/stream", four, seconds, seed, True),
-            watch(f"ws://{host}/live", seconds + 15),
-        )
-        task.cancel()
-        return out[0], out[1]
-
-    try:
-        sent, seen = asyncio.run(both())
-    finally:
-        alive = process.poll() is None
-        process.terminate()
-        process.wait(30)
-    seen = [s for s in seen if "characters" in s]
-    last, hz = seen[-1], [s["hz"] for s in seen[40:]]
-    late = np.array([s["latency_ms"] for s in seen[40:]])
-    off = [[s["characters"][k]["off_mm"] for s in seen[40:]] for k in range(4)]
-    return {
-        "machine": machine(), "minutes": minutes, "alive": alive, "sent": sent.counts,
-        "lookahead": ahead, "buffer_s": buffer,
-        "hz": {"median": float(np.median(hz)), "least": float(np.min(hz))},
-        "latency_ms_beyond_buffer": {
-            "p50": float(np.median(late[:, 0])), "p99": float(np.median(late[:, 1])),
-            "worst p99": float(late[:, 1].max()),
-        },
-        "step_ms": last["step_ms"], "steps_late": last["behind"], "refused": last["refused"],
-        "resets": last["resets"],
-        "looked_ahead": last["looked_ahead"],
-        "characters": [
-            {**{n: c[n] for n in ("doing", "lost", "falls", "recovered")},
-             "off_mm_median": float(np.median(o))}
-            for c, o in zip(last["characters"], off, strict=True)
-        ],
-        "unrecovered": sum(c["doing"] in ("falls", "gets up") for c in last["characters"]),
-        "memory_mb": held,
-    }  # fmt: skip
 
 
 def loop(
@@ -267,7 +210,7 @@ def clips_of(folder: Path, most: int, longest_s: float = 30.0) -> list[Clip]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("endure", "loop", "strangers"))
+    parser.add_argument("what", choices=("loop", "strangers"))
     parser.add_argument("--data", type=Path)
     parser.add_argument("--clips", type=int, default=24)
     parser.add_argument("--minutes", type=float, default=8.0)
@@ -278,9 +221,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     o = parser.parse_args()
     torch.set_num_threads(1)
-    if o.what == "endure":
-        found = endure(clips_of(o.data, o.clips), o.minutes, o.seed, o.lookahead, o.buffer)
-    elif o.what == "loop":
+    if o.what == "loop":
         clips = clips_of(o.data, o.clips)
         found = loop(clips, o.minutes, o.wall, o.seed, o.lookahead, o.buffer, o.json)
     else:

@@ -4,6 +4,8 @@
 
 `poise live --stream` runs in a process of its own, one character looks ahead; a client in this one sends
 people at 30 Hz with drop-outs, NaN packets, bursts and swaps, and another connection reads the figures.
+    python benchmarks/live_endure.py --plot OUT.svg --json OUT.json
+
 Each run is a row of the JSON, which is written every minute; runs that stand there whole are not made
 again. Times are of the machine as it was: where others work on it they are upper bounds.
 """
@@ -26,6 +28,7 @@ from speed import machine
 from live import clips_of, memory_mb, serve
 from poise.live.character import FALLS, RETURNS
 from poise.motion import Clip
+from poise.view.svg import line_plot
 
 #: s before figures count, s after the client's end in which characters that are down may still get up.
 WARMS_S, ENDS_S = 10.0, 20.0
@@ -123,14 +126,24 @@ def endure(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=Path())
     parser.add_argument("--clips", type=int, default=4)
     parser.add_argument("--minutes", type=float, default=50.0)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--lookahead", type=int, default=1)
     parser.add_argument("--buffer", type=float, default=0.3)
+    parser.add_argument("--plot", type=Path, help="memory of the runs that stand in the JSON, SVG")
     parser.add_argument("--json", type=Path, required=True)
     o = parser.parse_args()
+    if o.plot is not None:
+        runs = json.loads(o.json.read_text())["runs"]
+        lines = [
+            (f"run {k + 1}", *np.array([(t / 60, mb) for t, mb in r["memory_mb"]]).T)
+            for k, r in enumerate(runs)
+        ]
+        title = "Memory of four live characters"
+        line_plot(lines, title, "minutes", "MB", o.plot, zero=True)
+        return
     clips, rows = clips_of(o.data, o.clips), list[dict[str, Any]]()
     if o.json.exists():
         rows = [r for r in json.loads(o.json.read_text()).get("runs", []) if r["whole"]]
