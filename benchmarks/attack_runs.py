@@ -47,11 +47,6 @@ EVAL = strange.EVAL | {
     "num_obs a list": said("num_obs", to=[335]),
     "hidden of a million twice": said("policy", "hidden", to=[1_000_000, 1_000_000]),
 }
-RUN = strange.RUN | {
-    "1e9 steps a second": said("config", "sim", "rate_hz", to=1e9),
-    "1e9 frames a second": said("clips", 0, "fps", to=1e9),
-}
-POLICY = strange.POLICY | {"1e9 steps a second": said("config", "sim", "rate_hz", to=1e9)}
 
 
 def run_with(folder: Path, file: str, change: Any) -> Path:
@@ -97,8 +92,8 @@ def _each(what: str, changes: dict[str, Any], use: Any) -> None:
 
 _each("resume", RESUME, resumed)
 _each("checkpoint", EVAL, lambda f, c: command("eval", run_with(f, "checkpoint.safetensors", c)))
-_each("run file", RUN, lambda f, c: command("eval", run_with(f, "run.safetensors", c)))
-_each("policy", POLICY, tracked)
+_each("run file", strange.RUN, lambda f, c: command("eval", run_with(f, "run.safetensors", c)))
+_each("policy", strange.POLICY, tracked)
 _each("model", strange.MODEL, filled)
 
 

@@ -105,6 +105,9 @@ RUN = {
     "method unknown": said("config", "method", to="ppo"),
     "recipe a list": said("recipe", to=["imitate"]),
     "recipe unknown": said("recipe", to="magic"),
+    "1e9 steps a second": said("config", "sim", "rate_hz", to=1e9),
+    "1e9 iterations of the solver": said("config", "sim", "iterations", to=10**9),
+    "1e9 frames a second": said("clips", 0, "fps", to=1e9),
     "no rotations": held("0/rot", None),
     "rotations of another shape": held("0/rot", lambda x: x[:, :2]),
 }
@@ -118,6 +121,7 @@ POLICY = {
     "help a text": said("about", "help_n", to="none"),
     "seed a text": said("config", "seed", to="3"),
     "table a list": said("table", to=[1]),
+    "1e9 steps a second": said("config", "sim", "rate_hz", to=1e9),
     "example a text": said("example", to="walk"),
 }
 

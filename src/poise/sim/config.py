@@ -16,6 +16,10 @@ INTEGRATORS = {
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
 
+#: Above these a run of seconds would take days.
+MOST = {"rate_hz": 20_000.0, "control_hz": 20_000.0, "iterations": 10_000, "ls_iterations": 10_000,
+        "tolerance": 1.0}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class SimConfig:
@@ -54,6 +58,8 @@ class SimConfig:
             value = getattr(self, name)
             if not 0 < value < float("inf"):
                 raise PoiseError(f"{name} must be above 0, got {value}", "SimConfig")
+            if value > MOST[name]:
+                raise PoiseError(f"{name} must be at most {MOST[name]:g}, got {value:g}", "SimConfig")
         ratio = self.rate_hz / self.control_hz
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             nearest = max(1, round(ratio)) * self.control_hz
