@@ -126,9 +126,8 @@ class OntoBody:
         return self.where(qpos)
 
     def move(self, seen: np.ndarray, to: np.ndarray) -> None:
-        """See `Elsewhere.move`. Whole turns that hinges have made before do not count any more."""
+        """See `Elsewhere.move`."""
         self.where.move(seen, to)
-        self._last = None
 
 
 class Standing:
