@@ -17,7 +17,7 @@ from poise.motion import Clip, read_clip, write_clip
 
 
 def chain(joints: int, wide: bool = False) -> str:
-    """A BVH whose joints hang below, or beside, one another."""
+    """A BVH with joints that hang below, or beside, one another."""
     text = ["HIERARCHY", "ROOT Hips", "{", "OFFSET 0 0 0", "CHANNELS 6 Xposition Yposition Zposition "
             "Zrotation Xrotation Yrotation"]  # fmt: skip
     for k in range(joints):
@@ -71,7 +71,7 @@ def _(folder: Path) -> Any:
 
 
 def directory(folder: Path, count: int) -> Clip:
-    """An archive of one array whose directory names it many times."""
+    """An archive of one array that its directory names many times."""
     name = b"a.npy"
     entry = struct.pack(
         "<4s6H3L5H2L", b"PK\x01\x02", 20, 20, 0, 0, 0, 0, 0, 0, 0, len(name), 0, 0, 0, 0, 0, 0
@@ -103,7 +103,7 @@ def _(folder: Path) -> Any:
 
 
 def skinned(joints: int, deep: bool, name: str) -> str:
-    """A skin whose joints hang below, or beside, one another; the first one travels."""
+    """A skin with joints that hang below, or beside, one another; the first one travels."""
     data = np.array([0.0, 0.1, 0, 1, 0, 0, 1, 1], "<f4").tobytes()
     nodes: list[dict[str, Any]] = [
         {"name": name, "translation": [0, 1.5 / joints if deep else 1.5, 0]} for _ in range(joints)

@@ -1,4 +1,4 @@
-"""Hostile USD and MJCF files, whose libraries are native code, for `attack.py`."""
+"""Hostile USD and MJCF files, read by native libraries, for `attack.py`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _(folder: Path) -> Any:
 
 
 def few_keys(folder: Path, poses: int) -> Clip:
-    """Three joints whose four keys lie so that their common step makes many poses."""
+    """Three joints with four keys that lie so that their common step makes many poses."""
     joints = '["a", "a/b", "a/b/c"]'
     still = "[(1, 0, 0, 0), (1, 0, 0, 0), (1, 0, 0, 0)]"
     keys = "".join(f"{t}: {still}, " for t in (0, 1, 3, poses - 1))

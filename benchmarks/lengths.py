@@ -33,8 +33,8 @@ from poise.view.svg import line_plot
 RATE = 30.0
 #: Frames from one clip to the next, and how far the next may be turned by, rad.
 SEAM, MOST_TURN = 12, np.pi / 6
-#: s between two looks at the memory of a process.
-LOOK_S = 1.0
+#: s between two looks at the memory of a process, and how many of them the JSON keeps.
+LOOK_S, KEPT = 1.0, 100
 PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 2**20
 COMMANDS: dict[str, list[str]] = {
     "info": [],
@@ -144,8 +144,8 @@ def draw(rows: dict[str, Any], path: Path | None) -> None:
     lines: list[tuple[str, list[float], list[float]]] = []
     for name, row in rows.items():
         if seen := row.get("memory_mb"):
-            share = [100 * t / row["wall_s"] for t, _ in seen]
-            lines.append((name.removeprefix("track, "), share, [m for _, m in seen]))
+            share = [100 * t / row["wall_s"] for t in row["memory_s"]]
+            lines.append((name.removeprefix("track, "), share, seen))
     if path is not None and lines:
         line_plot(lines, "Memory of poise track", "% of its time", "MB", path, zero=True)
 
@@ -173,9 +173,9 @@ def main() -> None:
                 row, seen, text = run([sys.executable, "-m", "poise", verb, str(source), *more])
                 row["file_mb"] = round(source.stat().st_size / 2**20, 1)
                 if verb == "track":
-                    row |= outcome(text, out, source) | {
-                        "memory_mb": [[round(t), round(m)] for t, m in seen]
-                    }
+                    kept = seen[:: -(-len(seen) // KEPT)] if seen else []
+                    times, memory = [round(t) for t, _ in kept], [round(m) for _, m in kept]
+                    row |= outcome(text, out, source) | {"memory_s": times, "memory_mb": memory}
                 rows[f"{verb}, {minutes:g} minutes"] = row
                 told = {"command": "benchmarks/lengths.py", "machine": machine(), "seed": a.seed}
                 said |= told | {"clips": [p.stem for p in files]}

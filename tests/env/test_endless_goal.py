@@ -150,6 +150,28 @@ def test_without_recovery_clips_a_character_stays_where_it_fell(
     env.close()
 
 
+def test_a_get_up_that_is_lost_is_tried_in_another_way(tracker: Tracker, task: Imitation) -> None:
+    clips = tracker.recovery_clips
+    assert clips is not None
+    goal = EndlessGoal(Stands(clips.ease.double()), task.humanoid, 30.0, clips, lead=1)
+    goal.draw(torch.zeros(1, dtype=torch.long))
+    goal.aim(None, None)
+    lies, still = clips.ups[0][:1].clone(), torch.zeros(1, len(task.humanoid.bodies), 3)
+    took = list[int]()
+    for tries in range(3):
+        goal.watch(lies, goal.layout.unpacked(goal.now()).pos + 2.0, still)
+        assert goal.doing.tolist() == [FALLS] and goal.rows()["vain"].tolist() == [tries]
+        goal.watch(lies, goal.layout.unpacked(goal.now()).pos + 2.0, still)
+        assert goal.doing.tolist() == [RETURNS]
+        took.append(int(goal._until))
+    assert took[1] > took[0]
+    # Once it is back, the next fall begins anew.
+    while goal.doing.tolist() == [RETURNS]:
+        goal.advance(None, None)
+        goal.watch(goal.start(None)[0], goal.layout.unpacked(goal.now()).pos, still)
+    assert goal.doing.tolist() == [TRACKS] and goal.rows()["vain"].tolist() == [0]
+
+
 class Circles(Stands):
     """Proposes the past's last frame and, of each other future, a walk in another direction."""
 

@@ -33,7 +33,7 @@ CASES: dict[str, tuple[str, Callable[[str], str], str]] = {
     "ASF with half a limit": (
         "p.asf", lambda t: t.replace("(-45 45)", "(-45)"),
         "p.asf, line 32: limits come in pairs, got 1 numbers"),
-    "ASF whose bones are points": (
+    "ASF with bones that are points": (
         "p.asf", lambda t: "\n".join(
             "    length 0" if x.startswith("    length") else x for x in t.split("\n")),
         "p.asf: no bone of the skeleton has any length"),
@@ -50,10 +50,10 @@ CASES: dict[str, tuple[str, Callable[[str], str], str]] = {
             x if k < 5 else x.replace(x.split("\t")[1], "", 1) if x else x
             for k, x in enumerate(t.replace("\n30\t30", "\n0\t0").split("\n"))),
         "a.trc, line 3: DataRate is 0 and must be above 0"),
-    "TRC of a person who is a point": (
+    "TRC of a body that is a point": (
         "a.trc", lambda t: trc_text(np.arange(8)[:, None, None] + np.zeros((8, len(NAMES), 3))),
         "a.trc: all keypoints lie in one place"),
-    "TRC whose wrists are never seen at once": (
+    "TRC with wrists that are never seen at once": (
         "a.trc", lambda t: trc_text(_one_wrist(walking())),
         "a.trc: in no frame are all hips, knees, ankles, shoulders, elbows and wrists seen"),
     "DeepMimic with one frame of hours": (

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from poise.env.goals.led import LOST, REST, WAITS_S
 from poise.env.recovery.get_up import GetUpPlanner
-from poise.env.recovery.planner import DOWN
 from poise.live.passing import Passing
 from poise.live.ways import Way
 from poise.spatial.directions import facing, heading_angle
@@ -132,7 +131,7 @@ class Character:
             self.lost, self._lost = self.lost + (not self._lost), True
             self._fall()
         if self.doing == FALLS:
-            down = float(body.qpos[2]) < DOWN * float(self.ease[2])
+            down = bool(self.get_up.lies(body.qpos))
             rests = body.speed < REST or self._step > WAITS_S * rate or not down
             if rests and not self._way.planned:
                 self.falls += down

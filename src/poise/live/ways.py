@@ -6,12 +6,8 @@ from concurrent.futures import Executor, Future
 
 from torch import Tensor
 
+from poise.env.recovery.entry import way_to_stand
 from poise.env.recovery.get_up import GetUpPlanner
-from poise.env.recovery.planner import DOWN, plan_recovery
-from poise.spatial.directions import facing, heading_angle
-
-#: m/s^2 with which what moves comes to stand.
-STOPS = 1.7
 
 
 class Way:
@@ -40,17 +36,14 @@ class Way:
     def plan(self, start: Tensor, place: Tensor | None, moves: Tensor | None, again: int = 0) -> None:
         """Begins to plan from `start (7 + n)` to standing at `place (7 + n)`, None for on the spot.
 
-        moves: m/s `(2)` of a body that does not lie.
-        again: how often a motion from there was lost in a row.
+        moves, again: see `plan_recovery`.
         """
-        if self._low(start):
-            moves = None
-        self._frames = None
+        how, self._frames = (self.get_up, start, place, moves, again), None
         if self._executor is None:
             self._plan = Future()
-            self._plan.set_result(_planned(self.get_up, start, place, moves, again))
+            self._plan.set_result(way_to_stand(*how))
         else:
-            self._plan = self._executor.submit(_planned, self.get_up, start, place, moves, again)
+            self._plan = self._executor.submit(way_to_stand, *how)
 
     def begins(self) -> bool:
         """Whether it is planned by now, and followed from this step on."""
@@ -70,20 +63,3 @@ class Way:
     def leave(self) -> None:
         """It is not followed any more."""
         self._plan = self._frames = None
-
-    def _low(self, start: Tensor) -> bool:
-        return float(start[2]) < DOWN * float(self.get_up.recovery_clips.ease[2])
-
-
-def _planned(
-    get_up: GetUpPlanner, start: Tensor, place: Tensor | None, moves: Tensor | None, again: int
-) -> Tensor:
-    if place is None:
-        low = float(start[2]) < DOWN * float(get_up.recovery_clips.ease[2])
-        place = (get_up.up(start, again)[-1] if low else start).clone()
-        if moves is not None:
-            # x = v |v| / 2a: where what moves can stand.
-            place[:2] += moves * float(moves.norm()) / (2 * STOPS)
-    stand = facing(get_up.recovery_clips.ease, heading_angle(place[3:7]))
-    stand[:2] = place[:2]
-    return plan_recovery(get_up, start, stand, moves=moves, again=again)

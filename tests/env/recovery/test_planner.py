@@ -12,6 +12,7 @@ from torch import Tensor
 
 from poise.env import Reference
 from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
+from poise.env.recovery.entry import STOPS, way_to_stand
 from poise.env.recovery.get_up import LIFT, GetUpPlanner
 from poise.env.recovery.planner import plan_recovery, recovery_motions, walk_of
 from poise.env.recovery.run_up import SPEEDS_UP, run_up
@@ -63,6 +64,23 @@ def test_what_was_lost_is_tried_in_another_way(built: Built) -> None:
     assert lengths[2] != lengths[0]
     for way in ways:
         assert torch.allclose(way[0, 7:], lies[7:]) and torch.allclose(way[-1, 7:], one[-1, 7:])
+
+
+def test_what_moves_stands_where_it_can_stop(built: Built) -> None:
+    """Ahead by x = v |v| / 2a; what lies stands where it gets up, in other ways if that was lost."""
+    planner = built[1]
+    ease = planner.recovery_clips.ease.clone()
+    moves = 1.2 * torch.tensor([math.cos(0.3), math.sin(0.3)], dtype=torch.float64)
+    way = way_to_stand(planner, ease, moves=moves)
+    ahead = float((way[-1, :2] - ease[:2]).norm())
+    assert ahead == pytest.approx(1.2**2 / (2 * STOPS), abs=0.1)
+    assert float((way_to_stand(planner, ease)[-1, :2] - ease[:2]).norm()) < 0.1
+    lies = planner.recovery_clips.ups[0][0].clone()
+    assert bool(planner.lies(lies)) and not bool(planner.lies(ease))
+    first, again = (way_to_stand(planner, lies, again=k) for k in (0, 1))
+    assert len(again) > len(first)
+    for way in (first, again):
+        assert torch.allclose(way[-1, 7:], ease[7:], atol=1e-6)
 
 
 def test_nobody_walks_or_nobody_gets_up() -> None:

@@ -14,6 +14,9 @@ from poise.env.reference import Reference
 from poise.env.starts import Starts
 from poise.errors import PoiseError
 
+#: Frames behind the end of a clip at which a character that waits there may stand.
+BEHIND = 100_000
+
 
 class ClipGoal(Goal):
     """Every world follows one of the reference's clips.
@@ -136,7 +139,7 @@ class ClipGoal(Goal):
         clip, frame = clip.to(self.device), frame.to(self.device)
         known = (clip >= 0) & (clip < len(self.reference.length)) & (frame >= 0)
         place = clip * known
-        known &= self.reference.cyclic[place] | (frame < self.reference.length[place] + 10**5)
+        known &= self.reference.cyclic[place] | (frame < self.reference.length[place] + BEHIND)
         if not known.all():
             at = int((~known).nonzero()[0, 0])
             what = f"frame {int(frame[at])} of clip {int(clip[at])}"

@@ -13,9 +13,8 @@ from poise.env.goals.generator import GeneratorGoal, MotionGenerator
 from poise.env.goals.led import FALLS, LOST, REST, RETURNS, TRACKS, WAITS_S
 from poise.env.goals.steering import REACHED, Steering, cost_of
 from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.entry import way_to_stand
 from poise.env.recovery.get_up import GetUpPlanner
-from poise.env.recovery.planner import DOWN, plan_recovery
-from poise.spatial.directions import facing, heading_angle
 
 
 class EndlessGoal(GeneratorGoal):
@@ -77,6 +76,8 @@ class EndlessGoal(GeneratorGoal):
         self._next, self._end = torch.zeros_like(self.at), torch.zeros_like(self.at)
         # The frame with which a recovery motion ends.
         self._until = torch.zeros_like(self.at)
+        # How many recovery motions in a row each world has lost.
+        self._vain = torch.zeros_like(self.at)
         # What characters did in the last frames, the last one now; how many of them are known.
         self.simulated = simulated
         self._did = self.qpos[:, : generator.past].clone()
@@ -91,7 +92,7 @@ class EndlessGoal(GeneratorGoal):
         super().draw(ids)
         self.doing[ids], self._since[ids] = TRACKS, 0
         self._next[ids], self._end[ids] = 0, 0
-        self._known[ids] = 0
+        self._known[ids] = self._vain[ids] = 0
 
     def supply(self, ids: Tensor) -> None:
         """A recovery motion's frames first, then the generator's, which sees them as its past. Where
@@ -159,20 +160,21 @@ class EndlessGoal(GeneratorGoal):
         up = returning & ~off & (self.at >= self._until)
         for i in up.nonzero().squeeze(-1).tolist():
             self.back.append((i, int(self.steps[i])))
-        self.doing[up] = TRACKS
+        self.doing[up], self._vain[up] = TRACKS, 0
+        self._vain[off & returning] += 1
         lost = off & ~falling & ~up
         for i in (lost & ~returning).nonzero().squeeze(-1).tolist():
             if self.plans:
                 self.falls.append((i, int(self.steps[i])))
         self.doing[lost], self._since[lost] = FALLS, 0
         self._since += 1
-        if self.recovery_clips is None:
+        if self.get_up is None:
             # It stays where it fell.
             return bool((falling | lost).any())
         late = self._since > WAITS_S * self.rate_hz
         rests = falling & ((linvel.norm(dim=-1).mean(-1) < REST) | late)
         # What has not fallen needs no rest.
-        rests |= lost & returning & (qpos[:, 2] > DOWN * float(self.recovery_clips.ease[2]))
+        rests |= lost & returning & ~self.get_up.lies(qpos)
         rests &= torch.full_like(rests, self.plans)
         for i in rests.nonzero().squeeze(-1).tolist():
             self._lead(i, qpos[i].double().cpu())
@@ -199,13 +201,8 @@ class EndlessGoal(GeneratorGoal):
     def _lead(self, world: int, qpos: Tensor) -> None:
         """A recovery motion for a world from where its character is, at the end of which it stands as
         long as the generator's past is."""
-        planner, clips = self.get_up, self.recovery_clips
-        assert planner is not None and clips is not None
-        low = float(qpos[2]) < DOWN * float(clips.ease[2])
-        end = planner.up(qpos)[-1] if low else qpos
-        stand = facing(clips.ease, heading_angle(end[3:7]))
-        stand[:2] = end[:2]
-        way = plan_recovery(planner, qpos, stand)
+        assert self.get_up is not None
+        way = way_to_stand(self.get_up, qpos, again=int(self._vain[world]))
         way = torch.cat((way, way[-1:].expand(self.generator.past, -1))).to(self._ways)
         # The old table stays what it is in snapshots.
         used = self._next < self._end
@@ -230,7 +227,7 @@ class EndlessGoal(GeneratorGoal):
     def rows(self) -> dict[str, Tensor]:
         own = {"doing": self.doing, "since": self._since, "steps": self.steps, "next": self._next,
                "end": self._end, "until": self._until, "passed": self._passed,
-               "did": self._did, "known": self._known}  # fmt: skip
+               "did": self._did, "known": self._known, "vain": self._vain}  # fmt: skip
         return {**super().rows(), **own}
 
     def state(self) -> dict[str, Tensor]:

@@ -20,7 +20,6 @@ from poise.env.plugins import Start
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.entry import entry, way_into
 from poise.env.recovery.get_up import GetUpPlanner
-from poise.env.recovery.planner import DOWN
 from poise.env.reference import Reference
 
 #: m between bodies and their reference, on average, beyond which it is lost; the field's failure.
@@ -183,9 +182,7 @@ class LedGoal(Goal):
         late = self._since > WAITS_S * self.rate_hz
         rests |= falls & ((linvel.norm(dim=-1).mean(-1) < REST) | late) & self.plans
         # What has not fallen needs no rest.
-        rests |= (
-            lost & returns & (qpos[:, 2] > DOWN * float(self.get_up.recovery_clips.ease[2])) & self.plans
-        )
+        rests |= lost & returns & ~self.get_up.lies(qpos) & self.plans
         if bool(rests.any()):
             self.lead(rests.nonzero().squeeze(-1), qpos, linvel[:, 0])
         self.goal.frame.copy_(self.frame)

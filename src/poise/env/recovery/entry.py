@@ -1,4 +1,4 @@
-"""Where a motion that was lost is entered again, and the way into it."""
+"""Where a motion that was lost is entered again, the way into it, and the way to standing alone."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from poise.env.recovery.get_up import GetUpPlanner, Poses
 from poise.env.recovery.planner import STAY_S, plan_recovery, walk_of
 from poise.env.recovery.run_up import run_up
 from poise.env.reference import Reference
+from poise.spatial.directions import facing, heading_angle
 
 #: s that is stood at ease before a motion is entered.
 CALM_S = 0.3
@@ -17,6 +18,8 @@ CALM_S = 0.3
 MOVES, SKIPS = 0.3, 0.05
 #: s of it among which is chosen; later frames cost more than any pose can gain.
 FIRST_S = 30.0
+#: m/s^2 with which what moves comes to stand.
+STOPS = 1.7
 
 
 def entry(get_up: GetUpPlanner, motions: Reference, clip: int, frame: int, qpos: Tensor) -> int:
@@ -56,3 +59,26 @@ def way_into(
     way = plan_recovery(get_up, qpos, into[0], moves=moves, again=again)
     way = way[: len(way) - round((STAY_S - CALM_S) * get_up.rate_hz)]
     return torch.cat((way[:-1], get_up.blend(way[-1], into[0]), into[1:]))
+
+
+def way_to_stand(
+    get_up: GetUpPlanner,
+    qpos: Tensor,
+    place: Tensor | None = None,
+    moves: Tensor | None = None,
+    again: int = 0,
+) -> Tensor:
+    """The frames `(T, 7 + n)` from `qpos (7 + n)` to standing at ease at `place (7 + n)`, by default
+    where it gets up, or where it can stop.
+
+    moves, again: see `plan_recovery`.
+    """
+    if place is None:
+        lies = bool(get_up.lies(qpos))
+        place = (get_up.up(qpos, again)[-1] if lies else qpos).clone()
+        if moves is not None and not lies:
+            # x = v |v| / 2a: where what moves can stand.
+            place[:2] += moves * float(moves.norm()) / (2 * STOPS)
+    stand = facing(get_up.recovery_clips.ease, heading_angle(place[3:7]))
+    stand[:2] = place[:2]
+    return plan_recovery(get_up, qpos, stand, moves=moves, again=again)

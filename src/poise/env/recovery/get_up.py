@@ -23,6 +23,8 @@ LIFT = 0.12
 TURNED, LATER = 0.3, 0.1
 #: Share of the standing height: where the root is no higher than this above its lowest, the body lies.
 ENTERS = 0.1
+#: Share of the root's height at ease; a character with its root below must get up.
+DOWN = 0.6
 
 
 class GetUpPlanner:
@@ -40,6 +42,10 @@ class GetUpPlanner:
         for up in self._ups:
             height = up.pos[:, 0, 2]
             up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
+
+    def lies(self, qpos: Tensor) -> Tensor:
+        """`(...)` bool, which of the characters at `qpos (..., 7 + n)` must get up."""
+        return qpos[..., 2] < DOWN * float(self.recovery_clips.ease[2])
 
     def up(self, start: Tensor, again: int = 0) -> Tensor:
         """`(T, 7 + n)` from lying at `start (7 + n)` to the end of a clip that gets up.

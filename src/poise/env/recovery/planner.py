@@ -32,8 +32,6 @@ TURN, HERE, FACING = 2.0, 0.08, 0.1
 #: Of a walk's pace: what is gained and lost in a step, and where all of the walk is seen; steps on the
 #: spot while turning.
 FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
-#: Share of the root's height at ease; a character with its root below must get up.
-DOWN = 0.6
 #: m: what is no farther and behind is come to backwards. Cosine: of what is behind.
 NEAR, BEHIND = 1.2, -0.6
 #: s: at ease at the end.
@@ -66,7 +64,7 @@ def plan_recovery(
         again: how often a motion from there was lost in a row; it gets up in other ways then.
     """
     recovery_clips, body = get_up.recovery_clips, start[None]
-    if float(start[2]) < DOWN * float(recovery_clips.ease[2]):
+    if bool(get_up.lies(start)):
         body, moves = get_up.up(start, again), None
     stand = facing(recovery_clips.ease, heading_angle(body[-1, 3:7]))
     stand[:2] = body[-1, :2]

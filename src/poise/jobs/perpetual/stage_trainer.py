@@ -75,8 +75,7 @@ class StageTrainer:
     until: limits of the whole training, of which every stage has its part. save_s: seconds between two
     checkpoints, beside those after evaluations; 0 saves after every iteration, and None as often as
     that takes a fiftieth of the time at most (`SAVES`), which is after every iteration but for short
-    ones. trained: a policy that a
-    new run goes on from.
+    ones. trained: a policy that a new run goes on from.
     """
 
     def __init__(
