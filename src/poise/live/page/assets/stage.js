@@ -92,7 +92,7 @@ function makeStage(host, hello) {
   const wanted = new T.Vector3();
   const point = new T.Vector3();
   const up = new T.Vector3(0, 1, 0);
-  let begun = false;
+  let begun = false, drawn = 0;
   const stage = {
     canvas, camera, controls,
     theme() {
@@ -135,11 +135,14 @@ function makeStage(host, hello) {
         controls.target.copy(target);
         begun = true;
       } else if (follow) {
-        point.copy(wanted).sub(target).multiplyScalar(0.12);
+        // As near in a second, however many pictures are drawn in it.
+        const share = 1 - Math.exp((drawn - performance.now()) / 130);
+        point.copy(wanted).sub(target).multiplyScalar(share);
         target.add(point);
         camera.position.add(point);
         controls.target.add(point);
       } else target.copy(controls.target);
+      drawn = performance.now();
       controls.update();
       sun.target.position.set(controls.target.x, controls.target.y, 0);
       sun.position.set(controls.target.x + 2.4, controls.target.y - 3, 8);
