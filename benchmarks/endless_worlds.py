@@ -79,7 +79,8 @@ def told(out: Rollouts, goal: EndlessGoal) -> None:
 def rollouts(
     tracker: Tracker, made: Kinematic, count: int, seconds: float,
     look: Callable[[Rollouts], None] = lambda _: None,
-    recover: bool = True, past: str = "own", targets: tuple[tuple[float, float], ...] = (), **_: Any,
+    recover: bool = True, past: str = "own", targets: tuple[tuple[float, float], ...] = (),
+    label_seconds: float = 10.0, **_: Any,
 ) -> Rollouts:  # fmt: skip
     """`count` rollouts; number k begins from a past drawn with seed k, all later draws are of seed 0."""
     task = imitation_of(tracker, [place(tracker.example, tracker)])
@@ -87,7 +88,8 @@ def rollouts(
     rate, steps = tracker.config.sim.control_hz, round(seconds * tracker.config.sim.control_hz)
     begins = [made.begin(1, torch.Generator().manual_seed(k)) for k in range(count)]
     goal = EndlessGoal(
-        made, tracker.humanoid, rate, tracker.recovery_clips if recover else None, count, seed=0,
+        made.wishing(0.0 if targets else label_seconds, count), tracker.humanoid, rate,
+        tracker.recovery_clips if recover else None, count, seed=0,
         lead=max(*tracker.config.window, 1) + 1, pasts=torch.cat(begins),
         steering=Steering(targets), simulated=past == "simulated",
     )  # fmt: skip
