@@ -91,7 +91,7 @@ def dream(
         for _ in range(config.count)
     ]
     writers = [
-        MotionWriter(path, tracker.example, steps)
+        MotionWriter(path, tracker.example, steps * config.count)
         for path in ([] if out is None else names_of(Path(out), config.count))
     ]
     pieces = [
