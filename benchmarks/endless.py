@@ -5,7 +5,8 @@
 Nothing helps the character. The policy alone does all rollouts of a part side by side, in as many
 worlds, and every half minute its falls are written; other rollouts are written one by one, and a
 command that goes on with the same file makes only those that it lacks. A rollout without recovery counts
-until the character falls. What is written says how many rollouts of which length were made.
+until the character falls; with it, what is down in the end has 15 s more to get up. What is written says
+how many rollouts of which length were made.
 
 parts: kinematic (no physics), lookahead, policy (alone), unrecovered (policy alone, recovery off),
 simulated-past (policy alone, which goes on from what was done), steering and steering-policy (points
@@ -138,6 +139,7 @@ class Bench:
         return {
             "seconds": self.a.seconds, "counted_s": until, "falls": [round(t, 2) for t in falls],
             "away_s": [round(t, 2) for t in away], "stayed_down": int(down),
+            "up_after_end": sum(t + s > self.a.seconds for t, s in zip(falls, away, strict=False)),
             **self.about(made.done[world, :frames].astype(float)),
             **{f"asked_{n}": asked[n] for n in NAMES},
         }  # fmt: skip
@@ -239,7 +241,9 @@ def roamed(rows: list[dict[str, Any]]) -> dict[str, Any]:
         out |= {
             "falls": falls, "falls_per_hour": round(3600 * falls / counted, 1),
             "stayed_down": sum(r["stayed_down"] for r in rows),
+            "up_after_end": sum(r["up_after_end"] for r in rows),
             "mean_away_s": round(float(np.mean(away)), 2) if away else None,
+            "longest_away_s": max(away, default=None),
             **{f"asked_{n}": round(float(np.mean([r[f"asked_{n}"] for r in rows])), 2) for n in NAMES},
         }  # fmt: skip
     return out

@@ -53,7 +53,8 @@ def visited(humanoid: Humanoid, seeds: Tensor, qpos: np.ndarray, fps: float) -> 
     """Which of `seeds (S, p, 7 + n)`, a second of the library each, evenly spread, are the nearest to
     some second of a motion."""
     p = seeds.shape[1]
-    some = torch.stack([local_places(humanoid, s)[:: p // 5].flatten() for s in seeds])
+    places = local_places(humanoid, seeds.flatten(0, 1)).unflatten(0, seeds.shape[:2])
+    some = places[:, :: p // 5].flatten(1)
     local = local_places(humanoid, torch.tensor(qpos))
     own = [local[k : k + p : p // 5].flatten() for k in range(0, len(local) - p + 1, p // 2)]
     return set(torch.cdist(torch.stack(own), some).argmin(1).tolist()) if own else set()

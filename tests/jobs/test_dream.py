@@ -19,7 +19,7 @@ from poise.jobs.endless.dreaming import begun, dream, past_of
 from poise.jobs.endless.frames import Body, FrameStore, Pieces
 from poise.jobs.endless.model import GeneratorModel
 from poise.jobs.endless.training import Endless, motions_of, train_generator
-from poise.jobs.endless.writing import MotionWriter
+from poise.jobs.endless.writing import NUMBER, MotionWriter
 from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
@@ -143,6 +143,11 @@ def test_what_cannot_be_is_said(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(PoiseError, match="GB are free"):
         dream(60.0, model, tracker, out=tmp_path / "big.bvh")
+    # Two characters' motions need twice as much.
+    need = 1.5 * NUMBER * 30 * 60 * (3 * len(tracker.example.skeleton) + 3)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need))
+    with pytest.raises(PoiseError, match="GB are free"):
+        dream(60.0, model, tracker, out=tmp_path / "big.bvh", count=2)
     assert not list(tmp_path.iterdir())
 
 

@@ -22,7 +22,8 @@ from poise.motion import ClipLibrary
 from poise.nets.cosine_cvae import CosineCVAE, cosines
 from poise.nets.cvae import CVAE, Code, CVAEConfig
 from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
-from poise.synth.generator import Codes, Kinematic
+from poise.synth.codes import Codes
+from poise.synth.generator import Kinematic
 from poise.synth.place_free import ROOT, coordinates, features_of
 from toy_policy import walk
 

@@ -47,6 +47,9 @@ class Options:
     line. After the last one it goes where it likes."""
     style: Annotated[str | None, arg(metavar="LABEL", help_behavior_hint="")] = None
     """Only motion of this label, where the generator's library has labels, such as dance."""
+    label_seconds: Annotated[float, arg(metavar="S")] = 10.0
+    """It keeps to motion of one label of the library for about so long, and then turns to another one;
+    0 leaves that to chance. Neither with --style nor on the way to points."""
     generator: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A kinematic policy: its file, or the folder of poise train endless; by default the one that comes
     with Poise."""
@@ -81,6 +84,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("threads", o.threads, 0)
     check_range("budget", o.budget, 1, 1_000_000)
     check_range("seconds", o.seconds, 0.1, 36_000)
+    check_range("label-seconds", o.label_seconds, 0, 3600)
     out, motion = places(o.out)
     read = () if o.seed_clip is None else (o.seed_clip,)
     may_deliver(out, motion, o.force, *read)
@@ -94,8 +98,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     ahead = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     config = Dream(
         temperature=o.temperature, count=o.count, targets=targets, seed=o.seed, controller=o.controller,
-        lookahead=ahead, recover=o.recover, past=o.past, style=o.style, hold_feet=o.hold_feet,
-        threads=o.threads,
+        lookahead=ahead, recover=o.recover, past=o.past, style=o.style, label_seconds=o.label_seconds,
+        hold_feet=o.hold_feet, threads=o.threads,
     )  # fmt: skip
     files = names_of(motion or out / "simulated.bvh", o.count)
     for file in files:

@@ -117,7 +117,7 @@ class EndlessGoal(GeneratorGoal):
         propose = getattr(self.generator, "propose", None)
         if propose is None or not self.steering.chooses:
             return super().make(past, ids)
-        futures, out = propose(past, self.rng, self.steering.proposals), list[Tensor]()
+        futures, out = propose(past, self.rng, self.steering.proposals, ids), list[Tensor]()
         steps = torch.arange(1, self.generator.future + 1, device=self.device)
         for world, made in zip(ids.tolist(), futures, strict=True):
             others = list[Tensor]()

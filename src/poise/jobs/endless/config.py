@@ -30,6 +30,8 @@ class Dream:
         past: what the kinematic policy goes on from: its own frames, as the paper has it, or what the
             character did.
         style: label of the motion of the library that is done, where that has labels; None does all.
+        label_seconds: s for which, on average, a character keeps to motion of one label of the library
+            before it turns to another one; 0 leaves that to chance, as targets and a style do.
         hold_feet: standing feet are held in place in what is written.
         threads: cores of lookahead, 0 is all of them.
     """
@@ -43,6 +45,7 @@ class Dream:
     recover: bool = True
     past: Literal["own", "simulated"] = "own"
     style: str | None = None
+    label_seconds: float = 10.0
     hold_feet: bool = True
     threads: int = 0
 
@@ -52,4 +55,6 @@ class Dream:
             raise PoiseError(f"there may be 1 to {MOST} characters, got {self.count}")
         if not 0 <= self.temperature <= 10:
             raise PoiseError(f"the temperature must lie in 0 to 10, got {self.temperature:g}")
+        if not 0 <= self.label_seconds <= 3600:
+            raise PoiseError(f"a label is kept to for 0 to 3600 s, got {self.label_seconds:g}")
         Steering(self.targets)

@@ -91,7 +91,7 @@ def dream(
         for _ in range(config.count)
     ]
     writers = [
-        MotionWriter(path, tracker.example, steps)
+        MotionWriter(path, tracker.example, steps * config.count)
         for path in ([] if out is None else names_of(Path(out), config.count))
     ]
     pieces = [
@@ -159,9 +159,11 @@ def _go_about(
 
     def goal(worlds: int, plans: bool) -> EndlessGoal:
         clips = tracker.recovery_clips if config.recover else None
+        # Each has its own wishes; where there is somewhere to go, that alone counts.
+        wishing = made.wishing(0.0 if config.targets else config.label_seconds, worlds)
         lead = max(config.lookahead.horizon, *tracker.config.window, 1) + 1
         own = EndlessGoal(
-            made, tracker.humanoid, tracker.config.sim.control_hz, clips, worlds, seed=config.seed,
+            wishing, tracker.humanoid, tracker.config.sim.control_hz, clips, worlds, seed=config.seed,
             lead=lead, plans=plans, steering=steering,
             pasts=pasts if plans else pasts[:1].expand(worlds, -1, -1),
             simulated=config.past == "simulated",

@@ -17,7 +17,8 @@ from poise.learn.state import load_module, prefixed, take
 from poise.nets.cosine_cvae import CosineCVAE, make_cvae
 from poise.nets.cvae import CVAE, CVAEConfig
 from poise.settings import from_data
-from poise.synth.generator import Codes, Kinematic
+from poise.synth.codes import Codes
+from poise.synth.generator import Kinematic
 from poise.synth.place_free import ROOT
 
 #: The file in a run's folder.

@@ -25,7 +25,7 @@ from poise.motion import ClipLibrary
 from poise.nets.cosine_cvae import CosineCVAE, make_cvae
 from poise.nets.cvae import CVAE, CVAEConfig
 from poise.settings import to_data, validate
-from poise.synth.generator import Codes
+from poise.synth.codes import Codes
 from poise.synth.place_free import ROOT, coordinates, features_of
 
 #: Pasts that are kept, from which motions begin.

@@ -17,7 +17,7 @@ from poise.motion.io import check_writable, write_clip
 #: Room for the number of frames in a file's header.
 _DIGITS = 9
 #: Bytes of a number in a BVH file, with its space.
-_NUMBER = 11
+NUMBER = 11
 
 
 class MotionWriter:
@@ -25,7 +25,8 @@ class MotionWriter:
     format at the end. The file appears when it is closed.
 
     Args:
-        path: the file. example: a clip on the skeleton, for its size. frames: how many are to come.
+        path: the file. example: a clip on the skeleton, for its size. frames: how many are to come,
+            in all files that are written beside each other.
 
     Raises:
         PoiseError: the format cannot be written, or there is no room for it on the disk.
@@ -35,7 +36,7 @@ class MotionWriter:
         check_writable(path)
         self.path, self.frames = path, 0
         self._streams = path.suffix.lower() == ".bvh"
-        need = _NUMBER * (3 * len(example.skeleton) + 3) * frames
+        need = NUMBER * (3 * len(example.skeleton) + 3) * frames
         free = shutil.disk_usage(path.parent).free
         if need > free:
             raise PoiseError(
