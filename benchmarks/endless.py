@@ -222,13 +222,19 @@ class Bench:
         return {"minutes": self.a.hour_minutes, "file_mb": round(size, 1), "most_mb_at_s": seen}
 
 
+def mean(values: list[float | None]) -> float | None:
+    """Of those that could be measured: some rollouts end in a fall at once."""
+    found = [v for v in values if v is not None]
+    return round(float(np.mean(found)), 2) if found else None
+
+
 def roamed(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Summary of rollouts that go about."""
     labels = [len(r["labels"]) for r in rows]
     everywhere = set[int]().union(*(r["visited"] for r in rows))
     out: dict[str, Any] = {
         "rollouts": len(rows), "seconds_each": rows[0]["seconds"],
-        **{n: round(float(np.mean([r[n] for r in rows])), 2) for n in NAMES},
+        **{n: mean([r[n] for r in rows]) for n in NAMES},
         "longest_still_s": max(r["longest_still_s"] for r in rows),
         "repeated_share": round(float(np.mean([r["repeated_share"] or 0.0 for r in rows])), 3),
         "visited_a_rollout": round(float(np.mean([len(r["visited"]) for r in rows])), 1),
@@ -244,7 +250,7 @@ def roamed(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "up_after_end": sum(r["up_after_end"] for r in rows),
             "mean_away_s": round(float(np.mean(away)), 2) if away else None,
             "longest_away_s": max(away, default=None),
-            **{f"asked_{n}": round(float(np.mean([r[f"asked_{n}"] for r in rows])), 2) for n in NAMES},
+            **{f"asked_{n}": mean([r[f"asked_{n}"] for r in rows]) for n in NAMES},
         }  # fmt: skip
     return out
 

@@ -30,7 +30,7 @@ def repeats(humanoid: Humanoid, qpos: np.ndarray, fps: float) -> dict[str, Any]:
     """How much of a motion was there before: of its stretches of `LONG_S` the share that an earlier one,
     `APART_S` before, is like, and when that happens first."""
     local, step, long = local_places(humanoid, torch.tensor(qpos)), int(EVERY_S * fps), int(LONG_S * fps)
-    starts = torch.arange(0, len(local) - long, step)
+    starts = torch.arange(0, max(0, len(local) - long), step)
     if len(starts) < 2:
         return {"repeated_share": None, "first_repeat_s": None}
     bodies = local.shape[1]
