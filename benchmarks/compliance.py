@@ -198,11 +198,11 @@ def doors(tracker: Tracker, threads: int) -> dict[str, Any]:
         "level 0.16": Compliance(0.16), "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5),
         "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
     }  # fmt: skip
-    out: dict[str, Any] = {"episodes": 16}
+    out: dict[str, Any] = {"episodes": 8}
     for width in (1.0, 1.35, 1.7):
         rows: dict[str, Any] = {}
         for way, given in ways.items():
-            made = play(Doorway(width), tracker, None, given, 16, threads=threads)
+            made = play(Doorway(width), tracker, None, given, 8, threads=threads)
             rows["without"] = dict(made.stiff)
             rows[way] = dict(made.figures)
         out[f"{width:g} m"] = rows

@@ -117,12 +117,16 @@ class Stiffness:
         newtons_per_metre: K, at the point of each force.
         lag_s: time constant.
         series: whether what the servos give way is taken off.
+        hindsight: for training (hindsight perturbation, CHIP): what a policy is to reach stays where it
+            is, and the goal that it sees lies where a spring of stiffness K would have to pull from,
+            displaced by -J^+ f / K. What comes of it yields by K without being told a force.
         weights, root, return_hz, least_n: see `Compliance`; the root stands by default.
     """
 
     newtons_per_metre: float = 200.0
     lag_s: float = 0.1
     series: bool = True
+    hindsight: bool = False
     weights: Parts = (("thigh", 2.0), ("upper_arm", 2.0))
     root: bool = False
     return_hz: float = 1.0

@@ -205,7 +205,9 @@ class Yielding(Plugin):
                 point, force = point.gather(1, wide), force.gather(1, wide)
             jacobian, change = self._mechanics.linear(body, point), None
         if isinstance(given, Stiffness):
-            soft = softening(jacobian, force, self.level, self._kp, given.series)
+            series = given.series and not given.hindsight
+            soft = softening(jacobian, force, self.level, self._kp, series)
+            soft = -soft if given.hindsight else soft
             aim = moving(jacobian, force * (soft * on).unsqueeze(-1), self._weights).sum(1)
             self.share = room(aim[:, 6:], self._least, self._most)
             # u' = (u* - u) / lag, exactly.
