@@ -65,8 +65,7 @@ class ImitationEnv:
         self.backend, self.task, self.substeps, self._guard = backend, task, substeps, guard
         goal = goal if isinstance(goal, Goal) else goal_of(goal, task, backend, seed, weights)
         self.goal = displaced_goal(goal, task)
-        humanoid = self.goal.humanoid
-        self.hinges = len(humanoid.hinges)
+        self.hinges = len(self.goal.humanoid.hinges)
         self._limit_n = task.residual.limit_n if task.residual and task.residual.capped else None
         n, here = self.num_envs, self.device
         self.age = torch.zeros(n, dtype=torch.long, device=here)
@@ -90,17 +89,17 @@ class ImitationEnv:
         self._terms.check(self._sources.live(self._told()), n)
         self._sources.settle()
         # Worlds stand on their goals where these are known already.
-        obs = self._set_down(None) if self.goal.begins else self.observe()
-        self.num_obs = obs.shape[1]
+        if self.goal.begins:
+            self._place(None, None)
+        self.num_obs = self.observe().shape[1]
         self._style = seen_by(self._terms.style, self._frame())
         self._obs = torch.empty(n, self.num_obs, device=here)
 
     def _make_terms(self, fused: bool) -> Terms:
         task, model, here = self.task, self.backend.model, self.device
         named = {**observables.STANDARD, **task.observables}
-        held: dict[str, Tensor] = {"action": self.action, "age": self.age}
-        controls = self.controls
-        held |= {"action_before": controls.before, "torque_before": controls.torque_before}
+        was, torques = self.controls.before, self.controls.torque_before
+        held = {"action": self.action, "age": self.age, "action_before": was, "torque_before": torques}
         for plugin in self.plugins:
             named |= plugin.observables
             held |= plugin.sources()
@@ -173,9 +172,8 @@ class ImitationEnv:
         self.goal.rng.manual_seed(seed)
 
     def reset_to(self, clip: Tensor, frame: Tensor, kind: Tensor | None = None) -> Tensor:
-        """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; returns observations.
-
-        Frames past the end of a cyclic clip are where its later cycles are.
+        """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; frames past the end of a cyclic
+        clip are where its later cycles are. Gives observations.
 
         kind: `(N,)` kinds of episodes of a plug-in, such as those of `poise.env.recovery`; None begins
             ordinary ones.
@@ -183,17 +181,14 @@ class ImitationEnv:
         if kind is not None and not any(type(p).kinds is not Plugin.kinds for p in self.plugins):
             raise PoiseError("this task knows no falls", hint="Set TaskConfig.recovery")
         self.goal.seek(clip, frame)
-        return self._set_down(kind)
+        self._place(None, kind)
+        return self.observe()
 
     def _restart(self, ids: Tensor) -> None:
         """New episodes in worlds `ids (n,)`."""
         self.goal.draw(ids)
         drawn = (p.kinds(len(ids), self.goal.rng) for p in self.plugins)
         self._place(ids, next((kind for kind in drawn if kind is not None), None))
-
-    def _set_down(self, kind: Tensor | None) -> Tensor:
-        self._place(None, kind)
-        return self.observe()
 
     def _place(self, ids: Tensor | None, kind: Tensor | None) -> None:
         """Puts the characters of worlds `ids`, all for None, where their goals begin."""
@@ -223,8 +218,8 @@ class ImitationEnv:
 
     def drive(self, actions: Tensor) -> None:
         """The first part of a step: fills the drive; the physics is then the caller's to step."""
-        goal, by = self.goal, self.task.help_by
-        self._row, self._group = goal.row(), goal.group(by)
+        goal = self.goal
+        self._row, self._group = goal.row(), goal.group(self.task.help_by)
         torques = self._sources.reads("torque_before")
         self.controls.apply(actions, self.age, goal, self.help, torques)
 
@@ -251,8 +246,7 @@ class ImitationEnv:
         return EnvStep(final, reward, terminated, truncated, final, log, failed)
 
     def tick(self) -> None:
-        """Time goes on by a control step: what `judge` begins with, and all that is needed of it where
-        nobody asks for rewards and the caller moves the goal."""
+        """Time goes on by a control step: all of `judge` that is needed where goals move otherwise."""
         self.age += 1
         for plugin in self._ticking:
             plugin.tick()
@@ -292,8 +286,7 @@ class ImitationEnv:
         if type(self.goal).watch is Goal.watch:
             return False
         sim = self.here()
-        changed = self.goal.watch(self.backend.state.qpos, sim.pos, sim.linvel)
-        if changed:
+        if changed := self.goal.watch(self.backend.state.qpos, sim.pos, sim.linvel):
             self.goal.aim(None, self._held())
         return changed
 
@@ -377,18 +370,14 @@ class ImitationEnv:
     def restore(self, snapshot: Snapshot, rows: Tensor | None = None) -> Tensor:
         """Makes worlds `rows (n,)`, all for None, what a snapshot of n worlds holds; a snapshot of one
         world fills them all. It may be that of another environment of the same body and kind of goal.
-        Where it holds all worlds of an environment, what they share is restored, too.
-
-        Returns:
-            observations `(N, O)` of all worlds.
+        Where it holds all worlds of an environment, what they share is restored, too. Gives the
+        observations `(N, O)` of all worlds.
 
         Raises:
             PoiseError: another number of worlds, or the snapshot of another kind of environment.
         """
         put(self, snapshot, rows)
-        for plugin in self._placing:
-            plugin.placed(rows)
-        self.goal.aim(None, self._held())
+        self._put(rows)
         return self._observe()
 
     def state(self) -> dict[str, Tensor]:
@@ -399,8 +388,11 @@ class ImitationEnv:
         """Continues from `state()`: exactly, or from the same positions and velocities where the state
         is that of another kind of backend (another number format), such as the GPU's."""
         put_state(self, state)
+        self._put(None)
+
+    def _put(self, rows: Tensor | None) -> None:
         for plugin in self._placing:
-            plugin.placed(None)
+            plugin.placed(rows)
         self.goal.aim(None, self._held())
 
     def close(self) -> None:
