@@ -48,8 +48,10 @@ def _shortened(line: str) -> list[str]:
     line = re.sub(r"--learn \d+", "--learn 0.02", line)
     line = re.sub(r"(=\d+),[\d,]+", r"\1", line)
     argv = shlex.split(line, comments=True)[1:]
-    if "--search" in argv:
-        argv += ["--characters", "8"]
+    if argv[0] == "track":
+        # A policy that knows nothing loses its motion, is looked ahead for and searched.
+        for option, value in (("--characters", "8"), ("--threads", "1"), ("--budget", "40")):
+            argv += [] if option in argv else [option, value]
     if argv[0] == "imitate" and "--print-config" not in argv:
         argv += [*TINY, "--no-expert"]
         if "--resume" in argv:

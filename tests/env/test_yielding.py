@@ -15,6 +15,7 @@ from poise.env.events import InScene, Pushes, SetDown, touches_of
 from poise.env.goals import DisplacedGoal
 from poise.env.yielding import Yielding
 from poise.errors import PoiseError
+from poise.learn import PPOConfig
 from poise.motion import ClipLibrary
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
@@ -313,3 +314,49 @@ def test_what_cannot_be_felt(task: Imitation, felt: tuple[str, ...], what: str) 
     with pytest.raises(PoiseError, match=what):
         replace(task, task=own).env(backend=sim.characters())
     sim.close()
+
+
+def test_in_hindsight_the_goal_that_is_seen_lies_beyond_what_is_to_be_reached(task: Imitation) -> None:
+    """It lies by -f / K from where the hand should be, as a spring's anchor does; rewards stay."""
+    ways = {}
+    for hindsight in (False, True):
+        given = Stiffness(400.0, 0.02, series=False, hindsight=hindsight)
+        own = replace(
+            PUSH, newtons=(20.0, 20.0), every_s=(0.05, 0.05), lasts_s=3.0, bodies=(hand(task),)
+        )
+        made = replace(task.task, plugins=(own,), compliance=given, dones=(), help=None)
+        env = begun(replace(task, task=made).env(2, 1, False, threads=1, help_scale=0.0))
+        for _ in range(10):
+            env.step(still(env))
+        goal, place, row = env.goal, env.goal.layout.unpacked, hand(task)
+        assert isinstance(goal, DisplacedGoal)
+        felt = env.plugins[-2].felt()
+        assert felt is not None
+        now, ahead = (
+            (place(a).pos - place(b).pos)[:, row].double()
+            for a, b in ((goal.now(), goal.goal.now()), (goal.ahead(), goal.goal.ahead()))
+        )
+        ways[hindsight] = ahead, felt.force[:, 0] / 400.0
+        assert bool(now.any()) is not hindsight
+        told = goal.goal.targets()
+        torch.testing.assert_close(
+            goal.targets()[0], told[0][told[1]] + goal.offset[:, 6:], atol=0, rtol=0
+        )
+        env.close()
+    for hindsight, sign in ((False, 1.0), (True, -1.0)):
+        moved, want = ways[hindsight]
+        # The Jacobian is that of the character, which has moved off by then.
+        assert (moved - sign * want).norm(dim=1).max() < 0.35 * want.norm(dim=1).min()
+
+
+def test_a_tracker_is_trained_in_hindsight_the_same_every_time(task: Imitation) -> None:
+    ppo = PPOConfig(horizon=8, epochs=2, minibatch=16, policy_hidden=(16,), value_hidden=(16,))
+    pushes = replace(PUSH, newtons=(5.0, 20.0), every_s=(0.05, 0.2), bodies=(hand(task),))
+    own = replace(task.task, plugins=(pushes,), compliance=Stiffness(300.0, hindsight=True))
+    rows, offset = list[list[float]](), torch.zeros(1)
+    for _ in range(2):
+        trainer = replace(task, task=own).trainer(threads=1, ppo=ppo)
+        rows.append([trainer.iterate().row()["reward"] for _ in range(3)])
+        offset = trainer.env.goal.offset  # type: ignore[attr-defined]
+        trainer.close()
+    assert rows[0] == rows[1] and all(r > 0.0 for r in rows[0]) and offset.any()

@@ -14,6 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
+import torch
+
 from .native import fork_instead
 from .oracle import Verdict, judge
 
@@ -44,6 +46,8 @@ def work(pipe: Connection, parents: Connection, formats: Iterable[str]) -> None:
     parents: the pipe's other end, closed here, so that this process ends with its parent.
     """
     parents.close()
+    # The threads of a process do not come along when it forks: what asks for them waits for ever.
+    torch.set_num_threads(1)
     fork_instead(formats)
     # The libraries' own objects are many: they are never looked through for garbage again.
     gc.freeze()

@@ -42,6 +42,10 @@ def test_losses_and_rewards_are_those_of_the_equations():
     squares = AmpConfig.phc("paper")
     at = style_reward(torch.tensor([-1.0, 0.0, 1.0, 3.0, 9.0]), squares)
     assert at.tolist() == [0.0, 0.75, 1.0, 0.0, 0.0]
+    # 1 - beta (D - 1)^2 goes on below 0.
+    free = style_reward(torch.tensor([-1.0, 0.0, 1.0, 4.0]), AmpConfig.compliant())
+    torch.testing.assert_close(free, torch.tensor([0.2, 0.8, 1.0, -0.8]))
+    assert AmpConfig.compliant(few=False).shape == 0.25
     assert AmpConfig.phc("code").loss == "bce" and AmpConfig.phc("code").scale == 2.0
 
 

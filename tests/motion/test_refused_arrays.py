@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import struct
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from poise.errors import PoiseError
 from poise.motion import read_clip, write_clip
 from poise.motion.io.numpy import arrays as array_files
 from poise.motion.io.numpy import pickles
+from poise.motion.io.numpy.zips import directory_bytes
 from poise.motion.io.points import c3d
 
 
@@ -142,6 +145,13 @@ def test_limits_of_archives_and_pickles(tmp_path: Path, monkeypatch: pytest.Monk
     path = save_npz(tmp_path / "a.npz", keys())
     monkeypatch.setattr(array_files, "MAX_KEYS", 2)
     assert refusal(path) == ": the archive holds more than 2 arrays"
+    monkeypatch.setattr(array_files, "MAX_KEYS", 4096)
+    most = directory_bytes(path)
+    assert 0 < most < path.stat().st_size
+    monkeypatch.setattr(array_files, "MAX_DIRECTORY", most - 1)
+    with monkeypatch.context() as unread:
+        unread.delattr(array_files.zipfile, "ZipFile")
+        assert refusal(path) == ": the archive holds more than 4096 arrays"
     monkeypatch.setattr(pickles, "_MAX_STEPS", 5)
     path = save_pickle(tmp_path / "a.pkl", aist())
     assert refusal(path) == ": the pickle has more than 5 instructions"
@@ -185,3 +195,28 @@ def test_c3d_files_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.Monke
     assert refusal(path).startswith(": it holds 3 points and 4 labels")
     monkeypatch.setattr(c3d, "find_spec", lambda _: None)
     assert refusal(path).startswith(": C3D files need the package ezc3d")
+
+
+@pytest.mark.parametrize("comment", [b"", b"a comment", b"x" * 65_535])
+def test_the_size_of_a_directory_is_read_where_python_reads_it(tmp_path: Path, comment: bytes) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for k in range(5):
+            archive.writestr(f"{k}.npy", b"0" * 100)
+        archive.comment = comment
+    with path.open("rb") as file:
+        assert directory_bytes(path) == 5 * (46 + 5)
+        file.seek(0)
+        assert len(zipfile.ZipFile(file).infolist()) == 5
+
+
+def test_the_size_of_a_directory_of_64_bits(tmp_path: Path) -> None:
+    path, entries = tmp_path / "a.npz", 1 << 40
+    wide = struct.pack("<4sQ2H2L4Q", b"PK\x06\x06", 44, 45, 45, 0, 0, 1, 1, entries, 0)
+    points = struct.pack("<4sLQL", b"PK\x06\x07", 0, 0, 1)
+    end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
+    path.write_bytes(b"PK\x03\x04" + wide + points + end)
+    # No more than the file has.
+    assert directory_bytes(path) == path.stat().st_size
+    path.write_bytes(b"PK\x03\x04" + b"nothing")
+    assert directory_bytes(path) == 0

@@ -95,15 +95,17 @@ class Humanoid:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def make_spec(table: BodyTable) -> mujoco.MjSpec:
-    """The `MjSpec` of a humanoid with nothing around it; see `add_humanoid`."""
+def make_spec(table: BodyTable, count: int = 1) -> mujoco.MjSpec:
+    """The `MjSpec` of a humanoid with nothing around it, see `add_humanoid`; or of `count` of them, with
+    names that begin with `0/`, `1/`, ..."""
     import mujoco
 
     spec = mujoco.MjSpec()
     spec.modelname = "poise"
     spec.compiler.degree = False
     spec.compiler.autolimits = True
-    add_humanoid(spec, table)
+    for k in range(count):
+        add_humanoid(spec, table, f"{k}/" if count > 1 else "")
     return spec
 
 

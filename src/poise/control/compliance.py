@@ -117,12 +117,16 @@ class Stiffness:
         newtons_per_metre: K, at the point of each force.
         lag_s: time constant.
         series: whether what the servos give way is taken off.
+        hindsight: for training (hindsight perturbation, CHIP): what a policy is to reach stays where it
+            is, and the goal that it sees lies where a spring of stiffness K would have to pull from,
+            displaced by -J^+ f / K. What comes of it yields by K without being told a force.
         weights, root, return_hz, least_n: see `Compliance`; the root stands by default.
     """
 
     newtons_per_metre: float = 200.0
     lag_s: float = 0.1
     series: bool = True
+    hindsight: bool = False
     weights: Parts = (("thigh", 2.0), ("upper_arm", 2.0))
     root: bool = False
     return_hz: float = 1.0
@@ -189,17 +193,16 @@ def columns(table: BodyTable, parts: Parts, root: bool) -> Tensor:
     return torch.tensor([*along, 0.0, 0.0, 0.0, 0.0, *hinges], dtype=torch.float64)
 
 
-def pseudo_inverse(jacobian: Tensor, weights: Tensor, weighting: str = "inverse") -> Tensor:
-    """J^+ `(..., nv, 3)` of `jacobian (..., 3, nv)` with the columns' `weights (nv,)`.
+def moving(jacobian: Tensor, way: Tensor, weights: Tensor, weighting: str = "inverse") -> Tensor:
+    """J^+ x `(..., nv)`: what moves points with the `jacobian (..., 3, nv)` by x, the `way (..., 3)`,
+    with the columns' `weights (nv,)`.
 
-    "inverse": W J^T (J W J^T)^+, so that J J^+ is the identity where the point can move. "printed":
-    A^T (A A^T)^+ with A = J W.
+    "inverse": J^+ = W J^T (J W J^T)^+, so that J J^+ is the identity where the point can move.
+    "printed": A^T (A A^T)^+ with A = J W.
     """
-    # B = J W^(1/2) gives W J^T (J W J^T)^+ = W^(1/2) B^T (B B^T)^+; printed, B = J W without the factor.
-    scale = weights.sqrt() if weighting == "inverse" else weights
-    b = jacobian * scale
-    out = b.transpose(-1, -2) @ _inverse3(b @ b.transpose(-1, -2))
-    return scale.unsqueeze(-1) * out if weighting == "inverse" else out
+    wide = jacobian * weights
+    square = wide @ (jacobian if weighting == "inverse" else wide).transpose(-1, -2)
+    return ((_inverse3(square) @ way.unsqueeze(-1)) * wide).sum(-2)
 
 
 def _inverse3(square: Tensor) -> Tensor:
@@ -242,8 +245,8 @@ def compliant_rate(
     """
     axes = torch.tensor(given.axes).to(velocity)
     # u' = a J^T L x'
-    turned = pseudo_inverse(jacobian, weights, given.weighting) @ (axes * velocity).unsqueeze(-1)
-    return level.unsqueeze(-1) * shares * turned.squeeze(-1).sum(1)
+    turned = moving(jacobian, axes * velocity, weights, given.weighting)
+    return level.unsqueeze(-1) * shares * turned.sum(1)
 
 
 def printed_velocity(jacobian: Tensor, change: Tensor, step_s: float) -> Tensor:

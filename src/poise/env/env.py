@@ -231,10 +231,8 @@ class ImitationEnv:
     def judge(self) -> EnvStep:
         """The second part of a step: rewards and ends, before any episode begins anew."""
         goal, task = self.goal, self.task
-        self.age += 1
         waited = self._held()
-        for plugin in self._ticking:
-            plugin.tick()
+        self.tick()
         ref, ahead = goal.advance(waited, self._held())
         told = self._told(None, ref, ahead)
         final, scores, ends, self._style = self._terms.judge(self._sources.of(told))
@@ -251,6 +249,13 @@ class ImitationEnv:
         limit = None if self._limit_n is None else self.help.limit(self._limit_n, self._group)
         log = StepLog(self.terms, self.imitation, self.wrench, limit, more)
         return EnvStep(final, reward, terminated, truncated, final, log, failed)
+
+    def tick(self) -> None:
+        """Time goes on by a control step: what `judge` begins with, and all that is needed of it where
+        nobody asks for rewards and the caller moves the goal."""
+        self.age += 1
+        for plugin in self._ticking:
+            plugin.tick()
 
     def renew(self, step: EnvStep) -> EnvStep:
         """The last part of a step: new episodes where one ended, and what is seen then."""
@@ -286,7 +291,7 @@ class ImitationEnv:
         """Whether the goal has changed by what it sees of the characters."""
         if type(self.goal).watch is Goal.watch:
             return False
-        sim = self._terms.frame(self._sources).sim
+        sim = self.here()
         changed = self.goal.watch(self.backend.state.qpos, sim.pos, sim.linvel)
         if changed:
             self.goal.aim(None, self._held())
@@ -301,8 +306,12 @@ class ImitationEnv:
 
     def pose(self) -> Pose:
         """The simulated characters now."""
-        lazy = self._frame().sim
+        lazy = self.here()
         return Pose(*(getattr(lazy, name) for name in FIELDS))
+
+    def here(self) -> Pose:
+        """The same, of which only what is asked for is made: before the next step."""
+        return self._terms.frame(self._sources).sim
 
     def goal_pose(self) -> Pose:
         """What the goal asks for now."""
@@ -324,7 +333,7 @@ class ImitationEnv:
         return {**told, "window": goal.window(steps, ids)} if steps else told
 
     def _observe(self) -> Tensor:
-        return seen_by(self._terms.obs, self._frame())
+        return self._terms.observe(self._sources.of(self._told())).clone()
 
     @property
     def obs_widths(self) -> dict[str, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from poise.control import Stiffness
 from poise.env.body_assignment import BodyAssignment
 from poise.env.goals.clip import ClipGoal
 from poise.env.goals.displaced import DisplacedGoal
@@ -62,4 +63,5 @@ def displaced_goal(goal: Goal, task: TaskConfig) -> Goal:
     """A goal that what pushes can displace, where the task has compliance."""
     if task.compliance is None or isinstance(goal, DisplacedGoal):
         return goal
-    return DisplacedGoal(goal)
+    hindsight = isinstance(task.compliance, Stiffness) and task.compliance.hindsight
+    return DisplacedGoal(goal, hindsight)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -10,10 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.body import Humanoid
+from poise.body import Humanoid, make_spec
 from poise.env.frame import Layout, Pose
 from poise.kin import Kinematics
 from poise.spatial import heading_quat, quat_rotate
+
+#: Bodies in the one model that makes poses of many frames: a call is for so many at once.
+MANY = 16
 
 
 class Poser:
@@ -26,6 +28,7 @@ class Poser:
         self.humanoid = humanoid
         self.kinematics = Kinematics(humanoid.table)
         self._fast = Kinematics(humanoid.table, torch.float32, device)
+        self._made: dict[int, tuple[Any, ...]] = {}
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> Pose:
         """The poses of `qpos (F, 7 + n)` and `qvel (F, 6 + n)`, float64."""
@@ -43,42 +46,62 @@ class Poser:
         )
 
     def live(self, qpos: Tensor, qvel: Tensor) -> Pose:
-        """The same poses by MuJoCo, one after another: for the few frames that become known in a step,
-        for which torch takes milliseconds. What a frame's pose is does not depend on the others."""
-        model, (data, *views) = self.humanoid.model, self._data
-        at_q, at_v, at_pos, at_quat, at_com, at_cvel = views
-        frames, n = len(qpos), model.nbody
+        """The same poses by MuJoCo: for the frames that become known in a step, for which torch takes
+        longer. What a frame's pose is does not depend on the others, to the last bit."""
+        frames, n = len(qpos), len(self.humanoid.bodies)
         pos, quat, centres, cvel = (np.empty((frames, *k)) for k in ((n, 3), (n, 4), (3,), (n, 6)))
-        # Attributes of MjData are made anew at every access, which takes longer than the kinematics.
-        for i, (q, v) in enumerate(zip(qpos.numpy(), qvel.numpy(), strict=True)):
-            at_q[:], at_v[:] = q, v
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_comVel(model, data)
-            pos[i], quat[i], centres[i], cvel[i] = at_pos, at_quat, at_com, at_cvel
-        turning, moving = cvel[:, 1:, :3], cvel[:, 1:, 3:]
+        made, at, q, v = (pos, quat, centres, cvel), 0, qpos.numpy(), qvel.numpy()
+        for count, (model, data, at_q, at_v, *views) in zip(
+            (MANY, 1), self._worlds(frames), strict=True
+        ):
+            to = at + (frames - at) // count * count
+            # Attributes of MjData are made anew at every access, which takes longer than the kinematics.
+            for i in range(at, to, count):
+                at_q[:], at_v[:] = q[i : i + count], v[i : i + count]
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_comVel(model, data)
+                for out, view in zip(made, views, strict=True):
+                    out[i : i + count] = view
+            at = to
+        turning, moving = cvel[..., :3], cvel[..., 3:]
         # v(xpos) = v(c) + omega x (xpos - c), see `sim.body_linear_velocity_w`.
-        arm = pos[:, 1:] - centres[:, None]
-        out = np.concatenate((pos[:, 1:], quat[:, 1:], moving + np.cross(turning, arm), turning), -1)
-        at, turned, linvel, angvel = torch.from_numpy(out).float().split((3, 4, 3, 3), -1)
-        small = qpos.float()
+        arm = pos - centres[:, None]
+        for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+            moving[..., k] += turning[..., i] * arm[..., j] - turning[..., j] * arm[..., i]
+        small, arrays = qpos.float(), (pos, quat, moving, turning, centres)
+        at_pos, at_quat, linvel, angvel, com = (torch.from_numpy(x) for x in arrays)
         return Pose(
             small,
             qvel.float(),
-            at,
-            turned,
-            linvel,
-            angvel,
-            torch.from_numpy(centres).float(),
+            at_pos.float(),
+            at_quat.float(),
+            linvel.float(),
+            angvel.float(),
+            com.float(),
             self.local(small),
             heading_quat(small[:, 3:7]),
         )
 
-    @cached_property
-    def _data(self) -> tuple[Any, ...]:
-        """Data of the body's model, and views of what goes in and comes out."""
-        data = mujoco.MjData(self.humanoid.model)
-        return data, data.qpos, data.qvel, data.xpos, data.xquat, data.subtree_com[1], data.cvel
+    def _worlds(self, frames: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Models and data of `MANY` bodies and of one, with views of what goes in and comes out; the
+        former only for so many frames."""
+        one = self._world(1)
+        return (self._world(MANY) if frames >= MANY else one), one
+
+    def _world(self, count: int) -> tuple[Any, ...]:
+        if count not in self._made:
+            model = self.humanoid.model
+            if count > 1:
+                model = make_spec(self.humanoid.table, count).compile()
+            data, n = mujoco.MjData(model), len(self.humanoid.bodies)
+            bodies = (x[1:].reshape(count, n, -1) for x in (data.xpos, data.xquat, data.cvel))
+            at_pos, at_quat, at_cvel = bodies
+            self._made[count] = (
+                model, data, data.qpos.reshape(count, -1), data.qvel.reshape(count, -1), at_pos, at_quat,
+                data.subtree_com[1::n], at_cvel,
+            )  # fmt: skip
+        return self._made[count]
 
     def local(self, qpos: Tensor) -> Tensor:
         """`(F, J, 4)` wxyz local turns of hinged bodies."""

@@ -17,8 +17,8 @@ from poise.control.compliance import (
     check_stiffness,
     columns,
     compliant_rate,
+    moving,
     printed_velocity,
-    pseudo_inverse,
     room,
     settled,
     softening,
@@ -65,7 +65,7 @@ class Yielding(Plugin):
         self._weights = columns(table, given.weights, given.root).to(here)
         self._shares = torch.ones_like(self._weights)
         self._felt = [p for p in others if type(p).felt is not Plugin.felt]
-        self._mechanics = Mechanics(backend)
+        self._mechanics = Mechanics(backend, inertia=False)
         if isinstance(given, Compliance):
             # The root has no share of its own.
             self._shares[6:] = columns(table, given.joints, True)[6:].to(here)
@@ -88,6 +88,7 @@ class Yielding(Plugin):
         self.level = torch.full((n,), dial, dtype=torch.float64, device=here)
         self.share = torch.ones_like(self.level)
         self._before, self._k = goal.offset.clone(), 0
+        self._rows = torch.arange(n, device=here).unsqueeze(1)
 
     def turn(self, level: float | Tensor, rows: Tensor | None = None) -> None:
         """Turns the dial of worlds `rows (n,)`, all for None: a level, or N/m.
@@ -192,7 +193,7 @@ class Yielding(Plugin):
         on = torch.cat(list(acts), 1)
         algorithm = isinstance(given, Compliance) and given.law == "algorithm1"
         if algorithm:
-            jacobian = self._mechanics.jacobian(body, point)[0]
+            jacobian = self._mechanics.linear(body, point)
             driven = torch.tensor([f.driven for f in felt for _ in range(f.body.shape[1])])
             change = self._changes(jacobian, force, driven)
         else:
@@ -202,11 +203,12 @@ class Yielding(Plugin):
                 body, on = body.gather(1, pick), on.gather(1, pick)
                 wide = pick.unsqueeze(-1).expand(-1, -1, 3)
                 point, force = point.gather(1, wide), force.gather(1, wide)
-            jacobian, change = self._mechanics.jacobian(body, point)[0], None
+            jacobian, change = self._mechanics.linear(body, point), None
         if isinstance(given, Stiffness):
-            soft = softening(jacobian, force, self.level, self._kp, given.series)
-            way = (force * (soft * on).unsqueeze(-1)).unsqueeze(-1)
-            aim = (pseudo_inverse(jacobian, self._weights) @ way).squeeze(-1).sum(1)
+            series = given.series and not given.hindsight
+            soft = softening(jacobian, force, self.level, self._kp, series)
+            soft = -soft if given.hindsight else soft
+            aim = moving(jacobian, force * (soft * on).unsqueeze(-1), self._weights).sum(1)
             self.share = room(aim[:, 6:], self._least, self._most)
             # u' = (u* - u) / lag, exactly.
             left = float(np.exp(-h / given.lag_s))
@@ -225,21 +227,17 @@ class Yielding(Plugin):
 
     def _against(self, body: Tensor, point: Tensor, jacobian: Tensor) -> Tensor:
         """x' `(N, K, 3)`: how fast points of the characters move against those of their references."""
-        state = self._backend.state
-        wide = body.unsqueeze(-1)
-        origin, turn = (
-            getattr(state, name).gather(1, wide.expand(-1, -1, size)).double()
-            for name, size in (("xpos", 3), ("xquat", 4))
-        )
-        local = quat_rotate(quat_conj(turn), point - origin)
-        at = min(1.0, self._k / self._substeps)
+        state, rows = self._backend.state, self._rows
+        turn = state.xquat[rows, body].double()
+        local = quat_rotate(quat_conj(turn), point - state.xpos[rows, body].double())
+        at, row = min(1.0, self._k / self._substeps), (body - 1).clamp_min(0)
         moves = torch.zeros_like(point)
         for pose, share in zip(self._reference, (1.0 - at, at), strict=True):
-            quat, linear, spin = (
-                field.gather(1, (wide - 1).clamp_min(0).expand(-1, -1, field.shape[-1])).double()
-                for field in (pose.quat, pose.linvel, pose.angvel)
-            )
-            moves += share * (linear + torch.linalg.cross(spin, quat_rotate(quat, local)))
+            if share > 0.0:
+                quat, linear, spin = (
+                    x[rows, row].double() for x in (pose.quat, pose.linvel, pose.angvel)
+                )
+                moves += share * (linear + torch.linalg.cross(spin, quat_rotate(quat, local)))
         own = (jacobian @ state.qvel.double()[:, None, :, None]).squeeze(-1)
         return own - moves
 

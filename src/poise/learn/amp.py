@@ -59,7 +59,11 @@ class AmpConfig:
     """Normalised features are clipped to +-clip."""
     loss: Loss = "bce"
     """bce as in PHC's code, or least_squares: (D - 1)^2 and (D + 1)^2 with the reward
-    max(0, 1 - (D - 1)^2 / 4) scale, as in the AMP paper."""
+    max(0, 1 - shape (D - 1)^2) scale, as in the AMP paper."""
+    shape: float = 0.25
+    """beta of least_squares' reward; Deep Compliant Control has 0.2 for few clips."""
+    clamped: bool = True
+    """Whether least_squares' reward ends at 0; in Deep Compliant Control it does not."""
     lr: float = 1e-4
     """Adam's step size."""
     steps: int = 4
@@ -94,8 +98,23 @@ class AmpConfig:
         for name in ("frames", "lr", "steps", "minibatch", "kept"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "AmpConfig")
+        if not self.shape > 0:
+            raise PoiseError(f"shape must be above 0, got {self.shape:g}", "AmpConfig")
         if not 0 <= self.keep <= 1:
             raise PoiseError(f"keep must lie in [0, 1], got {self.keep}", "AmpConfig")
+
+    @classmethod
+    def compliant(cls, few: bool = True) -> AmpConfig:
+        """The settings of Deep Compliant Control (Lee et al. 2022, Eqs. 12 and 13, Sec. 5.1): pairs of
+        states, as many of the clips as of the character, without replay. What it does not state, the
+        weights of gradient and last layer and the number of steps, is as by default.
+
+        few: whether the clips are few, so that the discriminator learns too quickly: beta 0.2, not 0.25.
+        """
+        return cls(
+            frames=2, hidden=(256, 256, 256), loss="least_squares", shape=0.2 if few else 0.25,
+            clamped=False, lr=1e-4, minibatch=16, replay=0, scale=1.0,
+        )  # fmt: skip
 
     @classmethod
     def phc(cls, faithful: Literal["paper", "code"] = "paper") -> AmpConfig:
@@ -130,7 +149,9 @@ class AmpConfig:
 def style_reward(logit: Tensor, config: AmpConfig) -> Tensor:
     """r_style of D, any shape; see the module's text and `AmpConfig.loss`."""
     if config.loss == "least_squares":
-        return config.scale * (1 - 0.25 * (logit - 1).square()).clamp_min(0.0)
+        # r = 1 - beta (D - 1)^2
+        reward = 1 - config.shape * (logit - 1).square()
+        return config.scale * (reward.clamp_min(0.0) if config.clamped else reward)
     # 1 - sigmoid(D) = sigmoid(-D), and -log sigmoid(-D) = softplus(D).
     return config.scale * functional.softplus(logit).clamp_max(-math.log(LEAST))
 

@@ -117,7 +117,7 @@ class AheadBeside:
             self.decided += 1
             world.choice = Choice(torch.from_numpy(told.offsets), told.smoothing, told.correction)
             world.step, world.since = world.since or 0, None
-        pos, fresh = env.pose().pos, (env.age == 0).tolist()
+        pos, fresh = env.here().pos, (env.age == 0).tolist()
         n = len(obs)
         offsets = torch.zeros(n, env.num_actions)
         keep, much = torch.zeros(n, 1), torch.ones(n, 1)

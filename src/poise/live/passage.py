@@ -43,16 +43,26 @@ class FramePassage:
         self.source, self.target = clip.skeleton, onto.skeleton
         self.factor, self.centre = p.scale.factor, np.array(p.scale.centre)
         self._here, self._there = np.array(p.here.rot), np.array(p.there.rot)
-        self._direct = {b: a for a, b in p.joints.direct}
+        direct, chains = {b: a for a, b in p.joints.direct}, _chains(p)
+        self._direct = np.array(list(direct), dtype=int), np.array(list(direct.values()), dtype=int)
+        self._bent = np.array([c.joint for c in chains], dtype=int)
+        self._low, self._high = (np.array([c[k] for c in chains], dtype=int) for k in (1, 2))
+        self._shares = np.array([c.share for c in chains])
         hips = p.joints.target.joint("hips")
-        self._above = set(self.target.ancestors(hips if hips is not None else 0))
-        self._above_rot = np.array(p.there.above)
-        self._chains = {c.joint: c for c in _chains(p)}
-        self._rest = {
-            j: q.between(self._there[parent], self._there[j])
-            for j, parent in enumerate(self.target.parents)
-            if parent >= 0
-        }
+        above = set(self.target.ancestors(hips if hips is not None else 0))
+        # What hangs on its parent as it does at rest; those that follow each other's level are turned
+        # together.
+        done = {*direct, *self._bent.tolist()}
+        self._hanging = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
+        self._first = None if 0 in done else np.array(p.there.above[0])
+        for joints, parents in _levels(tuple(self.target.parents)):
+            at = [k for k, j in enumerate(joints.tolist()) if j not in done]
+            if at:
+                turns = [
+                    p.there.above[j] if j in above else q.between(self._there[parent], self._there[j])
+                    for j, parent in zip(joints[at].tolist(), parents[at].tolist(), strict=True)
+                ]
+                self._hanging.append((joints[at], parents[at], np.stack(turns)))
         pairs = [p.joints.limb_pair(f"{s}_thigh") for s in SIDES]
         self._thighs = [x for x in pairs if x is not None]
         self._paths = [
@@ -71,23 +81,15 @@ class FramePassage:
         """The same for world rotations `(J, 4)` of the source."""
         turned = q.mul(world, q.conj(self._here))
         out = np.empty((len(self.target), 4))
-        direct = np.array(list(self._direct), dtype=int)
-        out[direct] = q.mul(turned[list(self._direct.values())], self._there[direct])
-        chains = list(self._chains.values())
-        if chains:
-            low = np.stack([turned[c.low] for c in chains])
-            high = np.stack([turned[c.high] for c in chains])
-            at = np.array([c.joint for c in chains])
-            shares = np.array([c.share for c in chains])
-            out[at] = q.mul(q.slerp(low, high, shares), self._there[at])
-        for j, parent in enumerate(self.target.parents):
-            if j in self._direct or j in self._chains:
-                continue
-            if j in self._above:
-                own = self._above_rot[j]
-                out[j] = own if parent < 0 else q.mul(out[parent], own)
-            else:
-                out[j] = q.mul(out[parent], self._rest[j])
+        onto, of = self._direct
+        out[onto] = q.mul(turned[of], self._there[onto])
+        if len(self._bent):
+            bent = q.slerp(turned[self._low], turned[self._high], self._shares)
+            out[self._bent] = q.mul(bent, self._there[self._bent])
+        if self._first is not None:
+            out[0] = self._first
+        for joints, parents, turns in self._hanging:
+            out[joints] = q.mul(out[parents], turns)
         out = q.normalized(out)
         middle = self._middle(0, root_pos, world)
         root = middle + (self.factor - 1.0) * (middle - self.centre) - self._middle(1, np.zeros(3), out)

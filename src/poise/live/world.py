@@ -221,7 +221,10 @@ class World:
         env.drive(self._act(obs) if ahead is None else ahead.act(obs))
         self.looked += ahead is not None and ahead.acts
         env.controls.step(env.backend, self.substeps)
-        env.renew(env.judge())
+        # Nothing is rewarded, and the goal is moved above: a third of a step's time less.
+        env.tick()
+        goal.at += 1
+        goal.aim(None, None)
         self.steps += 1
         self._unwind()
         if bool(self.rows.unstable().any()) or not bool(self.rows.state.qpos.isfinite().all()):
@@ -247,7 +250,7 @@ class World:
                 self.rows.write(torch.tensor([k]), qpos[None], state.qvel[k].clone()[None])
 
     def _seen(self) -> Seen:
-        pose, goal, state = self.env.pose(), self.env.goal_pose(), self.scene.backend.state
+        pose, goal, state = self.env.here(), self.env.goal_pose(), self.scene.backend.state
         self._off = (pose.pos - goal.pos).norm(dim=-1).mean(-1).double().numpy()
         self._speed = pose.linvel.norm(dim=-1).mean(-1).double().numpy()
         self._moves = pose.linvel[:, 0, :2].double()

@@ -22,14 +22,22 @@ class Mechanics:
 
     Args:
         backend: the worlds; all have one model, but for expanded fields.
+        inertia: whether `inertia` and `solve` are asked for, which every physics step pays for.
     """
 
-    def __init__(self, backend: Backend):
+    def __init__(self, backend: Backend, inertia: bool = True):
         self.backend, model, here = backend, backend.model, backend.device
-        backend.state.bind(["cdof", "M"])
-        if backend.state["M"].shape[1:] != (model.nC,):
+        backend.state.bind(["cdof", "M"] if inertia else ["cdof"])
+        if inertia and backend.state["M"].shape[1:] != (model.nC,):
             raise PoiseError("this backend keeps its inertia in another form", "Mechanics")
         self._moves = torch.from_numpy(_ancestors(model)).to(here)
+        # (-[arm] 1) `(3, 6)` as one row: what is fixed in it, and what the arm adds.
+        fixed, cross = np.zeros((3, 6)), np.zeros((3, 3, 6))
+        fixed[:, 3:] = np.eye(3)
+        for k in range(3):
+            cross[k, :, :3] = np.cross(np.eye(3), np.eye(3)[k]).T
+        numbers = (torch.from_numpy(x).to(backend.state["cdof"]) for x in (fixed.ravel(), cross))
+        self._fixed, self._cross = next(numbers), next(numbers).flatten(1)
         self._root = torch.from_numpy(model.body_rootid.astype(np.int64)).to(here)
         rows = np.repeat(np.arange(model.nv), model.M_rownnz)
         places = [rows, model.M_colind[: model.nC]]
@@ -44,25 +52,35 @@ class Mechanics:
             body: one body, K bodies, or `(N, K)`, a different choice per world.
             point_w: `(N, 3)` m for one body, else `(N, K, 3)`.
         """
-        state, n = self.backend.state, self.backend.num_envs
-        single = isinstance(body, int)
-        index = torch.as_tensor(body, dtype=torch.long, device=self.backend.device)
-        index = (index.reshape(1) if single else index).expand(n, -1)
-        if bool(((index < 0) | (index >= self.backend.model.nbody)).any()):
-            most = self.backend.model.nbody - 1
-            raise PoiseError(f"bodies must be in 0 to {most}, got {index.unique().tolist()}", "jacobian")
-        point = point_w[:, None] if single else point_w
+        linear, index = self.linear(body, point_w), self._index(body)
+        turn = self.backend.state["cdof"][..., :3].unsqueeze(1).transpose(2, 3)
+        turning = turn * self._moves[index].unsqueeze(2)
+        return linear, turning[:, 0] if isinstance(body, int) else turning
+
+    def linear(self, body: int | Sequence[int] | Tensor, point_w: Tensor) -> Tensor:
+        """The linear one of `jacobian` alone."""
+        state, n, single = self.backend.state, self.backend.num_envs, isinstance(body, int)
+        index, point = self._index(body), point_w[:, None] if single else point_w
         if point.shape != (n, index.shape[1], 3):
             want = (n, 3) if single else (n, index.shape[1], 3)
             raise PoiseError(f"points must be {want}, got {tuple(point_w.shape)}", "jacobian")
         centre = state.subtree_com.gather(1, self._root[index][..., None].expand(-1, -1, 3))
         arm = point.to(centre) - centre
-        # Each degree of freedom turns and moves the tree about its centre of mass, see `SimState.cvel`.
-        turn, move = state["cdof"].reshape(n, 1, -1, 6).split(3, -1)
-        linear = move + torch.linalg.cross(turn, arm[:, :, None].expand(-1, -1, turn.shape[2], -1))
-        moved = self._moves[index][..., None]
-        both = [(x.expand_as(linear) * moved).transpose(2, 3) for x in (linear, turn)]
-        return (both[0][:, 0], both[1][:, 0]) if single else (both[0], both[1])
+        # Each degree of freedom turns and moves the tree about its centre of mass, see `SimState.cvel`;
+        # the point moves by move - arm x turn.
+        cdof = state["cdof"].unsqueeze(1).transpose(2, 3)
+        linear = (self._fixed + arm @ self._cross).unflatten(-1, (3, 6)) @ cdof
+        linear = linear * self._moves[index].unsqueeze(2)
+        return linear[:, 0] if single else linear
+
+    def _index(self, body: int | Sequence[int] | Tensor) -> Tensor:
+        """`(N, K)` bodies; K is 1 for one."""
+        index = torch.as_tensor(body, dtype=torch.long, device=self.backend.device)
+        index = (index.reshape(1) if isinstance(body, int) else index).expand(self.backend.num_envs, -1)
+        if bool(((index < 0) | (index >= self.backend.model.nbody)).any()):
+            most = self.backend.model.nbody - 1
+            raise PoiseError(f"bodies must be in 0 to {most}, got {index.unique().tolist()}", "jacobian")
+        return index
 
     def inertia(self) -> Tensor:
         """The joint-space inertia M, `(N, nv, nv)`."""

@@ -19,10 +19,13 @@ class DisplacedGoal(Goal):
     """Another goal, moved by `offset (N, 6 + n)`: m and rad of the root, rad of the hinges, in the
     coordinates of velocities (`sim.displaced`). Whatever yields to forces writes the offset, and `rate`
     `(N, 6 + n)`, its velocity, which is added to the goal's.
+
+    hindsight: what is asked for now, by which rewards and ends are judged, stays where it is; what comes
+    next, which policies see and actions add to, is displaced (`Stiffness.hindsight`).
     """
 
-    def __init__(self, goal: Goal):
-        self.goal = goal
+    def __init__(self, goal: Goal, hindsight: bool = False):
+        self.goal, self._hindsight = goal, hindsight
         self.humanoid, self.bodies, self.rate_hz = goal.humanoid, goal.bodies, goal.rate_hz
         self.layout, self.num_envs, self.device = goal.layout, goal.num_envs, goal.device
         self.rng, self.notes, self.begins = goal.rng, goal.notes, goal.begins
@@ -60,7 +63,8 @@ class DisplacedGoal(Goal):
         return self.goal.body(ids)
 
     def now(self, ids: Tensor | None = None) -> Tensor:
-        return self._moved(self.goal.now(ids), ids)
+        now = self.goal.now(ids)
+        return now if self._hindsight else self._moved(now, ids)
 
     def ahead(self, k: int = 1, ids: Tensor | None = None) -> Tensor:
         return self._moved(self.goal.ahead(k, ids), ids)
@@ -73,7 +77,10 @@ class DisplacedGoal(Goal):
         return table[rows] + self.offset[:, 6:], self._every
 
     def advance(self, waited: Tensor | None, held: Tensor | None) -> tuple[Tensor, Tensor]:
-        now, ahead = self._moved_all(torch.stack(self.goal.advance(waited, held), 1), None).unbind(1)
+        now, ahead = self.goal.advance(waited, held)
+        if self._hindsight:
+            return now, self._moved(ahead, None)
+        now, ahead = self._moved_all(torch.stack((now, ahead), 1), None).unbind(1)
         return now, ahead
 
     def watch(self, qpos: Tensor, pos: Tensor, linvel: Tensor) -> bool:

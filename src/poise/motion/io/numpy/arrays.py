@@ -19,12 +19,15 @@ import numpy as np
 from numpy.lib import format as npy
 
 from poise.errors import PoiseError, did_you_mean
+from poise.motion.io.numpy.zips import directory_bytes
 from poise.motion.io.text import CUT_OFF, MAX_VALUE, check_file, listed, shown
 
 MAX_ARRAY_BYTES = 512 << 20
 """Larger arrays are refused by what their header states, before memory is taken."""
 MAX_KEYS = 4096
 """NumPy archives with more arrays are refused."""
+MAX_DIRECTORY = MAX_KEYS << 10
+"""Bytes of an archive's directory; a larger one is refused before it is read."""
 NPY_MAGIC = b"\x93NUMPY"
 ASK = "Read it with --allow-pickle (in Python: allow_pickle); no code in it will run"
 """The hint of every refusal of a pickled file."""
@@ -73,9 +76,12 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """The archive; whatever is wrong with it becomes one sentence."""
     check_file(path, 2 * MAX_ARRAY_BYTES)
     try:
+        crowded = PoiseError(f"the archive holds more than {MAX_KEYS} arrays", path)
+        if directory_bytes(path) > MAX_DIRECTORY:
+            raise crowded
         with zipfile.ZipFile(path) as archive:
             if len(archive.infolist()) > MAX_KEYS:
-                raise PoiseError(f"the archive holds more than {MAX_KEYS} arrays", path)
+                raise crowded
             yield archive
     except _DAMAGE as error:
         raise PoiseError(f"the NumPy archive is damaged ({shown(error)})", path, CUT_OFF) from None
