@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from handmade_gltf_files import Gltf, walker
-from handmade_numpy_files import odd_clip
+from handmade_numpy_files import odd_clip, poselib, save_npy
 from test_opensim_files import mot
 
 from poise.errors import PoiseError
@@ -138,3 +138,19 @@ def test_a_shape_beyond_all_numbers(tmp_path: Path) -> None:
             archive.writestr(f"{key}.npy", header)
     said = refusal(tmp_path / "a.npz", (tmp_path / "sound.npz").read_bytes())
     assert "1e+09 GB and more than the limit" in said or "more than the limit" in said
+
+
+def test_a_joint_name_that_no_file_could_hold(tmp_path: Path) -> None:
+    motion = poselib()
+    names = motion["skeleton_tree"]["node_names"]
+    names[1] = "right_\0\1"
+    save_npy(tmp_path / "a.npy", motion)
+    assert "'right_??' is no joint name" in refusal(
+        tmp_path / "b.npy", (tmp_path / "a.npy").read_bytes()
+    )
+
+
+def test_times_beyond_all_bounds(tmp_path: Path, table: str) -> None:
+    line = next(x for x in reversed(table.splitlines()) if x)
+    far = table.replace(line, "1e308" + line[line.index(",") :])
+    assert "s after the one before it" in refusal(tmp_path / "a.csv", far.encode())

@@ -172,8 +172,8 @@ class ImitationEnv:
         self.goal.rng.manual_seed(seed)
 
     def reset_to(self, clip: Tensor, frame: Tensor, kind: Tensor | None = None) -> Tensor:
-        """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; frames past the end of a cyclic
-        clip are where its later cycles are. Gives observations.
+        """Starts world i exactly on `frame[i]` of `clip[i]`, both `(N,)`; frames past the end of a clip
+        that goes on are where its later cycles are. Gives observations.
 
         kind: `(N,)` kinds of episodes of a plug-in, such as those of `poise.env.recovery`; None begins
             ordinary ones.

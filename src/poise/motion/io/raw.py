@@ -20,7 +20,7 @@ from poise.motion.io.guess import (
     stated_unit,
     teleports,
 )
-from poise.motion.io.text import MAX_JOINTS
+from poise.motion.io.text import MAX_JOINTS, shown
 from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
 from poise.spatial import normalize, unwrap_quats
 
@@ -199,6 +199,8 @@ def _rate(raw: RawMotion) -> str:
 def _check(raw: RawMotion) -> None:
     if len(raw.names) > MAX_JOINTS:
         raise PoiseError(f"it has {len(raw.names)} joints, more than the {MAX_JOINTS} allowed", raw.path)
+    if odd := [n for n in raw.names if not n.isprintable()]:
+        raise PoiseError(f"{shown(odd[0])} is no joint name", raw.path)
     check_frames(len(raw.root_pos), raw.path)
     if not np.abs(raw.offsets).max() > 0:
         raise PoiseError("no bone of the skeleton has any length (all offsets are zero)", raw.path)
