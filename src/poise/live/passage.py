@@ -50,8 +50,7 @@ class FramePassage:
         self._shares = np.array([c.share for c in chains])
         hips = p.joints.target.joint("hips")
         above = set(self.target.ancestors(hips if hips is not None else 0))
-        # What hangs on its parent as it does at rest; those that follow each other's level are turned
-        # together.
+        # What hangs on its parent as it does at rest; joints of one level are turned together.
         done = {*direct, *self._bent.tolist()}
         self._hanging = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
         self._first = None if 0 in done else np.array(p.there.above[0])
