@@ -91,7 +91,8 @@ def test_landing_and_standing_are_those_of_the_cpu(make_spec):
     With a round friction cone; the pyramid's edges differ for steep capsules, see docs/gpu.md.
     """
     config = SimConfig(cone="elliptic")
-    warp = WarpBackend(make_spec(sensors=True, config=config), 2, WARP_DEVICE)
+    spec = make_spec(sensors=True, config=config)
+    warp = WarpBackend(spec, 2, WARP_DEVICE, deterministic=True)
     cpu = CpuBackend(make_spec(sensors=True, config=config), 2)
     weight = 9.81 * float(cpu.model.body_mass.sum())
     most = 0.0

@@ -101,13 +101,13 @@ class Drive:
             arm = point - xipos[:, body].to(like)
             torque = torch.linalg.cross(arm, force)
             like[:, body, :3].add_(force)
-            like[:, body, 3:].add_(torque if torque_w is None else torque + torque_w)
+            like[:, body, 3:].add_(torque if torque_w is None else torque + torque_w.to(like))
             return
         index = torch.as_tensor(body, dtype=torch.long, device=like.device)
         index = index.expand(self.num_envs, index.shape[-1])[..., None]
         arm = point - xipos.to(like).gather(1, index.expand(-1, -1, 3))
         torque = torch.linalg.cross(arm, force.expand_as(arm))
         if torque_w is not None:
-            torque = torque + torque_w
+            torque = torque + torque_w.to(like)
         wrench = torch.cat([force.expand_as(arm), torque], -1)
         like.scatter_add_(1, index.expand(-1, -1, 6), wrench)
