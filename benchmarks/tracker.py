@@ -1,7 +1,9 @@
-"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
+r"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
 
     python benchmarks/tracker.py --library FOLDER --onto FOLDER/cmu_amc/02/02_01.amc -o RUN --minutes 60
     python benchmarks/tracker.py --library FOLDER --from RUN --step 4e-5 -o FINER --minutes 60
+    python benchmarks/tracker.py --library FOLDER --from RUN --step 5e-5 --recovery 0.3 --seed 7 -o LARGER \
+        --device cuda --worlds 16384 --minibatch 16384 --cooling 0.5 --every 10000 --minutes 5.3
 
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
@@ -112,6 +114,11 @@ def main() -> None:
     parser.add_argument("--filter", type=float, default=0.0)
     parser.add_argument("--hips", action="store_true")
     parser.add_argument("--recovery", type=float, default=0.4)
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--worlds", type=int, default=4096, help="characters at once")
+    parser.add_argument("--minibatch", type=int, default=8192)
+    parser.add_argument("--cooling", type=float, default=0.0, help="share with smaller steps")
+    parser.add_argument("--every", type=int, default=12, help="iterations between evaluations")
     a = parser.parse_args()
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")
@@ -121,19 +128,23 @@ def main() -> None:
         if earlier
         else config(a.seed)
     )
+    if earlier:
+        large = {"num_envs": a.worlds, "cooling": a.cooling, "evaluate_every": a.every}
+        settings = replace(settings, ppo=replace(settings.ppo, minibatch=a.minibatch), **large)
     source, trained = str(a.library), None
     if a.resume:
-        imitation = resume(a.out, settings, source)
+        imitation = resume(a.out, settings, source, a.device)
     else:
         how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
         held = (HELD_OUT, TWINS, print, earlier.target if earlier else a.onto, how)
         library, notes = clips_of(a.library, BodyConfig(), *held)
         print(*notes, sep="\n")
-        imitation = begin(a.out, library, settings, source, earlier=earlier)
+        imitation = begin(a.out, library, settings, source, a.device, earlier)
         trained = widened(earlier, imitation) if earlier else None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         until, first = Until(minutes=a.minutes), beginning()
-        train(imitation, a.out, until, show, a.threads, beginning=first, trained=trained)
+        how = {"device": a.device, "beginning": first, "trained": trained}
+        train(imitation, a.out, until, show, a.threads, **how)
 
 
 if __name__ == "__main__":

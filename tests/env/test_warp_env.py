@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from poise.env import ImitationEnv
+from poise.env import ImitationEnv, Reference
 from poise.eval import run_episodes
 from poise.learn import PPOConfig
 from poise.learn.train import Trainer
@@ -61,6 +61,21 @@ def test_steps_are_those_of_the_cpu(make_task, make_phc, phc):
     goes_on_elsewhere(warp, cpu)
     trains(warp)
     evaluates(task)
+
+
+@needs_warp
+def test_cycles_are_carried_where_the_worlds_are(make_task):
+    """What a clip that goes round has travelled by its second cycle, on the device of the worlds."""
+    own = make_task(swing(0.4)).reference
+    motion = own.qpos.numpy().copy()
+    motion[-1] = motion[0]
+    motion[-1, 0] += 0.5
+    cyclic = Reference(own.humanoid, [motion], own.rate_hz, ["round"], [True])
+    there = cyclic.to(torch.device(WARP_DEVICE))
+    clip, frame = torch.zeros(2, dtype=torch.long), torch.tensor([0, len(motion) + 1])
+    turn, move = there.carry(clip.to(there.qpos.device), frame.to(there.qpos.device))
+    assert turn.device == move.device == there.qpos.device
+    assert move[:, 0].tolist() == pytest.approx([0.0, 0.5])
 
 
 def close(got: Tensor, want: Tensor) -> None:

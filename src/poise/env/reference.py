@@ -225,9 +225,9 @@ class Reference:
         )
         if not bool((cycles > 0).any()):
             return None
-        turn = torch.zeros(len(clip), 4, dtype=torch.float64)
+        turn = torch.zeros(len(clip), 4, dtype=torch.float64, device=clip.device)
         turn[:, 0] = 1.0
-        move = torch.zeros(len(clip), 3, dtype=torch.float64)
+        move = torch.zeros(len(clip), 3, dtype=torch.float64, device=clip.device)
         for k in range(int(cycles.max())):
             more = (cycles > k)[:, None]
             # x -> turn1 x + travel1, applied once per cycle
