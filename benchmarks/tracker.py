@@ -2,8 +2,9 @@ r"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
 
     python benchmarks/tracker.py --library FOLDER --onto FOLDER/cmu_amc/02/02_01.amc -o RUN --minutes 60
     python benchmarks/tracker.py --library FOLDER --from RUN --step 4e-5 -o FINER --minutes 60
-    python benchmarks/tracker.py --library FOLDER --from RUN --step 5e-5 --recovery 0.3 --seed 7 -o LARGER \
-        --device cuda --worlds 16384 --minibatch 16384 --cooling 0.5 --every 10000 --minutes 5.3
+    python benchmarks/tracker.py --library FOLDER --from RUN -o LARGER --step 5e-5 --seed 7 \
+        --recovery 0.3 --device cuda --worlds 16384 --minibatch 16384 --cooling 0.5 \
+        --every 10000 --minutes 5.3
 
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions

@@ -141,11 +141,11 @@ def test_keyframes_become_a_simulated_motion(tracker: Tracker, tmp_path: Path) -
 
 
 def test_too_little_time_is_given_more(tracker: Tracker, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hips 2 m on in 0.2 s: the gap gets longer."""
+    """Hips 4 m on in 0.2 s: the gap gets longer."""
     monkeypatch.setattr(completing, "ROUNDS", 2)
     clip = swing(2.0)
     root = clip.root_pos.copy()
-    root[36:, 0] += 2.0
+    root[36:, 0] += 4.0
     done = complete(
         clip.replaced(root_pos=root), (0, 30, 36, 59), tracker, lookahead=FEW, threads=1, adapt=0,
         supports="none", retime=True, controller="lookahead",
