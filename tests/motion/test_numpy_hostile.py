@@ -96,8 +96,8 @@ AMASS: dict[str, tuple[dict[str, Any], str]] = {
         {"weights": np.zeros(3)},
         ": its arrays are no motion that is known ('weights'). Known: Poise's own arrays; AMASS and the "
         "SMPL family (poses, trans); Kimodo (posed_joints); poselib (skeleton_tree, rotation); "
-        "keypoints (positions, names, fps); MDM results (motion, lengths); SMPL's joints (joints, "
-        "fps); OpenSim coordinates (q_hip_flexion_r, ...)",
+        "keypoints (positions, names, fps); MDM (motion, lengths); joints, fps; OpenSim "
+        "coordinates (q_hip_flexion_r, ...)",
     ),
     "robot": (
         {"qpos": np.zeros((5, 36))},

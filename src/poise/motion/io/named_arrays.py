@@ -48,8 +48,8 @@ KINDS: tuple[Kind, ...] = (
     Kind("Kimodo (posed_joints)", is_kimodo, read_kimodo),
     Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
     Kind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
-    Kind("MDM results (motion, lengths)", is_mdm, as_clip(mdm_points)),
-    Kind("SMPL's joints (joints, fps)", is_named_joints, as_clip(named_joint_points)),
+    Kind("MDM (motion, lengths)", is_mdm, as_clip(mdm_points)),
+    Kind("joints, fps", is_named_joints, as_clip(named_joint_points)),
     Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
     Kind("a robot's joint angles", is_qpos, refuse_qpos),
 )
