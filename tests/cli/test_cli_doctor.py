@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tiny_clips import bvh, put
 
+from poise.cli.info import _guess
 from poise.cli.main import main
 from poise.motion import read_clip, shifted, write_clip
 
@@ -133,6 +134,12 @@ def test_the_floor_can_be_stated_or_taken_from_the_soles(broken: Path, capsys) -
     assert ground() == pytest.approx(0.06, abs=0.02)
     assert ground("--ground", "auto") == pytest.approx(0.0, abs=1e-3)
     assert ground("--ground", "0.04") == pytest.approx(ground() - 0.04, abs=1e-6)
+
+
+def test_a_floor_that_is_0_but_for_rounding_is_0() -> None:
+    guess = {"what": "ground", "value": 4.1633e-17, "evidence": "E", "override": "O"}
+    assert _guess(guess) == "ground: 0. E. [O]"
+    assert _guess({**guess, "value": -0.0125}) == "ground: -0.0125. E. [O]"
 
 
 def test_sides_can_be_exchanged(tmp_path: Path, capsys) -> None:

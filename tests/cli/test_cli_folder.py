@@ -75,4 +75,13 @@ def test_ctrl_c_ends_the_folder(folder: Path) -> None:
 def test_what_takes_single_files_says_so(folder: Path, tmp_path: Path, refused) -> None:
     (tmp_path / "empty").mkdir()
     refused("imitate", folder, "-o", tmp_path / "out", words=("folder", "poise fleet"))
-    refused("info", tmp_path / "empty", words=("no motion file",))
+    refused("info", tmp_path / "empty", words=("no motion file", "TRC", "docs/formats.md"))
+
+
+def test_2d_keypoints_are_named(tmp_path: Path, refused) -> None:
+    frame = '{"version": 1.3, "people": [{"pose_keypoints_2d": [1, 2, 0.9]}]}'
+    (tmp_path / "json" / "cam1").mkdir(parents=True)
+    put(tmp_path / "json" / "cam1", "a_000000000000_keypoints.json", frame)
+    for verb in (("info",), ("fleet", "-o", tmp_path / "out")):
+        told = ("2D keypoints of one camera (OpenPose)", "no depth", "3D poses")
+        refused(verb[0], tmp_path / "json", *verb[1:], words=told)

@@ -45,6 +45,8 @@ def test_iterations_must_be_a_sensible_number(
     argv = ["inbetween", str(walk), "--keyframes", "0,30", "-o", str(tmp_path / "o.bvh")]
     assert main([*argv, "--adapt", "-1"]) == 2
     assert "--adapt must be 0 to 1000" in capsys.readouterr().err
+    assert main([*argv, "--samples", "0"]) == 2
+    assert "--samples must lie in 1 to 100, got 0" in capsys.readouterr().err
 
 
 def test_a_name_without_a_format_is_refused_before_the_work(

@@ -172,6 +172,19 @@ def test_another_skeleton_with_noise_and_resets(
     assert (out / "body.bvh").exists()
 
 
+def test_jitter_is_named_with_what_takes_it_away(
+    file: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clip, keys = read_clip(short), tmp_path / "keys.npz"
+    points = clip.positions() + np.random.default_rng(0).normal(size=clip.positions().shape) * 0.01
+    np.savez(keys, positions=points, names=np.array(clip.skeleton.names), fps=clip.fps)
+    argv = ["track", str(keys), "--policy", str(file), *ALONE]
+    assert main([*argv, "-o", str(tmp_path / "a")]) in (0, LOST)
+    assert capsys.readouterr().out.count("--smooth HZ") == 1
+    assert main([*argv, "-o", str(tmp_path / "b"), "--smooth", "6"]) in (0, LOST)
+    assert "--smooth HZ" not in capsys.readouterr().out
+
+
 def test_the_report_tells_of_the_file_that_came_in(
     file: Path, tmp_path: Path, refused, capsys: pytest.CaptureFixture[str]
 ) -> None:

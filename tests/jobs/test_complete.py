@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from poise.body import find_anatomy
+from poise.cli.complete import _say
 from poise.cli.main import main
 from poise.errors import PoiseError
 from poise.jobs import complete as completing
@@ -175,6 +177,22 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert main([*args, "-o", str(tmp_path / "bad"), *more]) == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "bad").exists()
+
+
+def test_warnings_are_no_part_of_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    """They are notes, which are shown once, at the end."""
+    warned = SimpleNamespace(stages=(), filled=SimpleNamespace(warnings=("the gap is long",)))
+    _say(warned)  # type: ignore[arg-type]
+    told = capsys.readouterr()
+    assert "the gap is long" not in told.out + told.err
+
+
+def test_neighbours_leave_nothing_to_fill(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out = tmp_path / "keys.bvh", tmp_path / "out.bvh"
+    write_clip(swing(0.5), file)
+    argv = ["complete", str(file), "--keyframes", "0,1,2", "-o", str(out), "--kinematic"]
+    assert main(argv) == 0 and out.exists()
+    assert capsys.readouterr().out.count("nothing to fill between these keyframes") == 1
 
 
 def test_a_config_keeps_its_own_lookahead(tracker: Tracker) -> None:

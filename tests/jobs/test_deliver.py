@@ -76,7 +76,10 @@ def test_the_written_motion_is_as_high_as_its_source(height: float):
     for name, clip in done.clips.items():
         assert np.abs(again.clips[name].positions() - clip.positions()).max() < 1e-6
     (told,) = (note for note in done.notes if note.startswith("high") and "as high as" in note)
-    assert "on a floor at" in told
+    moved = -1000 * height
+    # Up for a clip below the floor of the simulation, down for one above.
+    assert float(told.split("moved by ")[1].split(" mm to stand")[0]) == pytest.approx(moved, abs=25)
+    assert "--ground" not in told
 
 
 class Nothing:

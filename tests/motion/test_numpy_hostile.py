@@ -96,8 +96,8 @@ AMASS: dict[str, tuple[dict[str, Any], str]] = {
         {"weights": np.zeros(3)},
         ": its arrays are no motion that is known ('weights'). Known: Poise's own arrays; AMASS and the "
         "SMPL family (poses, trans); Kimodo (posed_joints); poselib (skeleton_tree, rotation); "
-        "keypoints (positions, names, fps); MDM results (motion, lengths); OpenSim coordinates "
-        "(q_hip_flexion_r, ...)",
+        "keypoints (positions, names, fps); MDM (motion, lengths); joints, fps; OpenSim "
+        "coordinates (q_hip_flexion_r, ...)",
     ),
     "robot": (
         {"qpos": np.zeros((5, 36))},
@@ -190,6 +190,15 @@ def test_single_arrays_and_robots_are_named(tmp_path: Path) -> None:
         ": it holds one array of shape (20, 23, 3) without joint names or a frame rate. Joints of SMPL "
         "are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays"
     )
+    for shape, message in (
+        ((60, 263), "holds the features of HumanML3D, and no joints. Give the joints recovered"),
+        ((5, 20, 22, 3), "holds 5 clips. Save each as a file of its own"),
+        ((5, 20, 24, 3), "holds 5 clips"),
+        ((20, 66), "may be joints of shape (20, 22, 3), flattened. If so, save it with reshape(20, 22,"),
+        ((20, 72), "may be joints of shape (20, 24, 3)"),
+    ):
+        np.save(tmp_path / "a.npy", np.zeros(shape))
+        assert message in refusal(tmp_path / "a.npy")
     row = "0,0,0.8,1,0,0,0," + ",".join(["0.1"] * 29)
     assert refusal(put(tmp_path, "a.csv", "\n".join([row] * 5))) == (
         ": its rows of 36 numbers are a robot's root pose and 29 joint angles (qpos), which mean "

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from handmade_numpy_files import amass, save_npz
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip
@@ -268,6 +269,22 @@ def test_results_of_the_motion_diffusion_model(data_dir: Path) -> None:
         mdm_points(data, path, ReadOptions(take="1"))
     with pytest.raises(PoiseError, match="none with index 2"):
         mdm_points(data, path, ReadOptions(take="2"))
+
+
+def test_joints_with_their_rate_are_read_as_joints_alone(tmp_path: Path) -> None:
+    points = read_clip(save_npz(tmp_path / "smpl.npz", amass(66))).positions()
+    clip = read_clip(save_npz(tmp_path / "a.npz", {"joints": points, "fps": np.array(30.0)}))
+    np.save(tmp_path / "a.npy", points)
+    alone = read_clip(tmp_path / "a.npy", fps=30.0)
+    assert clip.fps == 30.0 and np.array_equal(clip.rot, alone.rot)
+    assert clip.skeleton.source.format == "joints"
+    for told in (clip, alone):
+        assert "states no unit: metres taken" in dict(told.skeleton.source.evidence)["unit"]
+    stated = read_clip(tmp_path / "a.npy", fps=30.0, unit_m=1.0)
+    assert dict(stated.skeleton.source.evidence)["unit"] == "Stated with --unit"
+    bad = save_npz(tmp_path / "b.npz", {"joints": points[:, :9], "fps": np.array(30.0)})
+    with pytest.raises(PoiseError, match="others need positions, names and fps"):
+        read_clip(bad)
 
 
 def write_c3d(path: Path, positions: np.ndarray, names: tuple[str, ...], unit: str = "mm") -> None:

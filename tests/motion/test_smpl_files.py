@@ -101,6 +101,19 @@ def test_rest_joints_of_the_file_are_taken(tmp_path: Path) -> None:
     check_round_trip(clip, tmp_path / "b.npz")
 
 
+def test_what_was_taken_is_not_said_to_be_stated(tmp_path: Path) -> None:
+    def why(**options: Any) -> dict[str, str]:
+        return dict(read_clip(tmp_path / "a.npz", **options).skeleton.source.evidence)
+
+    save_npz(tmp_path / "a.npz", amass(66))
+    assert why()["up"] == "The file states no vertical: Z taken, as AMASS has it"
+    assert why()["unit"] == "The file states no unit: metres taken, as AMASS has it"
+    stated = why(up_axis="Z", unit_m=1.0)
+    assert (stated["up"], stated["unit"]) == ("Stated with --up", "Stated with --unit")
+    save_npz(tmp_path / "a.npz", {**amass(66), "up_axis": np.array("Z")})
+    assert why()["up"] == "The format itself states it"
+
+
 def test_parts_that_are_kept_apart(tmp_path: Path) -> None:
     data = amass(165)
     poses = data.pop("poses")

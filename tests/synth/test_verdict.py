@@ -71,6 +71,9 @@ def test_a_gap_with_faults_is_filled_anew_and_one_without_is_not(
     named = fill_keyframes(clip, (15, 45, 75), model(), Filling(rounds=1))
     assert any(f.kind == "teleport" and f.gap == (45, 75) for f in named.faults)
     assert any("the root jumps" in w for w in named.warnings)
+    assert not any(w.startswith("sample") for w in named.warnings)
+    two = fill_keyframes(clip, (45, 75), model(), Filling(samples=2, rounds=1))
+    assert [w[:10] for w in two.warnings if "the root jumps" in w] == ["sample 0: ", "sample 1: "]
     calls.clear()
     mended = fill_keyframes(clip, (15, 45, 75), model())
     assert not any(f.kind == "teleport" for f in mended.faults)

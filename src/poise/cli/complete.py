@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.answer import LOST, Answer
-from poise.cli.console import print_card, say, table, tell
+from poise.cli.console import print_card, say, table
 from poise.cli.inbetween import frames_of
 from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import claimed, may_deliver, may_write, places
@@ -192,5 +192,3 @@ def _say(done: Completed) -> None:
     ]  # fmt: skip
     names = ("stage", "keyframes mm", "foot slide mm/s", "sinks mm", "jerk m/s^3", "fastest m/s")
     table("stage by stage", names, rows, left=1)
-    for note in done.filled.warnings:
-        tell(f"warning: {note}.", "yellow")

@@ -19,7 +19,7 @@ def clips_in(given: Sequence[Path], out: Path | None = None) -> list[tuple[str, 
     Raises:
         PoiseError: no such file, or no motion in it.
     """
-    from poise.jobs.library.files import is_motion
+    from poise.jobs.library.files import is_motion, refuse_without_motion
 
     found: list[tuple[str, Path]] = []
     for path in given:
@@ -34,8 +34,7 @@ def clips_in(given: Sequence[Path], out: Path | None = None) -> list[tuple[str, 
             if out is None or not f.is_relative_to(out)
         ]
     if not found:
-        where = ", ".join(map(str, given)) or None
-        raise PoiseError("holds no motion file", where, "Give a folder with BVH, AMC or DeepMimic files")
+        refuse_without_motion(given)
     seen: dict[str, int] = {}
     named = []
     for name, path in found:

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import say, tell
-from poise.cli.options import Flag, Reading
+from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import may_write
 from poise.cli.progress import left, showing
 from poise.errors import PoiseError
@@ -63,6 +63,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     keys = frames_of(o.keyframes)
     if not 0 <= o.adapt <= 1000:
         raise PoiseError(f"--adapt must be 0 to 1000, got {o.adapt}")
+    check_range("samples", o.samples, 1, 100)
     one = o.samples == 1
     outs = [o.out] if one else [o.out.with_stem(f"{o.out.stem}-{k}") for k in range(o.samples)]
     check_writable(outs[0])

@@ -68,9 +68,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
 
 def _guess(guess: dict[str, Any]) -> str:
-    """One guess in a line."""
+    """One guess in a line; a number that is 0 but for rounding is 0."""
     value = guess["value"]
-    value = "not told" if value is None else f"{value:.5g}" if isinstance(value, float) else value
+    if isinstance(value, float):
+        value = f"{value if abs(value) >= 1e-9 else 0:.5g}"
+    value = "not told" if value is None else value
     return f"{guess['what']}: {value}. {guess['evidence']}. [{guess['override']}]"
 
 

@@ -216,7 +216,9 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         "score": done.card.to_dict(),
     }
     saved = {"policy": o.save_policy} if o.save_policy else {}
-    told = (*tracked.notes, *done.notes)
+    # What reading says of keypoints that jitter, which an option mends.
+    read_so = tracked.placed.source.skeleton.source.notes
+    told = (*(f"{n}." for n in read_so if "--smooth" in n), *tracked.notes, *done.notes)
     code = LOST if lost or survived else 0
     return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
 

@@ -180,8 +180,8 @@ def _floor_told(name: str, floor_m: float) -> list[str]:
     if not floor:
         return []
     return [
-        f"{name}: the written motion stands as high as the source, on a floor at {floor:+d} mm. Reading "
-        "it with --ground auto puts that floor at 0."
+        f"{name}: it was moved by {-floor:+d} mm to stand on the floor of the simulation; the written "
+        "motion is as high as the source again."
     ]
 
 

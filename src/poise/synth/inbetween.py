@@ -80,6 +80,8 @@ def fill_keyframes(
     other = unlike(clip, model)
     step = clip.fps / model.fps
     gaps, inserted, warnings = split_gaps(keys, (model.longest + 1) * step - 1)
+    if not gaps:
+        warnings.append("There is nothing to fill between these keyframes: the clip stays as it is")
     own = without_still_root(clip)
     root, rot = own.tensors()
     for k in inserted:
@@ -115,8 +117,9 @@ def fill_keyframes(
         name = clip.name if filling.samples == 1 else f"{clip.name}-{sample}"
         clips.append(_as_clip(clip, root_, rot_, name))
         faults += found
-    if faults:
-        warnings.append(named(faults))
+    for k in sorted({f.sample for f in faults}):
+        at = f"sample {k}: " if filling.samples > 1 else ""
+        warnings.append(at + named([f for f in faults if f.sample == k]))
     gaps_over = tuple(
         max((c.over for (x, y), c in filler.calmed.items() if a <= x and y <= b), default=0.0)
         for a, b in pairwise(keys)

@@ -8,10 +8,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from poise.errors import PoiseError
 from poise.motion.io.formats import READERS
+from poise.motion.io.refused import refuse_flat_folder
 from poise.motion.io.text import read_head
 
 #: Files that hold part of a motion beside them: its skeleton, its numbers.
@@ -61,8 +62,7 @@ def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFi
             *folders, stem = file.relative_to(base).with_suffix("").parts
             found.setdefault(file, (*folders, stem.replace("-", "_")))
     if not found:
-        where = ", ".join(map(str, given)) or None
-        raise PoiseError("holds no motion file", where, "Give a folder with BVH, AMC or DeepMimic files")
+        refuse_without_motion(given)
     out, seen = [], {}
     for path, parts in sorted(found.items(), key=lambda item: (item[1], str(item[0]))):
         name = "-".join(parts)
@@ -70,6 +70,16 @@ def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFi
         unique = name if seen[name] == 1 else f"{name}-{seen[name]}"
         out.append(MotionFile(path, unique, subject_of(unique)))
     return out
+
+
+def refuse_without_motion(given: Sequence[Path]) -> NoReturn:
+    """Refuses folders without any motion file, and says which files are."""
+    for folder in given:
+        if folder.is_dir():
+            refuse_flat_folder(folder)
+    where = ", ".join(map(str, given)) or None
+    hint = "Give a folder with motion files (BVH, AMC, GLB, C3D, TRC, npz and more: docs/formats.md)"
+    raise PoiseError("holds no motion file", where, hint)
 
 
 def is_motion(path: Path) -> bool:

@@ -21,13 +21,15 @@ from poise.motion.io.points.arrays import (
     array_points,
     is_joints,
     is_mdm,
+    is_named_joints,
     is_points,
     joint_points,
     mdm_points,
+    named_joint_points,
 )
 from poise.motion.io.points.raw import as_clip
 from poise.motion.io.raw import ReadOptions
-from poise.motion.io.refused import is_qpos, refuse_qpos
+from poise.motion.io.refused import is_qpos, refuse_array, refuse_qpos
 from poise.motion.io.text import listed, shown
 
 
@@ -46,7 +48,8 @@ KINDS: tuple[Kind, ...] = (
     Kind("Kimodo (posed_joints)", is_kimodo, read_kimodo),
     Kind("poselib (skeleton_tree, rotation)", is_poselib, read_poselib),
     Kind("keypoints (positions, names, fps)", is_points, as_clip(array_points)),
-    Kind("MDM results (motion, lengths)", is_mdm, as_clip(mdm_points)),
+    Kind("MDM (motion, lengths)", is_mdm, as_clip(mdm_points)),
+    Kind("joints, fps", is_named_joints, as_clip(named_joint_points)),
     Kind("OpenSim coordinates (q_hip_flexion_r, ...)", is_opensim, read_loco),
     Kind("a robot's joint angles", is_qpos, refuse_qpos),
 )
@@ -78,11 +81,7 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
                 file.seek(0)
                 return as_clip(joint_points)(read_npy(file, path), path, options)
             if not header.dtype.hasobject:
-                raise PoiseError(
-                    f"it holds one array of shape {header.shape} without joint names or a frame rate",
-                    path,
-                    "Joints of SMPL are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays",
-                )
+                refuse_array(header.shape, path)
     if not options.allow_pickle:
         raise PoiseError("this is a pickled file", path, ASK)
     return _read(load_restricted(path), path, options)

@@ -82,6 +82,23 @@ def refuse_qpos(data: Mapping[str, Any], path: Path, options: ReadOptions) -> No
     )
 
 
+def refuse_array(shape: tuple[int, ...], path: Path) -> NoReturn:
+    """One array that is no motion by itself: what its shape tells, and what to give."""
+    what = f"it holds one array of shape {shape} without joint names or a frame rate"
+    hint = "Joints of SMPL are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays"
+    if len(shape) == 2 and shape[1] == 263:
+        what = f"its array of shape {shape} holds the features of HumanML3D, and no joints"
+        hint = "Give the joints recovered from them, (T, 22, 3)"
+    elif len(shape) == 4 and shape[2:] in ((22, 3), (24, 3)):
+        what = f"its array of shape {shape} holds {shape[0]} clips"
+        hint = "Save each as a file of its own"
+    elif len(shape) == 2 and shape[1] in (66, 72):
+        joints = (shape[0], shape[1] // 3, 3)
+        what = f"its array of shape {shape} may be joints of shape {joints}, flattened"
+        hint = f"If so, save it with reshape{joints}; save rotations as npz with poses and trans"
+    raise PoiseError(what, path, hint)
+
+
 def looks_like_openpose(head: bytes) -> bool:
     """Whether a file's first bytes are one frame of OpenPose's JSON."""
     return head[:1] == b"{" and (b"pose_keypoints_2d" in head or b'"people"' in head[:200])
@@ -94,11 +111,15 @@ def refuse_openpose(path: Path, options: ReadOptions) -> NoReturn:
 
 def refuse_folder(path: Path) -> NoReturn:
     """A folder is no motion; one of OpenPose's JSON files is told from others."""
-    first = next(iter(sorted(path.glob("*.json"))), None)
-    if first is not None and first.is_file():
+    refuse_flat_folder(path)
+    raise PoiseError("this is a folder, not a motion file", path, "Name one file in it")
+
+
+def refuse_flat_folder(path: Path) -> None:
+    """Refuses a folder of OpenPose's JSON files, told by the first of its JSON files."""
+    first = next((f for f in sorted(path.rglob("*.json")) if f.is_file()), None)
+    if first is not None:
         with first.open("rb") as file:
             if looks_like_openpose(file.read(4096).lstrip()):
-                raise PoiseError(
-                    "this folder holds the 2D keypoints of one camera (OpenPose)", path, FLAT_HINT
-                )
-    raise PoiseError("this is a folder, not a motion file", path, "Name one file in it")
+                what = "this folder holds the 2D keypoints of one camera (OpenPose), which have no depth"
+                raise PoiseError(what, path, f"{FLAT_HINT}; or estimate 3D poses from the video")

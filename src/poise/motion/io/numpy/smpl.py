@@ -18,12 +18,14 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_poses
 from poise.motion.info import sampled
+from poise.motion.io.guess import Guess
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
 from poise.motion.io.raw import (
     RawMotion,
     ReadOptions,
     assemble,
+    evidence,
     vectors_from_z_up,
 )
 from poise.motion.io.text import listed
@@ -94,8 +96,13 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
         extra=_extra(data, layout, pelvis, up),
     )
     clip = assemble(raw, ReadOptions(fps=options.fps))
-    source = {"up_axis": up, "unit_m": world_unit / scale}
-    return clip.replaced(skeleton=clip.skeleton.with_source(**source))
+    taken = "The file states no unit: metres taken, as AMASS has it"
+    taken = "Metres after division by smpl_scaling" if "smpl_scaling" in data else taken
+    unit = Guess(world_unit / scale, taken)
+    rate = dict(clip.skeleton.source.evidence)["fps"]
+    why = evidence(options, Guess(up, "".join(up_note)), unit, rate)
+    skeleton = clip.skeleton.with_source(up_axis=up, unit_m=world_unit / scale, evidence=why)
+    return clip.replaced(skeleton=skeleton)
 
 
 def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,34 @@ def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED)
         fps = _HUMANML3D_FPS
         notes.append("The file states no frame rate: 20 taken, as HumanML3D has it (--fps F)")
     positions = numeric({"joints": array}, "joints", (None, len(names), 3), path)
-    return RawPoints("joints", path, names, positions, fps, 1.0, None, notes=tuple(notes))
+    return RawPoints(
+        "joints", path, names, positions, fps, 1.0, None, notes=tuple(notes),
+        unit_note="The file states no unit: metres taken (--unit METRES)",
+    )  # fmt: skip
+
+
+def is_named_joints(data: Mapping[str, Any]) -> bool:
+    """Whether named arrays are the places of SMPL's joints with their rate."""
+    return "joints" in data and "fps" in data
+
+
+def named_joint_points(
+    data: Mapping[str, Any], path: Path, options: ReadOptions = UNSTATED
+) -> RawPoints:
+    """`joints (T, 22, 3)` or `(T, 24, 3)` and `fps`, read as one array of joints is.
+
+    Raises:
+        PoiseError: another number of joints, or what `numeric` refuses.
+    """
+    joints = numeric(data, "joints", (None, None, 3), path)
+    if not is_joints(joints.shape, joints.dtype):
+        raise PoiseError(
+            f"its array 'joints' has the shape {joints.shape}", path,
+            "Joints of SMPL are (T, 22, 3) or (T, 24, 3); others need positions, names and fps",
+        )  # fmt: skip
+    fps = one_number(data, "fps", path) if options.fps is None else options.fps
+    check_rate(fps, path)
+    return joint_points(joints, path, replace(options, fps=fps))
 
 
 def is_points(data: Mapping[str, Any]) -> bool:

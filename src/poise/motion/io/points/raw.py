@@ -31,7 +31,7 @@ class RawPoints:
     """Named points in their file's own unit and axes.
 
     positions: `(T, K, 3)`, NaN where missing. unit_m, up_axis: what the file states, None where it
-    states nothing. confidence: `(T, K)` or None.
+    states nothing. confidence: `(T, K)` or None. unit_note: why `unit_m`, where no file states it.
     """
 
     format: str
@@ -43,6 +43,7 @@ class RawPoints:
     up_axis: str | None = None
     confidence: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    unit_note: str = ""
 
 
 # The places with the bones that make up a body's height, as the guesses know their names.
@@ -172,7 +173,8 @@ def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, 
     # A stated unit that makes a giant or a doll is a mistake, the file's too; the sentence tells.
     stated = raw.unit_m if options.unit_m is None else options.unit_m
     if stated is not None:
-        return stated_unit(height, stated, raw.path)
+        note = raw.unit_note if options.unit_m is None else ""
+        return Guess(stated_unit(height, stated, raw.path).value, note)
     return guess_unit(height, how, None, raw.path)
 
 
