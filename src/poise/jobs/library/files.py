@@ -72,9 +72,9 @@ def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFi
     return out
 
 
-def refuse_without_motion(given: Sequence[Path]) -> NoReturn:
+def refuse_without_motion(given: Sequence[Path | str]) -> NoReturn:
     """Refuses folders without any motion file, and says which files are."""
-    for folder in given:
+    for folder in map(Path, given):
         if folder.is_dir():
             refuse_flat_folder(folder)
     where = ", ".join(map(str, given)) or None
