@@ -100,7 +100,8 @@ def test_a_character_that_is_knocked_over_gets_up_and_goes_on(tracker: Tracker, 
     assert len(goal.back) == 1 and len(goal.falls) == 1
     aims = goal.start(None)[0][1, :2]
     assert float((aims - env.backend.state.qpos[1, :2]).norm()) < 0.3
-    assert float((aims - lying[1, :2]).norm()) < 1.5
+    # A getting-up of up to a metre, and the steps that end it.
+    assert float((aims - lying[1, :2]).norm()) < 1.75
     # A snapshot in the middle of getting up is that again.
     assert shot is not None
     env.restore(shot[0])
