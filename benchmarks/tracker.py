@@ -5,6 +5,10 @@ r"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
     python benchmarks/tracker.py --library FOLDER --from RUN -o LARGER --step 5e-5 --seed 7 \
         --recovery 0.3 --device cuda --worlds 16384 --minibatch 16384 --cooling 0.5 \
         --every 10000 --minutes 5.3
+    python benchmarks/tracker.py ... --from LARGER -o SMOOTHER --step 4e-5 --std 0.03 \
+        --acceleration 0.6 --slide 1
+    python benchmarks/tracker.py ... --from SMOOTHER -o SMOOTHEST --step 3e-5 --std 0.02 \
+        --acceleration 1.2 --slide 2
 
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
@@ -63,7 +67,15 @@ def config(seed: int) -> Perpetual:
 
 
 def finer(
-    tracker: Tracker, step: float, std: float, seed: int, recovery: float, smooth: float, hips: bool
+    tracker: Tracker,
+    step: float,
+    std: float,
+    seed: int,
+    recovery: float,
+    smooth: float,
+    hips: bool,
+    acceleration: float = 0.0,
+    slide: float = 0.2,
 ) -> Perpetual:
     """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
     actions, a nearer root, prices of changing actions and of feet that slide, large batches.
@@ -74,6 +86,8 @@ def finer(
         recovery: share of the episodes that begin with a fall.
         smooth: share of the last action that actions keep. With 0.5 all that a policy without knew of
             getting up is gone at once, and an hour does not bring it back.
+        acceleration, slide: prices, see `Perpetual`. Noise on the actions is rough, too: with 0.05 rad
+            it doubles the acceleration, and the policy has little to gain by its own.
         hips: whether headings are those of the hips from now on, which changes all that is observed.
     """
     kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
@@ -85,7 +99,8 @@ def finer(
         window=(2, 4, 8),
         root=0.2,
         action_rate=3.0,
-        foot_slide=0.2,
+        acceleration=acceleration,
+        foot_slide=slide,
         recovering=recovering,
         evaluate_every=12,
         cooling=0.0,
@@ -114,6 +129,8 @@ def main() -> None:
     parser.add_argument("--std", type=float, default=0.05)
     parser.add_argument("--filter", type=float, default=0.0)
     parser.add_argument("--hips", action="store_true")
+    parser.add_argument("--acceleration", type=float, default=0.0, help="price of rough motion")
+    parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
     parser.add_argument("--recovery", type=float, default=0.4)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--worlds", type=int, default=4096, help="characters at once")
@@ -125,7 +142,7 @@ def main() -> None:
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
     settings = (
-        finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter, a.hips)
+        finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter, a.hips, a.acceleration, a.slide)
         if earlier
         else config(a.seed)
     )

@@ -40,8 +40,8 @@ def actions(env: ImitationEnv, count: int = 3) -> torch.Tensor:
 
 def test_settings_of_before_mean_the_twist_and_nothing_new() -> None:
     old = to_data(Perpetual())
-    new = ("heading", "window", "filter", "root", "action_rate", "torque_rate", "foot_slide")
-    for name in new:
+    prices = ("action_rate", "torque_rate", "acceleration", "foot_slide")
+    for name in ("heading", "window", "filter", "root", *prices):
         del old[name]
     assert config_of(old) == Perpetual(heading="twist") != Perpetual()
     assert Perpetual.paper().heading == Perpetual.code().heading == "twist"
@@ -55,6 +55,7 @@ def test_settings_of_before_mean_the_twist_and_nothing_new() -> None:
         ({"window": (4, 2)}, "window must rise from 2"),
         ({"filter": 1.0}, "filter must lie in 0 to below 1"),
         ({"foot_slide": -0.1}, "prices must be at least 0"),
+        ({"acceleration": -0.1}, "prices must be at least 0"),
         ({"heading": "nose"}, "heading cannot be 'nose'"),
     ],
 )
@@ -71,6 +72,7 @@ def test_settings_that_cannot_be_are_refused(changes: dict[str, object], said: s
         ("root", 0.2, "root_position"),
         ("action_rate", 1.0, "action_rate"),
         ("torque_rate", 1.0, "torque_rate"),
+        ("acceleration", 1.0, "acceleration"),
         ("foot_slide", 1.0, "foot_slide"),
     ],
 )
@@ -232,4 +234,17 @@ def test_costs_of_an_environment_are_those_of_its_steps() -> None:
             want = ((now - torque) / limits).square().mean(-1)
             torch.testing.assert_close(env.terms["torque_rate"], want)
         action, torque = env.action.clone(), now
+    env.close()
+
+
+def test_acceleration_is_how_velocities_change_otherwise_than_the_goals() -> None:
+    env = an_env(acceleration=1.0)
+    env.reset_to(HERE, HERE)
+    for u in actions(env):
+        before = env.pose().linvel - env.goal_pose().linvel
+        env.step(u)
+        after = env.pose().linvel - env.goal_pose().linvel
+        want = (after - before).norm(dim=-1).mean(-1)
+        torch.testing.assert_close(env.terms["acceleration"], want)
+        assert want.min() > 0
     env.close()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from poise.body import Humanoid
 from poise.control import Wrench
 from poise.env.actuation import Actuation, keep_actions, unkept_actions
 from poise.env.goals.goal import Goal
@@ -28,6 +29,7 @@ class Controls:
         given: `(N, A)` the last one, as it was given; the same without `TaskConfig.filter`.
         before: `(N, A)` what acted in the step before.
         torque_before: `(N, n)` the hinges' torques at the begin of the last step, where terms read them.
+        linvel_before: `(N, B, 3)` m/s, velocities of the bodies less the goal's then; the same.
         wrench: what the residual force was; None without one, and before the first step.
         actuation: fills the drive.
     """
@@ -36,10 +38,11 @@ class Controls:
         self,
         task: TaskConfig,
         backend: Backend,
-        hinges: int,
+        humanoid: Humanoid,
         plugins: Sequence[Plugin],
         fused: bool,
     ):
+        hinges = len(humanoid.hinges)
         if backend.model.nu != hinges:
             raise PoiseError(f"the model has {backend.model.nu} actuators, the body {hinges} hinges")
         self._task, self._backend, self.hinges = task, backend, hinges
@@ -48,6 +51,7 @@ class Controls:
         self.action = torch.zeros(n, self.num_actions, device=here)
         self.given, self.before = torch.zeros_like(self.action), torch.zeros_like(self.action)
         self.torque_before = torch.zeros(n, hinges, device=here)
+        self.linvel_before = torch.zeros(n, len(humanoid.bodies), 3, device=here)
         self.wrench: Wrench | None = None
         # Only plug-ins that change a hook are asked by it.
         self._targeting, *pushing = (
@@ -82,6 +86,11 @@ class Controls:
                 targets = plugin.targets(targets)
         left = budget.at(goal.group(self._task.help_by))
         self.wrench = self.actuation.apply(self.action, targets, rows, left, budget.now > 0)
+
+    def sources(self) -> dict[str, Tensor]:
+        """What terms may read of the begin of the last step, by name."""
+        before = {"torque_before": self.torque_before, "linvel_before": self.linvel_before}
+        return {"action_before": self.before, **before}
 
     def step(self, worlds: Backend | NanGuard, substeps: int) -> None:
         """Physics steps of the worlds of these characters alone."""

@@ -79,7 +79,7 @@ class ImitationEnv:
         )
         # Recordings are for the CPU, where Python's share of a step is felt.
         fused = fused and here.type == "cpu"
-        self.controls = Controls(task, backend, self.hinges, self.plugins, fused)
+        self.controls = Controls(task, backend, self.goal.humanoid, self.plugins, fused)
         self.num_actions = self.controls.num_actions
         self.action, self.given = self.controls.action, self.controls.given
         self._every = torch.arange(n, device=here)
@@ -98,8 +98,7 @@ class ImitationEnv:
     def _make_terms(self, fused: bool) -> Terms:
         task, model, here = self.task, self.backend.model, self.device
         named = {**observables.STANDARD, **task.observables}
-        was, torques = self.controls.before, self.controls.torque_before
-        held = {"action": self.action, "age": self.age, "action_before": was, "torque_before": torques}
+        held = {"action": self.action, "age": self.age, **self.controls.sources()}
         for plugin in self.plugins:
             named |= plugin.observables
             held |= plugin.sources()
@@ -220,8 +219,9 @@ class ImitationEnv:
         """The first part of a step: fills the drive; the physics is then the caller's to step."""
         goal = self.goal
         self._row, self._group = goal.row(), goal.group(self.task.help_by)
-        torques = self._sources.reads("torque_before")
-        self.controls.apply(actions, self.age, goal, self.help, torques)
+        if self._sources.reads("linvel_before"):
+            torch.sub(self.here().linvel, self.goal_pose().linvel, out=self.controls.linvel_before)
+        self.controls.apply(actions, self.age, goal, self.help, self._sources.reads("torque_before"))
 
     def judge(self) -> EnvStep:
         """The second part of a step: rewards and ends, before any episode begins anew."""

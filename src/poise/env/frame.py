@@ -140,6 +140,7 @@ class Frame:
         age: `(N,)` control steps since the episode began.
         torque, torque_before: `(N, n)` N m that servos and damping exert on each hinge at the end of the
             step, and at its begin.
+        linvel_before: `(N, B, 3)` m/s, velocities of the bodies less the reference's at its begin.
         point: where the reference's root is, in a task with recovery; else None.
         sizes: `(N, K)` of each character's body, see `phc_obs.shape_of`; None where all have one.
     """
@@ -157,6 +158,7 @@ class Frame:
     age: Tensor | None
     torque: Tensor | None
     torque_before: Tensor | None
+    linvel_before: Tensor
     point: PointGoal | None
     sizes: Tensor | None
     #: What frames of one environment share, see `env.observables.Context`.

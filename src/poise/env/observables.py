@@ -146,6 +146,11 @@ def torque_before(frame: Frame) -> Tensor | None:
     return frame.source("torque_before")
 
 
+def linvel_before(frame: Frame) -> Tensor:
+    """Velocities of the bodies less the reference's at the begin of the step, m/s `(N, B, 3)`."""
+    return frame.source("linvel_before")
+
+
 def point(frame: Frame) -> PointGoal | None:
     """Where the reference's root is; the recovery plug-in says it."""
     return None

@@ -98,6 +98,16 @@ def torque_rate(frame: Frame, limits: Tensor) -> Tensor:
     return _after_first(frame, change)
 
 
+def acceleration(frame: Frame) -> Tensor:
+    """A cost: m/s by which the bodies' velocities change otherwise than the reference's in a control
+    step, length of each body's, mean over the bodies. `(N,)`
+
+    At 30 Hz 0.3 of it is an E_acc of PHC of 10 mm/frame^2.
+    """
+    change = frame.sim.linvel - frame.ref.linvel - frame.linvel_before
+    return change.norm(dim=-1).mean(-1)
+
+
 def foot_slide(frame: Frame, rows: Tensor, points: Tensor) -> Tensor:
     """A cost: m/s with which points of the soles that touch the ground move along it, summed over the
     points and divided by half their number, so that a foot that skates counts as fast as it is. `(N,)`

@@ -99,8 +99,9 @@ class Perpetual:
             with ten times as much falling early would pay, see `phc_reward.energy_term`.
         energy_form: of the "paper", squares of the hinges' power, or of the "code", its amount.
         root: weight of the reward for the root's place alone, see `phc_reward.root_position`.
-        action_rate, torque_rate, foot_slide: prices of changing actions and torques and of feet that
-            slide, see `phc_reward`; with several bodies the soles are those of the first.
+        action_rate, torque_rate, acceleration, foot_slide: prices of changing actions and torques, of
+            bodies accelerated otherwise than the reference's and of feet that slide, see `phc_reward`;
+            with several bodies the soles are those of the first.
         style: the motion prior, None for none.
         termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
             "code".
@@ -157,6 +158,7 @@ class Perpetual:
     root: float = 0.0
     action_rate: float = 0.0
     torque_rate: float = 0.0
+    acceleration: float = 0.0
     foot_slide: float = 0.0
     style: AmpConfig | None = field(default_factory=AmpConfig)
     termination: Literal["relaxed", "all", "code"] = "relaxed"
@@ -234,7 +236,8 @@ class Perpetual:
             raise PoiseError(what, "Perpetual", "The next step is told in any case")
         if not 0 <= self.filter < 1:
             raise PoiseError(f"filter must lie in 0 to below 1, got {self.filter}", "Perpetual")
-        if min(self.root, self.action_rate, self.torque_rate, self.foot_slide) < 0:
+        prices = self.action_rate, self.torque_rate, self.acceleration, self.foot_slide
+        if min(self.root, *prices) < 0:
             raise PoiseError("the weight of root and all prices must be at least 0", "Perpetual")
         if not 0 <= self.cooling <= 1:
             raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")

@@ -124,6 +124,9 @@ def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[Rew
         rewards += (
             phc_reward.cost_term(phc_reward.torque_rate, config.torque_rate, halved, limits=limits),
         )
+    if config.acceleration:
+        rough = phc_reward.cost_term(phc_reward.acceleration, config.acceleration, halved)
+        rewards += (replace(rough, when="near"),)
     if config.foot_slide:
         soles = _soles(humanoid)
         rewards += (phc_reward.cost_term(phc_reward.foot_slide, config.foot_slide, halved, **soles),)
