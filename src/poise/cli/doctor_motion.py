@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: The figures of the table: key, title, unit, digits.
 FIGURES = (
-    ("foot_slide_mm_per_s", "foot slide, mean", "mm/s", 0),
+    ("sole_slide_mm_per_s", "sole slide, mean", "mm/s", 0),
     ("penetration_mm", "penetration, mean", "mm", 1),
     ("penetration_max_mm", "penetration, deepest", "mm", 1),
     ("float_mm", "float, mean", "mm", 1),

@@ -18,11 +18,10 @@ from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
-from poise.kin.feet.contact import NEAR_M
 from poise.kin.flight import likely_rate
 from poise.kin.hinges import chain_angles
 from poise.kin.series import smooth_lift
-from poise.metrics import floating, foot_slide, jerk, penetration
+from poise.metrics import floating, jerk, penetration
 from poise.motion import Clip
 
 #: Degrees beyond a limit that a file states which count, and for how long (s): they are rough.
@@ -186,7 +185,7 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
     shake = jerk(pos, clip.fps)
     step = np.linalg.norm(np.diff(clip.root_pos, axis=0), axis=-1)
     out: dict[str, float | None] = {
-        "foot_slide_mm_per_s": None,
+        "sole_slide_mm_per_s": None,
         "penetration_mm": None,
         "penetration_max_mm": None,
         "float_mm": None,
@@ -196,11 +195,10 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
         "joint_speed_max_rad_per_s": float(body_steps(clip).max()) * clip.fps,
     }
     if support is not None:
-        slide = foot_slide(support.soles, clip.fps, height=NEAR_M, ground=-support.fit.lift_m)
         lowest = torch.tensor(support.low.min(-1))
         depth = penetration(lowest)
         gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com[:, 2]), clip.fps)
-        out["foot_slide_mm_per_s"] = _number(slide)
+        out["sole_slide_mm_per_s"] = support.sole_slide
         out["penetration_mm"], out["penetration_max_mm"] = _number(depth.mean_mm), _number(depth.max_mm)
         out["float_mm"] = _number(gap)
     return out
