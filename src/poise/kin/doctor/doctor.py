@@ -131,6 +131,7 @@ def _joint_faults(report: CleanReport, clip: Clip) -> list[Fault]:
         for f in report.flips
     ]
     out += [Fault("speed", s.joint, s.start, s.stop, s.before) for s in report.speeds]
+    out += [Fault("joint jump", s.joint, s.start, s.stop, s.before) for s in report.kept]
     last = clip.frames - 1
     return out + [Fault("out of reach", joint, 0, last, float(n)) for joint, n in report.left]
 
