@@ -127,6 +127,10 @@ def test_a_drifting_root_makes_feet_slide_until_it_is_mended(walk: Clip) -> None
     assert before > 400 and after < 0.35 * before
     # The walk's own slip is no fault; the mended one has little more.
     assert after < figure(walk, "sole_slide_mm_per_s") + 60
+    # Where the path has to stay, legs alone hold the feet as far as they reach.
+    held = heal(broken, path=False)
+    np.testing.assert_array_equal(held.root_pos[:, :2], broken.root_pos[:, :2])
+    assert figure(held, "sole_slide_mm_per_s") < before
 
 
 def test_a_floating_clip_is_lowered(walk: Clip) -> None:

@@ -71,11 +71,12 @@ def examine(clip: Clip) -> Examination:
     return Examination(tuple(ordered), _figures(clip, support), support is not None)
 
 
-def heal(clip: Clip) -> Clip:
+def heal(clip: Clip, path: bool = True) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
     In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, the height
-    above the floor, sliding feet. A step changes nothing if its faults are not there.
+    above the floor, sliding feet. A step changes nothing if its faults are not there. path: whether the
+    root's path may be freed of the slip of standing feet, or legs alone hold them.
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)
@@ -86,7 +87,7 @@ def heal(clip: Clip) -> Clip:
     clip = mend_jitter(clip)
     if support is None:
         return clip
-    return _on_floor(_locked(_on_floor(clip, anatomy), anatomy), anatomy)
+    return _on_floor(_locked(_on_floor(clip, anatomy), anatomy, path), anatomy)
 
 
 def _on_floor(clip: Clip, anatomy: Anatomy) -> Clip:
@@ -114,9 +115,9 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy) -> Clip:
-    """The clip without sliding feet."""
-    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
+def _locked(clip: Clip, anatomy: Anatomy, path: bool) -> Clip:
+    """The clip without sliding feet. path: see `heal`."""
+    for step in (*[mend_path] * path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:
