@@ -102,9 +102,9 @@ def measured(name: str, source: Path | Clip, kind: str, budget: float) -> dict[s
         "clip": name, "controller": done.controller, "whole": done.card.succ,
         "tracked": done.card.tracked, "needs": [dict(n) for n in done.card.needs],
         "failed_s": list(done.failed_s), **found, "jerk_ratio": found["jerk"] / of["jerk"],
-        "slide": figures["delivered"]["foot_slide_mm_per_s"],
-        "simulated_slide": figures["simulated"]["foot_slide_mm_per_s"],
-        "source_slide": figures["source"]["foot_slide_mm_per_s"],
+        "slide": figures["delivered"]["point_slide_mm_per_s"],
+        "simulated_slide": figures["simulated"]["point_slide_mm_per_s"],
+        "source_slide": figures["source"]["point_slide_mm_per_s"],
         "seconds_per_second": spent / done.placed.source.seconds,
     }  # fmt: skip
 

@@ -23,7 +23,7 @@ CLIPS = {
     "punch": "deepmimic_txt/humanoid3d_punch.txt",
 }
 STAGES = ("source", "simulated", "delivered")
-FIGURES = {"foot_slide_mm_per_s": 0, "penetration_mm": 1}
+FIGURES = {"point_slide_mm_per_s": 0, "penetration_mm": 1}
 
 
 def one(clip: Path, out: Path, minutes: float, threads: int) -> dict:

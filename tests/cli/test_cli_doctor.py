@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from tiny_clips import bvh, put
 
+from poise.cli.doctor_motion import worsened
 from poise.cli.info import _guess
 from poise.cli.main import main
+from poise.kin import Examination
 from poise.motion import read_clip, shifted, write_clip
 
 WALK = Path(str(files("poise") / "data/walk.bvh"))
@@ -79,6 +81,17 @@ def test_fix_shows_before_and_after(broken: Path, tmp_path: Path, capsys) -> Non
     assert [c.strip() for c in row.split("│")[3:5]] == ["1", "0"]
     assert "0 after" in text.splitlines()[-2]
     assert "The root moved by up to 505 mm (frame 46)" in text
+
+
+def test_what_mending_made_worse_is_named(broken: Path, tmp_path: Path, capsys) -> None:
+    facts = json.loads(said(capsys, "doctor", broken, "--fix", "-o", tmp_path / "a.bvh", "--json"))
+    assert facts["result"]["fixed"]["worse"] == []
+    # Figures of what is written, made up: a jerk twice as large, a slide that hardly differs.
+    figures = facts["result"]["figures"]
+    after = figures | {"jerk_max_m_per_s3": 2 * figures["jerk_max_m_per_s3"], "sole_slide_mm_per_s": 9.0}
+    found, left = (Examination((), f, True) for f in (figures | {"sole_slide_mm_per_s": 1.0}, after))
+    (worse,) = worsened(found, left)
+    assert worse.startswith("jerk, largest (") and worse.endswith(" m/s^3)")
 
 
 def test_a_clean_clip_is_written_as_it_was_read(tmp_path: Path, capsys) -> None:

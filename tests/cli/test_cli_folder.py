@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.folder import each
 from poise.cli.main import main
 from poise.motion import read_clip, trim, write_clip
+from poise.motion.io.refused import LOOKED_AT, refuse_flat_folder
 from toy_policy import WALK, toy_run
 
 
@@ -76,6 +78,19 @@ def test_what_takes_single_files_says_so(folder: Path, tmp_path: Path, refused) 
     (tmp_path / "empty").mkdir()
     refused("imitate", folder, "-o", tmp_path / "out", words=("folder", "poise fleet"))
     refused("info", tmp_path / "empty", words=("no motion file", "TRC", "docs/formats.md"))
+
+
+def test_a_large_folder_is_not_listed_to_refuse_it(tmp_path: Path, monkeypatch) -> None:
+    listed: list[int] = []
+
+    def endless(folder: Path, pattern: str) -> Iterator[Path]:
+        for k in range(10 * LOOKED_AT):
+            listed.append(k)
+            yield folder / f"{k}.txt"
+
+    monkeypatch.setattr(Path, "rglob", endless)
+    refuse_flat_folder(tmp_path)
+    assert len(listed) == LOOKED_AT
 
 
 def test_2d_keypoints_are_named(tmp_path: Path, refused) -> None:

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from tiny_clips import deepmimic, put
 
+from poise.cli import track as track_verb
 from poise.cli.answer import LOST
 from poise.cli.main import main
 from poise.jobs.open import open_run
+from poise.jobs.track import tracking
+from poise.kin import sole_slide
 from poise.motion import read_clip, shifted, trim, write_clip
 from toy_policy import WALK, toy_run
 
@@ -170,6 +173,9 @@ def test_another_skeleton_with_noise_and_resets(
     back = read_clip(out / "simulated.bvh")
     assert set(back.skeleton.names) == set(read_clip(person).skeleton.names)
     assert (out / "body.bvh").exists()
+    (held,) = json.loads((out / "score.json").read_text())["delivered"]
+    # What holding the feet did is told of the file that is written, as the doctor sees it.
+    assert held["delivered"]["sole_slide_mm_per_s"] == pytest.approx(sole_slide(back), rel=1e-3)
 
 
 def test_jitter_is_named_with_what_takes_it_away(
@@ -183,6 +189,21 @@ def test_jitter_is_named_with_what_takes_it_away(
     assert capsys.readouterr().out.count("--smooth HZ") == 1
     assert main([*argv, "-o", str(tmp_path / "b"), "--smooth", "6"]) in (0, LOST)
     assert "--smooth HZ" not in capsys.readouterr().out
+
+
+def test_a_rate_that_is_likely_wrong_is_told_before_anything_is_simulated(
+    file: Path, short: Path, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    doubt, order = "the clip likely has 60 frames per second; state it with --fps 60.", list[str]()
+    monkeypatch.setattr(tracking, "rate_doubts", lambda placed: [doubt])
+    monkeypatch.setattr(track_verb, "tell", lambda text, style="": order.append(text))
+    simulates = tracking.done_by
+    monkeypatch.setattr(tracking, "done_by", lambda *a: order.append("simulated") or simulates(*a))
+    argv = ["track", str(short), "--policy", str(file), *ALONE]
+    assert main([*argv, "-o", str(tmp_path / "a")]) == LOST
+    assert order == [doubt, "simulated"] and doubt not in capsys.readouterr().out
+    assert main([*argv, "-o", str(tmp_path / "b"), "--json"]) == LOST
+    assert doubt in json.loads(capsys.readouterr().out)["notes"]
 
 
 def test_the_report_tells_of_the_file_that_came_in(

@@ -13,6 +13,7 @@ import torch
 from poise.eval import Recording
 from poise.jobs.deliver import deliver, finished, floor_of, lost_at, simulated_clip
 from poise.jobs.runs import Evaluation, evaluate
+from poise.kin import sole_slide
 from poise.motion import Clip, ClipLibrary, ground_shift, read_clip
 from poise.recipes import ResidualForce, build
 from toy_human import swing
@@ -119,6 +120,10 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     done = deliver(imitation, evaluation, tmp_path / "held", {})
     (figures,) = json.loads((tmp_path / "held/score.json").read_text())["delivered"]
     assert figures["delivered"]["penetration_mm"] <= figures["simulated"]["penetration_mm"] + 0.1
+    # The slide of a file's soles is what the doctor says of it.
+    made = read_clip(tmp_path / "held/simulated.bvh")
+    assert figures["delivered"]["sole_slide_mm_per_s"] == pytest.approx(sole_slide(made), rel=1e-3)
+    assert figures["source"]["sole_slide_mm_per_s"] == pytest.approx(sole_slide(source))
     # It is on its motion for so short a time; where it is taken away from there, that is told.
     r = evaluation.rollouts
     away = r.pos.clone()

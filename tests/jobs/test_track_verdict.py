@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from poise.eval import Help, ScoreCard
 from poise.jobs.track import TrackConfig, rates
 from poise.jobs.track.missing import shortfalls
-from poise.jobs.track.rates import rate_notes
+from poise.jobs.track.rates import rate_doubts, rate_notes
 from poise.kin.flight import Flight
 from toy_human import swing
 
@@ -99,7 +100,19 @@ def test_where_it_is_not_tried(tries: list[float]) -> None:
     assert tries == []
 
 
-def test_flights_speak_whether_it_was_lost_or_not(tries: list[float]) -> None:
-    (said,) = notes(120.0, (DOUBLE,), lost=False)
-    assert "state it with --fps 60" in said and tries == []
-    assert len(notes(120.0, (DOUBLE,))) == 2 and tries == [60.0]
+def fit(name: str, flights: tuple[Flight, ...]) -> Any:
+    """A motion of 120 Hz that was placed, with its flights."""
+    clip = swing(1.0, 30.0, name=name).replaced(fps=120.0)
+    return SimpleNamespace(
+        clip=clip, source=clip, report=SimpleNamespace(clips=(SimpleNamespace(flights=flights),))
+    )
+
+
+def test_flights_speak_before_anything_is_simulated(tries: list[float]) -> None:
+    (said,) = rate_doubts([fit("jump", (DOUBLE,))])
+    assert "state it with --fps 60" in said and said.startswith("In flight")
+    (said,) = rate_doubts([fit("fall", (FALLS,)), fit("jump", (DOUBLE,))])
+    assert said.startswith("jump: In flight")
+    assert rate_doubts([fit("fall", (FALLS,)), fit("still", ())]) == []
+    # A motion that is doubted and lost is tried as well.
+    assert len(notes(120.0, (DOUBLE,))) == 1 and tries == [60.0]

@@ -150,6 +150,9 @@ def test_noise_of_a_centimetre_is_carried_and_smoothing_takes_it_away() -> None:
     assert jerk[1] < 0.2 * jerk[0]
     assert any("smoothed" in note for note in calm.skeleton.source.notes)
     assert any("jitter by about 10 mm" in note for note in rough.skeleton.source.notes)
+    source = rough.skeleton.source
+    assert dict(source.evidence)["jitter"] in source.notes
+    assert "jitter" not in dict(calm.skeleton.source.evidence)
     assert not any("jitter" in note for note in fit_clip(points).skeleton.source.notes)
 
 

@@ -13,7 +13,7 @@ from poise.synth.filler import Filler
 from poise.synth.gaps import Gap
 from poise.synth.inbetween import Filling, fill_keyframes
 from poise.synth.limits import Feet
-from poise.synth.verdict import JUDGED, GapFault, judged, told, weight
+from poise.synth.verdict import JUDGED, GapFault, distance, judged, told, weight
 from toy_human import swing
 
 
@@ -42,6 +42,9 @@ def test_the_sentence_names_each_fault_once_and_counts_the_rest() -> None:
     said = told([*many, *many])
     assert said.count("the root jumps") == 6 and said.endswith("; and 2 more")
     assert weight(many) == (1, 8) and weight(()) == (0, 0)
+    # A long way in few frames is worse than a short one in many.
+    far, near = (GapFault("foot slide", "L", 0, n, cm, (0, 30)) for n, cm in ((9, 35.0), (20, 13.0)))
+    assert weight([near]) < weight([far]) and distance([far, near, *many]) == 48.0
 
 
 def test_a_gap_with_faults_is_filled_anew_and_one_without_is_not(

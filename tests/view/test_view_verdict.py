@@ -102,8 +102,8 @@ def test_table_shows_the_clip_beside_and_keeps_unknown_keys():
 
 
 def test_the_written_motion_is_told_beside_the_simulation():
-    assert grades(score())[3].detail == "the clip itself: 41 mm/s"
-    written = {"delivered": [{"clip": "walk", "delivered": {"foot_slide_mm_per_s": 5.6}}]}
-    told = "the clip itself: 41 mm/s; the written motion, feet held: 6 mm/s"
+    assert grades(score())[3].detail == "the motion it follows: 41 mm/s"
+    written = {"delivered": [{"clip": "walk", "delivered": {"sole_slide_mm_per_s": 5.6}}]}
+    told = "the motion it follows: 41 mm/s; soles of the written motion, feet held: 6 mm/s"
     assert grades({**score(), **written})[3].detail == told
     assert grades({**score(), "delivered": [{"clip": "no feet"}]})[3].detail.endswith("41 mm/s")

@@ -30,6 +30,7 @@ class Answer:
         exit_code: 0, or `LOST` and the like.
         outcome: a few words for the table of a folder, such as "tracked".
         error_mm: the tracking error for that table, None where nothing is tracked.
+        said: those of the notes that were told already, while the verb ran.
     """
 
     result: Any = None
@@ -38,6 +39,7 @@ class Answer:
     exit_code: int = 0
     outcome: str = ""
     error_mm: float | None = None
+    said: Sequence[str] = ()
 
 
 def inputs_of(options: Any) -> list[Path]:

@@ -185,10 +185,10 @@ def _say(done: Completed) -> None:
 
     rows = [
         (
-            s.name, figure(s.key_mm), figure(s.foot_slide_mm_per_s), figure(s.penetration_mm, 1),
+            s.name, figure(s.key_mm), figure(s.sole_slide_mm_per_s), figure(s.penetration_mm, 1),
             figure(s.jerk_m_per_s3), figure(s.fastest_m_per_s, 1),
         )
         for s in done.stages
     ]  # fmt: skip
-    names = ("stage", "keyframes mm", "foot slide mm/s", "sinks mm", "jerk m/s^3", "fastest m/s")
+    names = ("stage", "keyframes mm", "sole slide mm/s", "sinks mm", "jerk m/s^3", "fastest m/s")
     table("stage by stage", names, rows, left=1)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: The figures of the table: key, title, unit, digits.
 FIGURES = (
-    ("foot_slide_mm_per_s", "foot slide, mean", "mm/s", 0),
+    ("sole_slide_mm_per_s", "sole slide, mean", "mm/s", 0),
     ("penetration_mm", "penetration, mean", "mm", 1),
     ("penetration_max_mm", "penetration, deepest", "mm", 1),
     ("float_mm", "float, mean", "mm", 1),
@@ -26,6 +26,8 @@ FIGURES = (
     ("root_step_max_mm", "root's largest step", "mm", 1),
     ("joint_speed_max_rad_per_s", "fastest joint", "rad/s", 1),
 )
+#: What is said to be worse after a repair: this share more, and as much more as the last digits say.
+WORSE, LEAST = 1.1, {"mm/s": 10.0, "mm": 10.0, "m/s^3": 50.0, "rad/s": 1.0}
 #: Rows of faults of one kind that are printed.
 ROWS = 6
 
@@ -64,12 +66,15 @@ def run_on(path: Path, options: Options) -> Answer:
     moved = _root_moved(clip, healed)
     facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
     facts["fixed"]["root_moved"] = moved
+    facts["fixed"]["worse"] = worsened(found, left) if fix else []
     if rest:
         facts["fixed"]["rest_pose"] = said
         say(said)
     if not fix:
         return Answer(facts, {"clip": target}, outcome=outcome)
     _compare(found, left)
+    if worse := facts["fixed"]["worse"]:
+        say(f"Mending made these figures worse: {', '.join(worse)}.")
     if moved is not None and moved["max_mm"] >= 10.0:
         say(
             f"The root moved by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and ends "
@@ -125,6 +130,18 @@ def _compare(found: Examination, left: Examination) -> None:
         values = [e.figures[key] for e in (found, left)]
         rows.append((title, unit, *("-" if v is None else f"{v:,.{digits}f}" for v in values)))
     table("", ("", "", "before", "after"), rows, left=2)
+
+
+def worsened(found: Examination, left: Examination) -> list[str]:
+    """The figures that are clearly worse after a repair, each with its values before and after."""
+    out = []
+    for key, title, unit, digits in FIGURES:
+        before, after = found.figures[key], left.figures[key]
+        if before is None or after is None:
+            continue
+        if after > max(WORSE * before, before + LEAST[unit]):
+            out.append(f"{title} ({before:,.{digits}f} to {after:,.{digits}f} {unit})")
+    return out
 
 
 def _root_moved(clip: Clip, healed: Clip) -> dict[str, Any] | None:

@@ -130,7 +130,7 @@ def _run(argv: list[str], inputs: list[Path]) -> Answer:
         tell(_begins(verb, inputs), "dim")
     _share_cores(verb not in _LIGHT)
     answer = module.run(options, rest)
-    notes(answer.notes)
+    notes([n for n in answer.notes if n not in answer.said])
     for path in answer.outputs.values():
         say(str(path))
     return answer

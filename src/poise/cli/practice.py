@@ -93,7 +93,7 @@ def first_result(job: Job, tracker: Tracker, clip: Clip, motion: Path | None, ho
     from poise.jobs.track import TrackConfig, write
 
     config = TrackConfig(seed=job.config.seed, threads=job.training.threads)
-    first = follow(tracker, [clip], config)
+    first = follow(tracker, [clip], config, [])
     paths = write(first, job.out, motion, hold).paths
     tell(f"First result: {outcome(first, False)} See {paths['report']}")
     return first

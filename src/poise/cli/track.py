@@ -185,12 +185,13 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     with claimed(out):
         # What is to be learned is the motion alone.
         plain = replace(config, recover=False, controller="policy") if o.learn else config
-        tracked = follow(tracker, given, plain)
+        said_early = list[str]()
+        tracked = follow(tracker, given, plain, said_early)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
                 return Answer(exit_code=INTERRUPTED, outcome="interrupted")
             tracker = learned
-            tracked = follow(tracker, given, config)
+            tracked = follow(tracker, given, config, said_early)
         with working("writing"):
             done = write(tracked, out, motion, o.hold_feet)
             if o.save_policy is not None:
@@ -217,10 +218,12 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     }
     saved = {"policy": o.save_policy} if o.save_policy else {}
     # What reading says of keypoints that jitter, which an option mends.
-    read_so = tracked.placed.source.skeleton.source.notes
-    told = (*(f"{n}." for n in read_so if "--smooth" in n), *tracked.notes, *done.notes)
+    jitter = dict(tracked.placed.source.skeleton.source.evidence).get("jitter")
+    told = (*((f"{jitter}.",) if jitter else ()), *tracked.notes, *done.notes)
     code = LOST if lost or survived else 0
-    return Answer(result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm)
+    return Answer(
+        result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm, tuple(said_early)
+    )
 
 
 def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support, ...]:
@@ -242,13 +245,21 @@ def is_lost(tracked: Tracked) -> bool:
     return bool(tracked.failures) and (losses is None or len(losses.back) < len(losses.lost))
 
 
-def follow(tracker: Tracker, given: Sequence[Clip | Keypoints], config: TrackConfig) -> Tracked:
-    """The motions as they are tracked, with a bar while it is looked ahead or searched."""
+def follow(
+    tracker: Tracker, given: Sequence[Clip | Keypoints], config: TrackConfig, said: list[str]
+) -> Tracked:
+    """The motions as they are tracked, with a bar while it is looked ahead or searched. What speaks
+    against a motion is told before it is simulated, and once: `said` is what was."""
     from poise.jobs.track import track
+
+    def warn(sentence: str) -> None:
+        if sentence not in said:
+            said.append(sentence)
+            tell(sentence, "yellow")
 
     with contextlib.ExitStack() as shown:
         shown.enter_context(working("tracking"))
-        return track(given, tracker, config, progress=staged(shown))
+        return track(given, tracker, config, progress=staged(shown), warn=warn)
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:

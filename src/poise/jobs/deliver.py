@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
-from poise.kin import hold_feet, lowest_height, qpos_to_clip
+from poise.kin import hold_feet, lowest_height, qpos_to_clip, sole_slide
 from poise.kin.doctor.support import SOLE_M
 from poise.kin.feet.height import stands_higher
 from poise.metrics import success
@@ -79,35 +80,56 @@ class Delivery:
     """What an evaluation gives a user.
 
     Attributes:
-        clips: the simulated motions by the names of their files, on the skeletons that came in.
+        clips: the simulated motions by the names of their files, on the body's skeletons.
+        home: the same on the skeletons that came in.
         card: the score card with what holding the feet did.
         notes: what was done to the motions beyond simulating them, in sentences.
         paths: of what was written, by name; empty before anything is.
     """
 
     clips: dict[str, Clip]
+    home: dict[str, Clip]
     card: ScoreCard
     notes: tuple[str, ...]
     paths: dict[str, Path] = field(default_factory=dict)
 
 
-def finished(imitation: Imitation, evaluation: Evaluation, hold: bool = True) -> Delivery:
+#: Puts a motion of the body onto the skeleton that came in; the second says whether feet are held.
+Home = Callable[[Clip, bool], Clip]
+
+
+def finished(
+    imitation: Imitation,
+    evaluation: Evaluation,
+    hold: bool = True,
+    source: Clip | None = None,
+    home: Home | None = None,
+) -> Delivery:
     """The simulated motion of every clip, its standing feet held to the spot, as high as its source; see
     `deliver`."""
-    clips: dict[str, Clip] = {}
+    clips, homes = dict[str, Clip](), dict[str, Clip]()
     figures, notes = [], []
+    home = home or (lambda motion, _: motion)
     for k, recording in enumerate(evaluation.recordings):
         single = len(evaluation.recordings) == 1
         name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
-        clip = simulated_clip(imitation, evaluation, k)
+        raw = clip = simulated_clip(imitation, evaluation, k)
+        found: dict[str, Any] = {}
         if hold:
             clip, found = _held(imitation, evaluation, recording.clip, clip)
+        clips[name] = as_high_as_source(clip, imitation, recording.clip)
+        homes[name] = home(clips[name], hold)
+        if hold:
+            before = source or imitation.library.clips[recording.clip]
+            between = home(as_high_as_source(raw, imitation, recording.clip), False)
+            of = {"source": before, "simulated": _as_file(between), "delivered": _as_file(homes[name])}
+            for stage, motion in of.items():
+                found.setdefault(stage, {})["sole_slide_mm_per_s"] = sole_slide(motion)
             figures.append(found)
             notes += _sentences(found)
-        clips[name] = as_high_as_source(clip, imitation, recording.clip)
         raised = float(clips[name].root_pos[0, 2] - clip.root_pos[0, 2])
         notes += _floor_told(clip.name, raised)
-    return Delivery(clips, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
+    return Delivery(clips, homes, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
 
 
 def deliver(
@@ -121,6 +143,7 @@ def deliver(
     said: tuple[str, ...] = (),
     keys: tuple[int, ...] = (),
     lost: tuple[float, ...] | None = None,
+    home: Home | None = None,
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`.
 
@@ -137,10 +160,11 @@ def deliver(
         said: sentences that the report begins with.
         keys: frames of the source that stay visible in the report.
         lost: s, when the first clip was lost; by default as the score's rule judges its episode.
+        home: of a body that is not the skeleton that came in; what is written here is on the body's.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
-    done = finished(imitation, evaluation, hold)
+    done = finished(imitation, evaluation, hold, source, home)
     for name, clip in done.clips.items():
         single = len(done.clips) == 1
         paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"
@@ -175,6 +199,13 @@ def _held(
     return held, found
 
 
+def _as_file(clip: Clip) -> Clip:
+    """A motion as it is read from its file: what tells the soles of some formats is lost in BVH."""
+    if home_suffix(clip) != ".bvh":
+        return clip
+    return clip.replaced(skeleton=clip.skeleton.with_source(format="bvh"))
+
+
 def _floor_told(name: str, floor_m: float) -> list[str]:
     floor = round(floor_m * 1000)
     if not floor:
@@ -186,18 +217,24 @@ def _floor_told(name: str, floor_m: float) -> list[str]:
 
 
 def _sentences(found: dict[str, Any]) -> list[str]:
-    if "delivered" not in found or not found["held_max_mm"] > 0.05:
+    if not found["held_max_mm"] > 0.05:
         return []
 
-    def three(key: str, digits: int) -> str:
-        before, between, after = (found[k][key] for k in ("source", "simulated", "delivered"))
-        return f"{after:.{digits}f} (simulated {between:.{digits}f}, the clip {before:.{digits}f})"
+    def three(key: str, digits: int) -> str | None:
+        each = [found[k].get(key) for k in ("source", "simulated", "delivered")]
+        if any(x is None for x in each):
+            return None
+        before, between, after = (f"{x:.{digits}f}" for x in each)
+        return f"{after} (simulated {between}, the clip {before})"
 
-    return [
-        f"{found['clip']}: standing feet are held in place in the written motion: they slide at "
-        f"{three('foot_slide_mm_per_s', 0)} mm/s and sink by {three('penetration_mm', 1)} mm; ankles "
-        f"moved by {found['held_mean_mm']:.0f} mm on average, {found['held_max_mm']:.0f} at most."
+    slide, depth = three("sole_slide_mm_per_s", 0), three("penetration_mm", 1)
+    told = [f"soles slide at {slide} mm/s"] if slide else []
+    told += [f"feet sink by {depth} mm"] if depth else []
+    told += [
+        f"ankles moved by {found['held_mean_mm']:.0f} mm on average, {found['held_max_mm']:.0f} at most"
     ]
+    name = found["clip"]
+    return [f"{name}: standing feet are held in place in the written motion: {'; '.join(told)}."]
 
 
 def make_report(

@@ -19,14 +19,14 @@ class Stage:
     Attributes:
         name: of the stage.
         key_mm: mean distance of the joints from the keyframes, mm.
-        foot_slide_mm_per_s, penetration_mm, float_mm, jerk_m_per_s3: see `poise doctor`; None where no
+        sole_slide_mm_per_s, penetration_mm, float_mm, jerk_m_per_s3: see `poise doctor`; None where no
             human body is told by the joints' names.
         fastest_m_per_s: of all joints.
     """
 
     name: str
     key_mm: float
-    foot_slide_mm_per_s: float | None
+    sole_slide_mm_per_s: float | None
     penetration_mm: float | None
     float_mm: float | None
     jerk_m_per_s3: float | None
@@ -35,8 +35,8 @@ class Stage:
     def sentence(self) -> str:
         """The figures in words."""
         parts = [f"keyframes off by {self.key_mm:.0f} mm"]
-        if self.foot_slide_mm_per_s is not None:
-            parts.append(f"feet slide at {self.foot_slide_mm_per_s:.0f} mm/s")
+        if self.sole_slide_mm_per_s is not None:
+            parts.append(f"soles slide at {self.sole_slide_mm_per_s:.0f} mm/s")
         if self.jerk_m_per_s3 is not None:
             parts.append(f"jerk {self.jerk_m_per_s3:.0f} m/s^3")
         return f"{self.name}: {', '.join(parts)}, fastest joint {self.fastest_m_per_s:.1f} m/s."
@@ -59,7 +59,7 @@ def key_errors(made: Clip, source: Clip, keys: Sequence[int], at: Sequence[int])
 def stage_of(name: str, made: Clip, key_mm: Sequence[float]) -> Stage:
     """The figures of a motion. key_mm: see `key_errors`."""
     figures, pos = examine(made).figures, made.positions()
-    names = ("foot_slide_mm_per_s", "penetration_mm", "float_mm", "jerk_m_per_s3")
+    names = ("sole_slide_mm_per_s", "penetration_mm", "float_mm", "jerk_m_per_s3")
     speed = np.linalg.norm(np.diff(pos, axis=0), axis=-1).max() * made.fps
     slide, sinks, floats, jerk = (figures.get(n) for n in names)
     return Stage(name, float(np.mean(key_mm)), slide, sinks, floats, jerk, float(speed))

@@ -7,7 +7,7 @@ from poise.kin.doctor.doctor import Examination, examine, heal
 from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.guesses import find_guesses, grounded
 from poise.kin.doctor.sides import swap_sides
-from poise.kin.doctor.support import anatomy_of, support_of
+from poise.kin.doctor.support import anatomy_of, sole_slide, support_of
 from poise.kin.feet.contact import contact_labels
 from poise.kin.feet.hold import hold_feet
 from poise.kin.feet.level import level_feet
@@ -70,6 +70,7 @@ __all__ = [
     "qpos_to_clip",
     "qpos_velocity",
     "retarget",
+    "sole_slide",
     "support_of",
     "swap_sides",
     "two_bone",

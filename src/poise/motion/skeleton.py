@@ -42,7 +42,8 @@ class Source:
     frame_time: seconds per frame exactly as the file states it.
     travel_joint: the joint with the channels that carry the travel (Bandai: "Hips", not the root).
     ground_m: where the floor was before it was moved to z = 0 by the user's word; None if it was not.
-    evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps.
+    evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps; and
+        ("jitter", sentence) where keypoints tremble so much that they are better smoothed.
     mended: (kind, joint, first frame, last frame, size) of what the reader had to mend: "bone drift" m,
         "quaternion length" (distance from 1), "rest frame" (frames dropped); last frame -1 is the end.
     """

@@ -13,7 +13,7 @@ from poise.spatial import slerp
 from poise.synth.filler import Filler
 from poise.synth.gaps import Gap
 from poise.synth.limits import Calmed, Feet, Motion, excess
-from poise.synth.verdict import GapFault, judged, weight
+from poise.synth.verdict import GapFault, distance, judged, weight
 
 #: Shares of the network's motion in the best guess, round by round, the rest being interpolated, and
 #: what is done with feet: at last they are led from stand to stand.
@@ -46,7 +46,7 @@ def best_of_rounds(
         on_gap: is told how many gaps are filled, in the first round.
     """
     root, rot = path[0].clone(), path[1].clone()
-    kept: dict[Gap, tuple[tuple[int, int], Motion, Calmed | None, Tensor]] = {}
+    kept: dict[Gap, tuple[tuple[int, float], Motion, Calmed | None, Tensor]] = {}
     wanting = list(gaps)
     for round_ in range(max(1, filler.filling.rounds)):
         noise, (most, ways) = None, ROUNDS[min(round_, len(ROUNDS) - 1)]
@@ -70,7 +70,9 @@ def best_of_rounds(
             break
     _compose(filler, root, rot, kept)
     if wanting and filler.filling.rounds > 1:
-        _mend(filler, root, rot, wanting, gaps)
+        # First the legs alone, since keyframes say where the hips are.
+        for hips in (False, True):
+            _mend(filler, root, rot, wanting, gaps, hips)
     left = judged(_clip(filler, root, rot), gaps, sample)
     return root, rot, tuple(dict.fromkeys(f for faults in left.values() for f in faults))
 
@@ -79,7 +81,7 @@ def _compose(
     filler: Filler,
     root: Tensor,
     rot: Tensor,
-    kept: dict[Gap, tuple[tuple[int, int], Motion, Calmed | None, Tensor]],
+    kept: dict[Gap, tuple[tuple[int, float], Motion, Calmed | None, Tensor]],
 ) -> None:
     """The best of each gap, in place, with ends that meet."""
     for gap, (_, motion, calmed, before) in kept.items():
@@ -92,12 +94,12 @@ def _compose(
 
 
 def _mend(
-    filler: Filler, root: Tensor, rot: Tensor, wanting: Sequence[Gap], gaps: Sequence[Gap]
+    filler: Filler, root: Tensor, rot: Tensor, wanting: Sequence[Gap], gaps: Sequence[Gap], hips: bool
 ) -> None:
     """What the doctor makes of the gaps with faults, in place, where fewer are left then; it fades in
-    from the keyframes."""
+    from the keyframes. hips: whether their path may change, or legs alone."""
     before = _clip(filler, root, rot)
-    healed = heal(before)
+    healed = heal(before, hips)
     if healed.frames != before.frames:
         return
     tried_root, tried_rot = root.clone(), rot.clone()
@@ -118,6 +120,11 @@ def _mend(
         for gap in some:
             rows = slice(gap.a + 1, gap.b)
             root[rows], rot[rows] = tried_root[rows], tried_rot[rows]
+        for gap in gaps:
+            # A gap begins in the speed in which the one before it ends.
+            at = max(0, gap.a - 1)
+            if gap in some or not torch.equal(was[1][at], rot[at]):
+                filler.join(root, rot, gap)
         now = _count(judged(_clip(filler, root, rot), gaps))
         if now >= fewest:
             root.copy_(was[0])
@@ -128,8 +135,10 @@ def _mend(
             fewest = now
 
 
-def _count(found: Mapping[Gap, Sequence[GapFault]]) -> int:
-    return len({(f.kind, f.joint, f.start) for faults in found.values() for f in faults})
+def _count(found: Mapping[Gap, Sequence[GapFault]]) -> tuple[int, float]:
+    """How many faults there are, and `distance` of all."""
+    each = {(f.kind, f.joint, f.start): f for faults in found.values() for f in faults}
+    return len(each), distance(each.values())
 
 
 def _speed(filler: Filler, root: Tensor, rot: Tensor, gap: Gap) -> float:

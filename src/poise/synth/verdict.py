@@ -68,11 +68,17 @@ def judged(clip: Clip, gaps: Sequence[Gap], sample: int = 0) -> dict[Gap, tuple[
     return out
 
 
-def weight(faults: Iterable[GapFault]) -> tuple[int, int]:
+def weight(faults: Iterable[GapFault]) -> tuple[int, float]:
     """How bad faults are, to compare ways to fill the same gap: how many kinds and joints are at fault,
-    then for how many frames."""
+    then how far feet slide, hover or sink, cm, and for how many frames there are others."""
     found = list(faults)
-    return len({(f.kind, f.joint) for f in found}), sum(f.stop - f.start + 1 for f in found)
+    others = sum(f.stop - f.start + 1 for f in found if KINDS[f.kind].unit != "cm")
+    return len({(f.kind, f.joint) for f in found}), distance(found) + others
+
+
+def distance(faults: Iterable[GapFault]) -> float:
+    """How far (cm) feet slide, hover or sink in all."""
+    return sum(f.size for f in faults if KINDS[f.kind].unit == "cm")
 
 
 def told(faults: Sequence[GapFault], most: int = 6) -> str:

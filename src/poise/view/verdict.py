@@ -120,15 +120,17 @@ def help_given(score: dict[str, Any]) -> Grade:
 
 
 def foot_slide(score: dict[str, Any]) -> Grade:
-    """Foot slide beside that of the clip; told, but it does not decide the verdict."""
+    """Foot slide beside that of the goal; told, but it does not decide the verdict. That of the written
+    file is measured on its soles, as `poise doctor` does."""
     slide = number(score.get("foot_slide_mm_per_s"))
     before = number(_part(score, "reference").get("foot_slide_mm_per_s"))
     text = "not measured" if slide is None else f"{slide:.0f} mm/s"
     key = "foot_slide_mm_per_s"
-    told = [] if before is None else [f"the clip itself: {before:.0f} mm/s"]
-    written = [number(_part(d, "delivered").get(key)) for d in score.get("delivered") or ()]
-    if written and written[0] is not None:
-        told.append(f"the written motion, feet held: {written[0]:.0f} mm/s")
+    told = [] if before is None else [f"the motion it follows: {before:.0f} mm/s"]
+    for held in (score.get("delivered") or ())[:1]:
+        written = number(_part(held, "delivered").get("sole_slide_mm_per_s"))
+        if written is not None:
+            told.append(f"soles of the written motion, feet held: {written:.0f} mm/s")
     detail = "; ".join(told)
     return Grade("Foot slide", text, _level(slide, key), _rule(key, "mm/s"), detail, False)
 

@@ -150,7 +150,7 @@ def test_joints_without_a_body_are_examined_as_far_as_they_can_be() -> None:
     clip = Clip(skeleton, path, rot, 60.0)
     seen = examine(clip)
     assert not seen.judged and [f.kind for f in seen.faults] == ["teleport"]
-    assert seen.figures["foot_slide_mm_per_s"] is None
+    assert seen.figures["sole_slide_mm_per_s"] is None
     assert examine(heal(clip)).faults == ()
     assert anatomy_of(clip) == Anatomy((), ())
     values = {g.what: g.value for g in find_guesses(clip)}

@@ -10,7 +10,14 @@ import torch
 
 from poise.body import find_anatomy
 from poise.kin.doctor import speeds
-from poise.kin.doctor.speeds import ARM_SPEED, TRUNK_SPEED, limit_speeds, speed_limits
+from poise.kin.doctor.clean import CleanReport
+from poise.kin.doctor.speeds import (
+    ARM_SPEED,
+    TRUNK_SPEED,
+    limit_speeds,
+    speed_limits,
+    without_rougher,
+)
 from poise.motion import Clip
 from poise.spatial import quat_angle, quat_conj, quat_mul
 from toy_human import human, swing, turn
@@ -41,6 +48,31 @@ def fastest(clip: Clip) -> np.ndarray:
 @pytest.fixture
 def clip() -> Clip:
     return swing(1.0, 120.0, speed=1.0)
+
+
+def test_a_repair_that_jerks_the_body_more_is_undone(clip):
+    """The hips turn for one frame, and what hangs on them turns back: hardly anything moves."""
+    turns = torch.zeros(clip.frames, dtype=torch.float64)
+    turns[50] = 0.3
+    rot = torch.tensor(clip.rot)
+    for name, way in (("Hips", turns), ("Spine", -turns), ("LeftUpLeg", -turns), ("RightUpLeg", -turns)):
+        j = clip.skeleton.index(name)
+        rot[:, j] = quat_mul(turn("X", way), rot[:, j])
+    broken = clip.replaced(rot=rot.numpy())
+    mended, found = limit_speeds(broken, ANATOMY)
+    # Hips may be as fast as that, a trunk and thighs may not.
+    assert {r.joint for r in found} == {"Spine", "LeftUpLeg", "RightUpLeg"}
+    same, repairs, undone = without_rougher(broken, mended, found)
+    assert repairs == () and undone == found
+    np.testing.assert_array_equal(same.rot, broken.rot)
+    (said,) = CleanReport(kept=undone).sentences()
+    assert said.startswith("Left faster than a human joint, since mending jerks the body more: Spine ")
+    # Where it helps it stays.
+    angles = np.zeros(clip.frames)
+    angles[50:52] = 2.8
+    broken = twisted(clip, angles)
+    mended, found = limit_speeds(broken, ANATOMY)
+    assert without_rougher(broken, mended, found) == (mended, found, ())
 
 
 def test_a_clean_clip_comes_back_as_it_is(clip):

@@ -11,6 +11,7 @@ from poise.env import Acts
 from poise.errors import PoiseError
 from poise.eval import ClipJudge, simulate
 from poise.jobs.track.controllers import Show, Told, look_ahead
+from poise.jobs.track.placement import Placed
 from poise.jobs.tracker import Tracker
 from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence, usual_rate
 from poise.motion import Clip
@@ -24,6 +25,17 @@ if TYPE_CHECKING:
 TRIED, USUAL = (0.5, 2.0), 0.02
 
 
+def rate_doubts(placed: Sequence[Placed]) -> list[str]:
+    """Sentences on frame rates that flights speak against, known before anything is simulated; of
+    several motions each names its own."""
+    out = []
+    for p in placed:
+        doubt = rate_sentence(p.report.clips[0].flights, p.source.fps)
+        if doubt is not None:
+            out.append(f"{p.clip.name}: {doubt}" if len(placed) > 1 else doubt)
+    return out
+
+
 def rate_notes(
     tracker: Tracker,
     given: Clip,
@@ -33,7 +45,7 @@ def rate_notes(
     lost: bool,
     show: Show | None = None,
 ) -> list[str]:
-    """Sentences on the frame rate of a motion, none where nothing speaks against it.
+    """Sentences on the frame rate at which a lost motion is done, none without any.
 
     A motion that more than the policy lost is tried at half and at double its rate, by the policy alone
     and then with lookahead if that is wanted; each try ends where it loses the motion. A policy that is
@@ -45,8 +57,7 @@ def rate_notes(
         on_body: makes a task of a clip. lost: whether the motion was.
         show: is told of tries with lookahead.
     """
-    doubt = rate_sentence(flights, given.fps)
-    notes = [] if doubt is None else [doubt]
+    notes = list[str]()
     vouched = clear_fall(flights) is not None and likely_rate(flights, given.fps) is None
     single = (
         config.count == 1

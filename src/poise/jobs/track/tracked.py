@@ -91,7 +91,8 @@ class Tracked(Result):
     @cached_property
     def card(self) -> ScoreCard:
         """The score of the simulation, help 0, with what holding the feet did."""
-        return finished(self.imitation, self.evaluation).card
+        source = self.placed.source
+        return finished(self.imitation, self.evaluation, True, source, self.at_home).card
 
     @property
     def clip(self) -> Clip:
@@ -104,10 +105,13 @@ class Tracked(Result):
         made = self.motion(character)
         if hold:
             made = hold_feet(made, self.imitation.humanoid.table)[0]
-        made = as_high_as_source(made, self.imitation)
+        return self.at_home(as_high_as_source(made, self.imitation), hold)
+
+    def at_home(self, motion: Clip, hold: bool) -> Clip:
+        """A motion of the body on the skeleton that came in. hold: limbs that stay put are led there."""
         if self.placed.moved is not None:
-            made = home(made, self.placed, self.tracker).replaced(name=made.name)
-        return pinned(made, self.pins) if hold and self.pins else made
+            motion = home(motion, self.placed, self.tracker).replaced(name=motion.name)
+        return pinned(motion, self.pins) if hold and self.pins else motion
 
     def _shown(self) -> Shown:
         return Shown(self.clip, self.placed.source, self.card, self.notes)
@@ -151,8 +155,9 @@ def write(
     said += tuple(p.sentence() for p in t.parts) or failures
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(
-        t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s
-    )
+        t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s,
+        t.at_home,
+    )  # fmt: skip
     (out / FILE).unlink(missing_ok=True)
     if t.simulation is not None:
         t.simulation.save(out / FILE)
@@ -164,7 +169,7 @@ def write(
         if k >= count:
             paths[name] = path
             continue
-        back = t.delivered(k, hold)
+        back = done.home[name]
         body = name.replace("simulated", "body", 1)
         paths[body] = path.rename(out / f"{body}{path.suffix}")
         paths[name] = motion or out / f"{name}{home_suffix(back)}"

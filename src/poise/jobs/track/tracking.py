@@ -6,7 +6,7 @@ tracked.card, tracked.clip, tracked.save("out")
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from poise.jobs.track.parts import Span, cut, parts_of, with_parts
 from poise.jobs.track.placement import Placed, place, place_all
 from poise.jobs.track.points import fitted, follow, points_of
 from poise.jobs.track.pushed import with_push
-from poise.jobs.track.rates import rate_notes
+from poise.jobs.track.rates import rate_doubts, rate_notes
 from poise.jobs.track.retaking import retaken
 from poise.jobs.track.supports import with_supports
 from poise.jobs.track.tracked import Clean, Tracked
@@ -57,6 +57,7 @@ def track(
     config: TrackConfig | None = None,
     *,
     progress: Show | None = None,
+    warn: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> Tracked:
     """Lets a trained policy do a motion that it need not know, without help and without training.
@@ -74,6 +75,8 @@ def track(
             controller="policy".
         progress: is told what is done ("looking ahead", "searching"), and how many control steps of how
             many are done.
+        warn: is told, before anything is simulated, what speaks against the motion: a frame rate that is
+            likely wrong. The same sentences are among the notes.
 
     Raises:
         PoiseError: a motion that cannot be read, that no human makes or that is too short, or no such
@@ -100,6 +103,11 @@ def track(
     imitation = imitation_of(tracker, all_placed)
     notes = [f"{p.clip.name}: {n}" if several else n for p in all_placed for n in p.notes]
     notes += directions
+    doubts = rate_doubts(all_placed)
+    if warn is not None:
+        for doubt in doubts:
+            warn(doubt)
+    notes += doubts
     if points is not None and not several:
         reference, said = follow(tracker, placed, points, imitation.reference, config.smooth_hz)
         imitation, notes = replace(imitation, reference=reference), [*notes, *said]

@@ -9,7 +9,7 @@ from typing import Any
 from poise.body import Anatomy, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.doctor.flips import Flip, out_of_reach, unflip
-from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds
+from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds, without_rougher
 from poise.kin.flight import likely_rate, rate_sentence
 from poise.kin.ground import clip_flights
 from poise.motion import Clip
@@ -20,15 +20,17 @@ class CleanReport:
     """What was repaired in one clip; empty for a clean one. Frames are the file's.
 
     flips: feet and hands that were turned back. speeds: turns faster than a human joint. left: (joint,
-    frames) of feet and hands that are still where none reaches, since no repair was sure enough.
+    frames) of feet and hands that are still where none reaches, since no repair was sure enough. kept:
+    turns too fast that stay, since the body would jerk more without, see `without_rougher`.
     """
 
     flips: tuple[Flip, ...] = ()
     speeds: tuple[SpeedRepair, ...] = ()
     left: tuple[tuple[str, int], ...] = ()
+    kept: tuple[SpeedRepair, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.flips or self.speeds or self.left)
+        return bool(self.flips or self.speeds or self.left or self.kept)
 
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
@@ -50,6 +52,9 @@ class CleanReport:
         if self.left:
             parts = [f"{joint} in {frames} frames" for joint, frames in self.left]
             out.append(f"Left where no joint reaches: {', '.join(parts)}.")
+        if self.kept:
+            told = ", ".join(f"{joint} {_frames(mine)}" for joint, mine in _by_joint(self.kept))
+            out.append(f"Left faster than a human joint, since mending jerks the body more: {told}.")
         return out
 
     def to_dict(self) -> dict[str, Any]:
@@ -70,12 +75,12 @@ def clean_clip(clip: Clip, anatomy: Anatomy | None = None) -> tuple[Clip, CleanR
     """The clip with its faults repaired, and every repair; a clean clip comes back as it is.
 
     First feet and hands are turned back (`unflip`), then speeds that no human joint reaches are
-    interpolated (`limit_speeds`), so that what remains of the jumps goes too.
+    interpolated (`limit_speeds`), so that what remains of the jumps goes too; not where that is rougher.
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
     turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
-    slowed, speeds = limit_speeds(turned, anatomy)
-    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy))
+    slowed, speeds, kept = without_rougher(turned, *limit_speeds(turned, anatomy))
+    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept)
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,10 @@ from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
-from poise.kin.feet.contact import NEAR_M
 from poise.kin.flight import likely_rate
 from poise.kin.hinges import chain_angles
 from poise.kin.series import smooth_lift
-from poise.metrics import floating, foot_slide, jerk, penetration
+from poise.metrics import floating, jerk, penetration
 from poise.motion import Clip
 
 #: Degrees beyond a limit that a file states which count, and for how long (s): they are rough.
@@ -72,11 +71,12 @@ def examine(clip: Clip) -> Examination:
     return Examination(tuple(ordered), _figures(clip, support), support is not None)
 
 
-def heal(clip: Clip) -> Clip:
+def heal(clip: Clip, path: bool = True) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
     In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, the height
-    above the floor, sliding feet. A step changes nothing if its faults are not there.
+    above the floor, sliding feet. A step changes nothing if its faults are not there. path: whether the
+    root's path may be freed of the slip of standing feet, or legs alone hold them.
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)
@@ -87,7 +87,7 @@ def heal(clip: Clip) -> Clip:
     clip = mend_jitter(clip)
     if support is None:
         return clip
-    return _on_floor(_locked(_on_floor(clip, anatomy), anatomy), anatomy)
+    return _on_floor(_locked(_on_floor(clip, anatomy), anatomy, path), anatomy)
 
 
 def _on_floor(clip: Clip, anatomy: Anatomy) -> Clip:
@@ -115,9 +115,9 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy) -> Clip:
-    """The clip without sliding feet."""
-    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
+def _locked(clip: Clip, anatomy: Anatomy, path: bool) -> Clip:
+    """The clip without sliding feet. path: see `heal`."""
+    for step in (*[mend_path] * path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:
@@ -132,6 +132,7 @@ def _joint_faults(report: CleanReport, clip: Clip) -> list[Fault]:
         for f in report.flips
     ]
     out += [Fault("speed", s.joint, s.start, s.stop, s.before) for s in report.speeds]
+    out += [Fault("joint jump", s.joint, s.start, s.stop, s.before) for s in report.kept]
     last = clip.frames - 1
     return out + [Fault("out of reach", joint, 0, last, float(n)) for joint, n in report.left]
 
@@ -186,7 +187,7 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
     shake = jerk(pos, clip.fps)
     step = np.linalg.norm(np.diff(clip.root_pos, axis=0), axis=-1)
     out: dict[str, float | None] = {
-        "foot_slide_mm_per_s": None,
+        "sole_slide_mm_per_s": None,
         "penetration_mm": None,
         "penetration_max_mm": None,
         "float_mm": None,
@@ -196,11 +197,10 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
         "joint_speed_max_rad_per_s": float(body_steps(clip).max()) * clip.fps,
     }
     if support is not None:
-        slide = foot_slide(support.soles, clip.fps, height=NEAR_M, ground=-support.fit.lift_m)
         lowest = torch.tensor(support.low.min(-1))
         depth = penetration(lowest)
         gap = floating(torch.tensor(support.sole_low), torch.tensor(support.com[:, 2]), clip.fps)
-        out["foot_slide_mm_per_s"] = _number(slide)
+        out["sole_slide_mm_per_s"] = support.sole_slide
         out["penetration_mm"], out["penetration_max_mm"] = _number(depth.mean_mm), _number(depth.max_mm)
         out["float_mm"] = _number(gap)
     return out

@@ -31,6 +31,7 @@ KINDS = {
     "float": Kind("hovers without falling", "cm", "lowered to the floor"),
     "penetration": Kind("lies under the floor", "cm", "lifted out of the floor"),
     "foot slide": Kind("slides while it stands", "cm", "held in place, the leg follows"),
+    "joint jump": Kind("faster than a human joint, and a repair would jerk the body more", "rad/s"),
     "out of reach": Kind("stays where no joint reaches", "frames"),
     "limit": Kind("beyond the file's own limits", "degrees"),
     "bone drift": Kind("its bone changes its length or place", "mm", "kept rigid when it is read"),

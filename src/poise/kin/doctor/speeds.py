@@ -10,6 +10,7 @@ from torch import Tensor
 
 from poise.body import Anatomy
 from poise.kin.series import fade_beside, find_runs, gaussian_sums
+from poise.metrics import jerk
 from poise.motion import Clip
 from poise.spatial import normalize, quat_angle, quat_between, slerp, unwrap_quats
 
@@ -29,6 +30,8 @@ LONGEST_S, END_S = 0.3, 0.1
 WIDEST_S = 0.1
 #: A smoothed stretch is preferred where it changes this much less than an interpolated one.
 CLEARLY_LESS = 0.7
+#: A repair is undone where the clip jerks this many times as much there as it did anywhere before.
+ROUGHER = 1.1
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,40 @@ def limit_speeds(clip: Clip, anatomy: Anatomy) -> tuple[Clip, tuple[SpeedRepair,
                 )
             )
     return (clip.replaced(rot=rot.numpy()), tuple(found)) if found else (clip, ())
+
+
+def without_rougher(
+    before: Clip, after: Clip, repairs: tuple[SpeedRepair, ...]
+) -> tuple[Clip, tuple[SpeedRepair, ...], tuple[SpeedRepair, ...]]:
+    """A clip with its speeds repaired but where that jerks the body more than anything did before.
+
+    There many joints jump in one frame (frames are missing, or one joint undoes another), and only
+    those above the limit would be made steady. Such spells stay as they were, with all repairs that
+    touch them.
+
+    Returns:
+        the clip, the repairs that it has, and those that were undone.
+    """
+    undone: tuple[SpeedRepair, ...] = ()
+    if not repairs or before.frames < 4:
+        return after, repairs, undone
+    most = ROUGHER * float(_shake(before).max())
+    while True:
+        # A third difference is of four frames.
+        rough = torch.nonzero(_shake(after) > most).flatten().tolist()
+        hit = tuple(r for r in repairs if any(r.start - 3 <= k <= r.stop for k in rough))
+        if not hit:
+            return after, repairs, undone
+        rot = torch.tensor(after.rot)
+        for r in hit:
+            here, j = slice(r.start, r.stop + 1), before.skeleton.index(r.joint)
+            rot[here, j] = torch.tensor(before.rot[here, j])
+        after = after.replaced(rot=rot.numpy())
+        repairs, undone = tuple(r for r in repairs if r not in hit), (*undone, *hit)
+
+
+def _shake(clip: Clip) -> Tensor:
+    return jerk(torch.tensor(clip.positions()), clip.fps)
 
 
 def _around(fps: float) -> int:

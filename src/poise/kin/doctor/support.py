@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,7 +18,7 @@ from poise.kin.fk import carried
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights
 from poise.kin.series import find_runs
 from poise.kin.solids import low_and_com
-from poise.metrics import foot_contacts
+from poise.metrics import foot_contacts, foot_slide
 from poise.motion import Clip
 
 #: How far (m) the estimated soles of a clip may be off the floor before the whole clip is: the file
@@ -88,6 +89,13 @@ class Support:
         """`(T, P)` m, how deep each point is under the floor beyond its margin, 0 above it."""
         return np.maximum(self.off_m - self.margin - self.low, 0.0)
 
+    @property
+    def sole_slide(self) -> float | None:
+        """Mean horizontal speed (mm/s) of the soles' ends while in contact, None without any."""
+        ground = -self.fit.lift_m
+        found = float(foot_slide(self.soles, self.fps, height=NEAR_M, ground=ground))
+        return found if math.isfinite(found) else None
+
     @cached_property
     def contacts(self) -> tuple[Tensor, Tensor]:
         """Horizontal speed (m/s) and contact of every sole point between frames, `(T - 1, F)`.
@@ -114,6 +122,13 @@ def support_of(clip: Clip, anatomy: Anatomy) -> Support | None:
     except PoiseError:
         return None
     return Support.of(clip, anatomy, table) if anatomy.parts else None
+
+
+def sole_slide(clip: Clip) -> float | None:
+    """How fast (mm/s) the standing soles of a motion travel over the floor: what `poise doctor` says of
+    its file. None where no body is told, or none of its soles comes near the floor."""
+    support = support_of(clip, anatomy_of(clip))
+    return None if support is None else support.sole_slide
 
 
 def _low_points(

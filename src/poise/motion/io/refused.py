@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -11,6 +12,8 @@ from poise.motion.io.raw import ReadOptions
 
 FLAT_HINT = "Triangulate the cameras first, for example with Pose2Sim, and give its TRC file"
 """What to do with 2D keypoints."""
+LOOKED_AT = 1000
+"""Files of a folder among which one is sought that tells what the folder holds."""
 _HUMAN_HINT = "Give the human motion it was made from"
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ROOT = 7
@@ -116,8 +119,9 @@ def refuse_folder(path: Path) -> NoReturn:
 
 
 def refuse_flat_folder(path: Path) -> None:
-    """Refuses a folder of OpenPose's JSON files, told by the first of its JSON files."""
-    first = next((f for f in sorted(path.rglob("*.json")) if f.is_file()), None)
+    """Refuses a folder of OpenPose's JSON files, told by one among its first `LOOKED_AT` files."""
+    few = itertools.islice(path.rglob("*"), LOOKED_AT)
+    first = min((f for f in few if f.suffix == ".json" and f.is_file()), default=None)
     if first is not None:
         with first.open("rb") as file:
             if looks_like_openpose(file.read(4096).lstrip()):

@@ -81,7 +81,8 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     stop = marks.first + clip.frames
     note = _misfit_note(fit_distances(_cut(points, marks.first, stop), clip))
     all_notes = (*points.source.notes, *notes, note)
-    return clip.replaced(skeleton=skeleton.with_source(notes=all_notes))
+    why = points.source.evidence + ((("jitter", marks.jitter),) if marks.jitter else ())
+    return clip.replaced(skeleton=skeleton.with_source(notes=all_notes, evidence=why))
 
 
 def fit_distances(points: Keypoints, clip: Clip) -> dict[str, np.ndarray]:

@@ -27,11 +27,13 @@ class Landmarks:
 
     tracks: place -> `(T, 3)`, no NaN.
     first: the frame of the recording that is frame 0 here. notes: one sentence per repair.
+    jitter: that of the notes which says how much they tremble, empty where they do not.
     """
 
     tracks: dict[str, np.ndarray]
     first: int
     notes: tuple[str, ...]
+    jitter: str = ""
 
 
 def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -123,17 +125,19 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
     tracks = _filled(tracks)
     size = jitter(np.stack([tracks[place] for place in NEEDED], 1))
+    trembles = ""
     if smooth_hz is None and size > _JITTER_M:
-        notes.append(
+        trembles = (
             f"The keypoints jitter by about {size * 1e3:.0f} mm from frame to frame, and so does the "
             "clip: --smooth HZ (6 suits most motion) takes it away"
         )
+        notes.append(trembles)
     if smooth_hz is not None:
         tracks = {place: smooth(track, points.fps, smooth_hz) for place, track in tracks.items()}
         notes.append(
             f"The keypoints were smoothed by a zero-phase Gaussian low-pass at {smooth_hz:g} Hz"
         )
-    return Landmarks(tracks, start, tuple(notes))
+    return Landmarks(tracks, start, tuple(notes), trembles)
 
 
 def _lost(missing: np.ndarray, start: int, stop: int) -> str:
