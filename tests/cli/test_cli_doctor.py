@@ -151,8 +151,8 @@ def test_the_floor_can_be_stated_or_taken_from_the_soles(broken: Path, capsys) -
 
 def test_a_floor_that_is_0_but_for_rounding_is_0() -> None:
     guess = {"what": "ground", "value": 4.1633e-17, "evidence": "E", "override": "O"}
-    assert _guess(guess) == "ground: 0. E. [O]"
-    assert _guess({**guess, "value": -0.0125}) == "ground: -0.0125. E. [O]"
+    assert _guess(guess) == "ground: 0 m. E. [O]"
+    assert _guess({**guess, "value": -0.0125}) == "ground: -0.0125 m. E. [O]"
 
 
 def test_sides_can_be_exchanged(tmp_path: Path, capsys) -> None:

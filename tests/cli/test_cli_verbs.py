@@ -111,7 +111,7 @@ def test_what_tyro_refuses_becomes_one_sentence() -> None:
     import tyro
 
     from poise.cli.imitate import Options
-    from poise.cli.parse import TRIED, parse
+    from poise.cli.parse import TRIED, joined, parse
 
     # The events are private to tyro: where this fails after an upgrade, try the sentences below again.
     assert tyro.__version__ == TRIED or tyro.__version__.split(".")[:2] == TRIED.split(".")[:2]
@@ -123,6 +123,11 @@ def test_what_tyro_refuses_becomes_one_sentence() -> None:
         assert text.endswith(". See poise imitate --help") or "? See poise imitate --help" in text
         return text.removesuffix(" See poise imitate --help").rstrip(".")
 
+    # Help is wrapped at the window's width alone, not where docstrings in the source are.
+    assert (
+        joined("It walks\n    and (then)\n    0 runs.\n\n    Or not.")
+        == "It walks and (then) 0 runs.\n\nOr not."
+    )
     given = ("a.bvh", "-o", "out")
     assert said("a.bvh") == "poise imitate needs -o DIR|FILE"
     assert said() == "poise imitate needs CLIP and -o DIR|FILE"

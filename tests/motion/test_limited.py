@@ -46,9 +46,9 @@ def test_an_answer_comes_back_whatever_else_is_printed(tmp_path: Path) -> None:
         ("refuse('it is bad', 'Make it good')", "it is bad. Make it good"),
         ("raise ValueError('line\\n\\x1b[31m two')", "the BIN file is damaged ('line ?[31m two')"),
         ("raise SystemExit(7)", "the BIN file is damaged ('7'). The file seems cut off"),
-        ("os._exit(7)", "the BIN file is damaged ('it ended with 7'). The file seems cut off"),
-        ("os._exit(0)", "the BIN file is damaged ('it ended with 0'). The file seems cut off"),
-        ("os.write(1, b'x'); os._exit(3)", "the BIN file is damaged ('it ended with 3')"),
+        ("os._exit(7)", "the BIN file is damaged (reading ended with 7). The file seems cut off"),
+        ("os._exit(0)", "the BIN file is damaged (reading ended with 0). The file seems cut off"),
+        ("os.write(1, b'x'); os._exit(3)", "the BIN file is damaged (reading ended with 3)"),
         ("raise MemoryError", "the BIN file takes more than 1.1 GB to read"),
     ],
 )
@@ -58,7 +58,7 @@ def test_every_end_is_a_sentence(tmp_path: Path, body: str, said: str) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
 def test_a_crash_is_a_sentence(tmp_path: Path) -> None:
-    assert "ended with -" in refusal(tmp_path, "os.kill(os.getpid(), signal.SIGKILL)")
+    assert "(what reads it crashed)" in refusal(tmp_path, "os.kill(os.getpid(), signal.SIGKILL)")
 
 
 @pytest.mark.parametrize("body", ["time.sleep(600)", "while True: pass"])

@@ -35,6 +35,10 @@ class Options:
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
+#: What guesses that are numbers are in.
+UNITS = {"unit": " m", "ground": " m", "fps": " frames/s"}
+
+
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads every file before the first line is printed."""
     if not options.clips:
@@ -71,7 +75,7 @@ def _guess(guess: dict[str, Any]) -> str:
     """One guess in a line; a number that is 0 but for rounding is 0."""
     value = guess["value"]
     if isinstance(value, float):
-        value = f"{value if abs(value) >= 1e-9 else 0:.5g}"
+        value = f"{value if abs(value) >= 1e-9 else 0:.5g}{UNITS.get(guess['what'], '')}"
     value = "not told" if value is None else value
     return f"{guess['what']}: {value}. {guess['evidence']}. [{guess['override']}]"
 

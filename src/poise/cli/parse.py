@@ -39,7 +39,7 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
         raise PoiseError(what, hint=f"{hint}See {prog} --help")
 
     try:
-        with _told(refuse), contextlib.redirect_stderr(io.StringIO()):
+        with _told(refuse), _whole_lines(), contextlib.redirect_stderr(io.StringIO()):
             made = tyro.cli(options, prog=prog, args=dotted(argv), config=_CONFIG, default=default)
         assert made is not None
         return made
@@ -57,6 +57,27 @@ def _told(refuse: Any) -> contextlib.AbstractContextManager[None]:
     except ImportError:
         return contextlib.nullcontext()
     return on_parse_error(refuse)
+
+
+@contextlib.contextmanager
+def _whole_lines() -> Iterator[None]:
+    """Has tyro wrap help at the window's width alone: it breaks docstrings where their source does."""
+    try:
+        from tyro import _strings
+    except ImportError:
+        yield
+        return
+    theirs = _strings.remove_single_line_breaks
+    _strings.remove_single_line_breaks = joined
+    try:
+        yield
+    finally:
+        _strings.remove_single_line_breaks = theirs
+
+
+def joined(text: str) -> str:
+    """Each paragraph of a docstring as one line."""
+    return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n[ \t]*\n", text.strip()))
 
 
 def sentence(event: Any, options: type, prog: str) -> tuple[str, str]:

@@ -73,7 +73,8 @@ class Options:
     count: Annotated[int, arg(metavar="N")] = 1
     """Characters that do the motion side by side in one world, where they may collide."""
     supports: Flag = True
-    """Where a single motion sits, leans or steps on something, put a box there; a sentence says what."""
+    """Put nothing beside the motion; by default a box stands where a single motion sits, leans or steps
+    on something, and a sentence says so."""
     support: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Boxes beside the motion that stand there instead (.json), such as a result's supports.json."""
     weight: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PART=FACTOR[:A-B]")] = ()

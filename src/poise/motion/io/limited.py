@@ -71,7 +71,8 @@ def read_limited(
     said = _said(done.stdout) if done.returncode in (REFUSED, FAULT) else {}
     if done.returncode == REFUSED and said:
         raise PoiseError(str(said.get("what")), path, said.get("hint"))
-    reason = shown(" ".join(str(said.get("what") or "").split()) or f"it ended with {done.returncode}")
+    crashed = "what reads it crashed" if done.returncode < 0 else f"reading ended with {done.returncode}"
+    reason = shown(what) if (what := " ".join(str(said.get("what") or "").split())) else crashed
     raise PoiseError(f"the {kind} is damaged ({reason})", path, hint)
 
 
