@@ -62,12 +62,14 @@ def _told(refuse: Any) -> contextlib.AbstractContextManager[None]:
 @contextlib.contextmanager
 def _whole_lines() -> Iterator[None]:
     """Has tyro wrap help at the window's width alone: it breaks docstrings where their source does."""
+    # Private to tyro: without it help is as tyro wraps it.
     try:
         from tyro import _strings
-    except ImportError:
+
+        theirs = _strings.remove_single_line_breaks
+    except (ImportError, AttributeError):
         yield
         return
-    theirs = _strings.remove_single_line_breaks
     _strings.remove_single_line_breaks = joined
     try:
         yield
