@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import shutil
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, NoReturn, TypeVar
@@ -23,6 +25,8 @@ T = TypeVar("T")
 _CONFIG = (tyro.conf.FlagCreatePairsOff,)
 #: The version of tyro with the events that were tried.
 TRIED = "1.0.17"
+#: Columns of the widest line of what a verb does.
+WIDEST = 100
 _KINDS = {"INT": "a whole number", "FLOAT": "a number"}
 
 
@@ -39,8 +43,10 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
         raise PoiseError(what, hint=f"{hint}See {prog} --help")
 
     try:
-        with _told(refuse), _whole_lines(), contextlib.redirect_stderr(io.StringIO()):
-            made = tyro.cli(options, prog=prog, args=dotted(argv), config=_CONFIG, default=default)
+        does = about(options)
+        with _told(refuse), _whole_lines(does), contextlib.redirect_stderr(io.StringIO()):
+            how: dict[str, Any] = {"prog": prog, "config": _CONFIG, "default": default}
+            made = tyro.cli(options, args=dotted(argv), description=does, **how)
         assert made is not None
         return made
     except SystemExit as stop:
@@ -60,8 +66,9 @@ def _told(refuse: Any) -> contextlib.AbstractContextManager[None]:
 
 
 @contextlib.contextmanager
-def _whole_lines() -> Iterator[None]:
-    """Has tyro wrap help at the window's width alone: it breaks docstrings where their source does."""
+def _whole_lines(kept: str) -> Iterator[None]:
+    """Has tyro wrap help at the window's width alone: it breaks docstrings where their source does.
+    kept: a text with lines of its own."""
     # Private to tyro: without it help is as tyro wraps it.
     try:
         from tyro import _strings
@@ -70,11 +77,18 @@ def _whole_lines() -> Iterator[None]:
     except (ImportError, AttributeError):
         yield
         return
-    _strings.remove_single_line_breaks = joined
+    _strings.remove_single_line_breaks = lambda text: text if text == kept else joined(text)
     try:
         yield
     finally:
         _strings.remove_single_line_breaks = theirs
+
+
+def about(options: type) -> str:
+    """What a verb does, in lines that fit into the window: tyro wraps what it says of options alone."""
+    wide = min(shutil.get_terminal_size().columns, WIDEST)
+    lines = joined(options.__doc__ or "").split("\n\n")
+    return "\n\n".join(textwrap.fill(line, wide) for line in lines)
 
 
 def joined(text: str) -> str:
