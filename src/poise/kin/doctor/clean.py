@@ -71,15 +71,23 @@ def _frames(found: Sequence[Any]) -> str:
     return f"{count} frame{'' if count == 1 else 's'}"
 
 
-def clean_clip(clip: Clip, anatomy: Anatomy | None = None) -> tuple[Clip, CleanReport]:
+def clean_clip(
+    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True
+) -> tuple[Clip, CleanReport]:
     """The clip with its faults repaired, and every repair; a clean clip comes back as it is.
 
     First feet and hands are turned back (`unflip`), then speeds that no human joint reaches are
-    interpolated (`limit_speeds`), so that what remains of the jumps goes too; not where that is rougher.
+    interpolated (`limit_speeds`), so that what remains of the jumps goes too.
+
+    rougher: also where that jerks the body more, see `without_rougher`. A body with joints that cannot
+    turn so fast wants it; a file that stays a file does not.
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
     turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
-    slowed, speeds, kept = without_rougher(turned, *limit_speeds(turned, anatomy))
+    slowed, speeds = limit_speeds(turned, anatomy)
+    kept: tuple[SpeedRepair, ...] = ()
+    if not rougher:
+        slowed, speeds, kept = without_rougher(turned, slowed, speeds)
     return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept)
 
 

@@ -55,7 +55,7 @@ def examine(clip: Clip) -> Examination:
     """
     anatomy = anatomy_of(clip)
     support = support_of(clip, anatomy)
-    cleaned, report = clean_clip(clip, anatomy)
+    cleaned, report = clean_clip(clip, anatomy, rougher=False)
     faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
     faults += [*limit_faults(clip), *_read_faults(clip)]
     if support is not None:
@@ -83,7 +83,7 @@ def heal(clip: Clip, path: bool = True) -> Clip:
     support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)
     clip = mend_teleports(clip, low)
-    clip = clean_clip(clip, anatomy)[0]
+    clip = clean_clip(clip, anatomy, rougher=False)[0]
     clip = mend_jitter(clip)
     if support is None:
         return clip
