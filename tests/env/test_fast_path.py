@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import mmap
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -24,6 +27,8 @@ from poise.spatial import (
 )
 from toy_human import swing
 
+#: MB that a recording's constant takes, and how many recordings are made and left.
+CONSTANT_MB, RECORDINGS = 32, 4
 CLIPS = (swing(0.6), swing(0.5, speed=1.0, bend=0.4, cyclic=True, name="walk"))
 
 
@@ -212,3 +217,29 @@ def test_a_term_that_looks_at_values_is_never_frozen(make_task):
     env.reset_to(start, start)
     rewards = [float(env.step(torch.zeros(1, env.num_actions)).reward) for _ in range(25)]
     assert rewards[:10] == [0.0] * 10 and rewards[-5:] == [1.0] * 5
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
+def test_recordings_that_are_left_leave_no_memory_behind() -> None:
+    """An environment's recordings hold its reference; a folder of clips makes many environments."""
+
+    def held_mb() -> float:
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 2**20
+
+    def record_one() -> None:
+        table = torch.rand(CONSTANT_MB, 2**18)
+
+        def plain(x: Tensor) -> tuple[Tensor, ...]:
+            return (x + table[:, :3].sum(),)
+
+        x = torch.rand(3)
+        recorded = record(plain, (x,))
+        assert recorded is not plain
+        torch.testing.assert_close(recorded(x)[0], plain(x)[0], rtol=0, atol=0)
+
+    record_one()
+    before = held_mb()
+    for _ in range(RECORDINGS):
+        record_one()
+    assert held_mb() - before < CONSTANT_MB / 2

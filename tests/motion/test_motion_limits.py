@@ -22,10 +22,10 @@ RATE = "the frame rate must be from 0.1 to 2000 per second, got "
 
 
 def refusal(path: Path, **options: object) -> str:
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(PoiseError) as error:
         read_clip(path, **options)  # type: ignore[arg-type]
-    assert time.perf_counter() - start < 3.0
+    assert time.process_time() - start < 3.0
     message = str(error.value)
     assert message.startswith(str(path)) and "\n" not in message and len(message) < len(str(path)) + 250
     return message.removeprefix(str(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,13 +30,14 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
-            recorded = cast(Any, torch.jit.trace(plain, given, check_trace=False))
+            graph = _traced(plain, given)
         except RuntimeError:
             return plain
     # What a recording would freeze, such as a value that was asked for, torch only warns of.
     if any(issubclass(w.category, torch.jit.TracerWarning) for w in told):
         return plain
-    _drop_whole_slices(recorded.graph)
+    _drop_whole_slices(graph)
+    recorded = torch._C._create_function_from_graph("replayed", graph)
 
     def replay(*given: Tensor) -> tuple[Tensor, ...]:
         # What every operation otherwise notes for gradients is a sixth of the time of one world.
@@ -44,6 +45,16 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
             return recorded(*given)
 
     return replay
+
+
+def _traced(plain: TensorFunction, given: tuple[Tensor, ...]) -> Any:
+    """The operations of `plain(*given)`.
+
+    `torch.jit.trace` does the same, but keeps the function and its constants until the process ends,
+    which is some MB for every environment.
+    """
+    names = [f"given{k}" for k in range(len(given))]
+    return torch._C._create_graph_by_tracing(plain, given, lambda _: "", True, False, None, names)[0]
 
 
 def _drop_whole_slices(graph: Any) -> None:

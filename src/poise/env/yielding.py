@@ -87,7 +87,7 @@ class Yielding(Plugin):
         dial = given.level if isinstance(given, Compliance) else given.newtons_per_metre
         self.level = torch.full((n,), dial, dtype=torch.float64, device=here)
         self.share = torch.ones_like(self.level)
-        self._before, self._k = goal.offset.clone(), 0
+        self._before, self._k, self._looked = goal.offset.clone(), 0, False
         self._rows = torch.arange(n, device=here).unsqueeze(1)
 
     def turn(self, level: float | Tensor, rows: Tensor | None = None) -> None:
@@ -128,8 +128,14 @@ class Yielding(Plugin):
         u.masked_fill_(gone, 0.0)
         rate.masked_fill_(gone, 0.0)
         self._before.copy_(self.goal.offset)
-        self._k = 0
-        inner = self.goal.goal
+        self._k, self._looked = 0, False
+
+    def _look(self) -> None:
+        """What the goal is in this control step, once something moves u: it takes as long as a quarter
+        of the physics."""
+        if self._looked:
+            return
+        self._looked, inner = True, self.goal.goal
         self._reference = [inner.layout.unpacked(packed) for packed in (inner.now(), inner.ahead())]
         table, rows = inner.targets()
         hinges = table[rows].double()
@@ -171,6 +177,7 @@ class Yielding(Plugin):
             ):
                 return
             back_u, back_rate = settled(u, rate, self.given.return_hz, self._step_s)
+        self._look()
         if pushed is None or not bool(pushed.any()):
             u.copy_(back_u)
             rate.copy_(back_rate)

@@ -77,8 +77,9 @@ class Kinematics:
             else:
                 arm = quat_rotate(quat[parent], offset.expand(*batch, 3))
                 p = pos[parent] + arm
-                v = lin[parent] + torch.linalg.cross(ang[parent], arm)
-                w = ang[parent]
+                v, w = lin[parent], ang[parent]
+                if vel is not None:
+                    v = v + torch.linalg.cross(w, arm)
                 q = quat_mul(quat[parent], rest.expand(*batch, 4))
                 for i, axis in enumerate(axes):
                     angle = qpos[..., 7 + at + i]

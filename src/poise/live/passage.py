@@ -111,11 +111,23 @@ def _levels(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.array(js), np.array([parents[j] for j in js])) for js in levels]
 
 
+@lru_cache(maxsize=64)
+def _doublings(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Joints, and those that all of the way up to which they know already hang on: each round doubles
+    the way, so that few are enough."""
+    above, out = np.array(parents), list[tuple[np.ndarray, np.ndarray]]()
+    while (above >= 0).any():
+        joints = np.flatnonzero(above >= 0)
+        out.append((joints, above[joints]))
+        above = np.where(above >= 0, above[np.maximum(above, 0)], -1)
+    return out
+
+
 def world_of(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
     """World rotations `(J, 4)` of local ones."""
     out = rot.copy()
-    for joints, parents in _levels(tuple(skeleton.parents)):
-        out[joints] = q.mul(out[parents], rot[joints])
+    for joints, above in _doublings(tuple(skeleton.parents)):
+        out[joints] = q.mul(out[above], out[joints])
     return out
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from poise.env.recovery.get_up import GetUpPlanner, Poses
+from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import STAY_S, plan_recovery, walk_of
 from poise.env.recovery.run_up import run_up
 from poise.env.reference import Reference
@@ -34,8 +34,8 @@ def entry(get_up: GetUpPlanner, motions: Reference, clip: int, frame: int, qpos:
     rows = slice(first, min(end, first + round(FIRST_S * motions.rate_hz)))
     if rows.stop - rows.start < 2:
         return frame
-    table, poses = motions.humanoid.table, motions.qpos[rows].cpu()
-    apart = Poses(table, get_up.recovery_clips.ease[None]).apart(Poses(table, poses))[0]
+    poses = motions.qpos[rows].cpu()
+    apart = get_up.poses(get_up.recovery_clips.ease[None]).apart(get_up.poses(poses))[0]
     speed = motions.pose.linvel[rows].norm(dim=-1).mean(-1).cpu()
     later = torch.arange(len(apart)) / motions.rate_hz
     walked = (poses[:, :2] - qpos[:2]).norm(dim=-1) / walk_of(get_up, 0)[1]
@@ -73,12 +73,13 @@ def way_to_stand(
 
     moves, again: see `plan_recovery`.
     """
+    up = None
     if place is None:
-        lies = bool(get_up.lies(qpos))
-        place = (get_up.up(qpos, again)[-1] if lies else qpos).clone()
-        if moves is not None and not lies:
+        up = get_up.up(qpos, again) if bool(get_up.lies(qpos)) else None
+        place = (qpos if up is None else up[-1]).clone()
+        if moves is not None and up is None:
             # x = v |v| / 2a: where what moves can stand.
             place[:2] += moves * float(moves.norm()) / (2 * STOPS)
     stand = facing(get_up.recovery_clips.ease, heading_angle(place[3:7]))
     stand[:2] = place[:2]
-    return plan_recovery(get_up, qpos, stand, moves=moves, again=again)
+    return plan_recovery(get_up, qpos, stand, moves=moves, again=again, up=up)

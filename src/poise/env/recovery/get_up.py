@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from torch import Tensor
 
@@ -37,7 +39,8 @@ class GetUpPlanner:
     def __init__(self, recovery_clips: RecoveryClips, table: BodyTable, rate_hz: float):
         self.recovery_clips, self.table, self.rate_hz = recovery_clips, table, rate_hz
         self.ups = [_sooner(clip, QUICK) for clip in recovery_clips.ups]
-        self._ups = [Poses(table, clip) for clip in self.ups]
+        self.kinematics = Kinematics(table)
+        self._ups = [self.poses(clip) for clip in self.ups]
         # A clip is entered while its root lies: what comes later needs what came before.
         for up in self._ups:
             height = up.pos[:, 0, 2]
@@ -53,7 +56,7 @@ class GetUpPlanner:
         again: how often that was lost in a row. What was lost is tried half as fast at its begin, and
             then by the clip that is next nearest: the same would be lost the same way for ever.
         """
-        lying, clips = Poses(self.table, start[None]), self.ups
+        lying, clips = self.poses(start[None]), self.ups
         costs = [
             # Of two frames alike the later one is up sooner.
             lying.apart(up)[0] + LATER * (len(clip) - up.rows) / self.rate_hz
@@ -90,32 +93,39 @@ class GetUpPlanner:
 
     def _between(self, a: Tensor, b: Tensor) -> int:
         """Frames from one pose to another; 1 where they are the same."""
-        gap = float(Poses(self.table, a[None]).apart(Poses(self.table, b[None])))
+        both = self.poses(torch.stack((a, b)))
+        gap = float(both.row(0).apart(both.row(1)))
         gap = max(gap, float((b[:2] - a[:2]).norm()))
         return round(self.rate_hz * (BLEND_S + gap / BLEND_SPEED)) + 1 if gap > SAME else 1
 
     def _lifted(self, frames: Tensor) -> Tensor:
         """Frames raised or lowered until they touch the floor, by no more than `LIFT` m up."""
-        body, out = Kinematics(self.table)(frames), frames.clone()
+        body, out = self.kinematics(frames), frames.clone()
         lift = -lowest_height(self.table, body.pos, body.quat).amin(-1)
         out[:, 2] += lift.clamp(max=LIFT)
         return out
 
     def _laid(self, onto: Tensor, frames: Tensor) -> Tensor:
         """Frames moved and turned so that the first lies on the pose `onto`."""
-        own, there = (Poses(self.table, q[None]) for q in (frames[0], onto))
+        both = self.poses(torch.stack((frames[0], onto)))
+        own, there = both.row(0), both.row(1)
         return turned(frames, float(there.turn(own)), own.centre[0], there.centre[0])
+
+    def poses(self, qpos: Tensor) -> Poses:
+        """Poses `(P, 7 + n)` of the characters, to be compared."""
+        return Poses(self.kinematics, qpos)
 
 
 class Poses:
     """Poses that are compared, wherever they stand and whichever way they face.
 
     Args:
-        qpos: `(P, 7 + n)` of a body `table`.
+        kinematics: of the body.
+        qpos: `(P, 7 + n)`.
     """
 
-    def __init__(self, table: BodyTable, qpos: Tensor):
-        body = Kinematics(table)(qpos)
+    def __init__(self, kinematics: Kinematics, qpos: Tensor):
+        body = kinematics(qpos)
         self.quat, self.centre = body.quat, body.pos[..., :2].mean(1)
         self.pos, self.rows = body.pos.clone(), torch.arange(len(qpos))
         self.pos[..., :2] -= self.centre.unsqueeze(1)
@@ -124,6 +134,12 @@ class Poses:
         """Only some rows, `(P,)` bool; `rows` says which of all they are."""
         for name in ("pos", "quat", "centre", "rows"):
             setattr(self, name, getattr(self, name)[those])
+
+    def row(self, k: int) -> Poses:
+        """Pose k alone."""
+        out = copy(self)
+        out.keep(self.rows == k)
+        return out
 
     def turn(self, other: Poses) -> Tensor:
         """`(P, Q)` rad about Z that lay each pose of `other` best on each of these."""

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.recovery.get_up import GetUpPlanner, Poses, mixed, smooth
+from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.spatial import quat_mul
 from poise.spatial.directions import facing, heading_angle, yaw_quat
 
@@ -53,6 +53,7 @@ def plan_recovery(
     phase: float = 0.0,
     moves: Tensor | None = None,
     again: int = 0,
+    up: Tensor | None = None,
 ) -> Tensor:
     """The frames `(T, 7 + n)` from `start (7 + n)` to standing at ease at `place (7 + n)`.
 
@@ -62,10 +63,11 @@ def plan_recovery(
         phase: 0 to 1, where in its cycle the walk begins.
         moves: m/s `(2)`, how the body moves at the start; it walks on if that is how it faces.
         again: how often a motion from there was lost in a row; it gets up in other ways then.
+        up: `get_up.up(start, again)`, where that is known already.
     """
     recovery_clips, body = get_up.recovery_clips, start[None]
     if bool(get_up.lies(start)):
-        body, moves = get_up.up(start, again), None
+        body, moves = get_up.up(start, again) if up is None else up, None
     stand = facing(recovery_clips.ease, heading_angle(body[-1, 3:7]))
     stand[:2] = body[-1, :2]
     pace = 0.0 if moves is None else _pace(get_up, body[-1], moves, which)
@@ -90,7 +92,7 @@ def walk_of(get_up: GetUpPlanner, which: int) -> tuple[Tensor, float, float]:
 def nearest_phase(get_up: GetUpPlanner, pose: Tensor, which: int) -> float:
     """0 to 1, where in a walk's cycle the body is most as in `pose (7 + n)`."""
     cycle = walk_of(get_up, which)[0]
-    apart = Poses(get_up.table, pose[None]).apart(Poses(get_up.table, cycle[:-1]))[0]
+    apart = get_up.poses(pose[None]).apart(get_up.poses(cycle[:-1]))[0]
     return int(apart.argmin()) / (len(cycle) - 1)
 
 

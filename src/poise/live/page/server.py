@@ -200,8 +200,10 @@ class PageServer:
         self.watchers += 1
         self._programs += text
         try:
+            # What comes from now on is not missed, however long the greeting takes.
+            last = self._newest
             await connection.send(self._hello)
-            sending = asyncio.create_task(self._send(connection, text))
+            sending = asyncio.create_task(self._send(connection, text, last))
             try:
                 await self._receive(connection, None if text else self._command)
             finally:
@@ -212,8 +214,8 @@ class PageServer:
             self.watchers -= 1
             self._programs -= text
 
-    async def _send(self, connection: ServerConnection, text: bool) -> None:
-        told, last = "", self._newest
+    async def _send(self, connection: ServerConnection, text: bool, last: tuple[bytes, str]) -> None:
+        told = ""
         try:
             while self._fresh is not None:
                 # What came while this page was sent the one before is not missed.

@@ -1,0 +1,145 @@
+"""VMC by an independent client in real time: how far the character is off, against the same clip offline.
+
+    python benchmarks/live_vmc.py CLIP ... --json benchmarks/live_vmc.json
+
+`poise live --vmc` runs in a process of its own. python-osc sends each clip once, on a VRM model, at
+30 Hz: it stands for 3 s and then does the motion. The character's distance from its goal is what
+`poise live` tells pages meanwhile; offline the same policy tracks the same clip alone. What
+`--vmc-out` sends is heard, too: it must be whole frames of the model that came in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from live_client import watch
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
+from pythonosc.udp_client import SimpleUDPClient
+from speed import machine
+
+from live import serve
+from poise.errors import PoiseError
+from poise.jobs.track import track
+from poise.kin import retarget
+from poise.live.sources.osc import messages
+from poise.live.vrm import standard, t_pose, to_unity
+from poise.motion import Clip, read_clip
+
+#: s that it stands before the motion, Hz of the messages.
+STANDS_S, RATE = 3.0, 30.0
+
+
+def free_port() -> int:
+    """A UDP port that nothing listens on."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def send(clip: Clip, port: int) -> float:
+    """Sends the clip, a bundle a frame; `time.perf_counter()` at which the motion began."""
+    client, began = SimpleUDPClient("127.0.0.1", port), time.perf_counter()
+    for step in range(round((STANDS_S + clip.seconds) * RATE)):
+        frame = min(clip.frames - 1, max(0, round((step / RATE - STANDS_S) * clip.fps)))
+        pos = clip.skeleton.offsets.copy()
+        pos[0] = clip.root_pos[frame]
+        places, turns = to_unity(pos, clip.rot[frame])
+        bundle = OscBundleBuilder(IMMEDIATELY)  # type: ignore[arg-type]
+        bundle.add_content(_message("/VMC/Ext/OK", 1))
+        bundle.add_content(_message("/VMC/Ext/T", step / RATE))
+        for name, place, turn in zip(clip.skeleton.names, places, turns, strict=True):
+            numbers = (float(x) for x in (*place, *turn))
+            bundle.add_content(_message("/VMC/Ext/Bone/Pos", name, *numbers))
+        client.send(bundle.build())
+        time.sleep(max(0.0, began + (step + 1) / RATE - time.perf_counter()))
+    return began + STANDS_S
+
+
+def _message(address: str, *values: Any) -> Any:
+    made = OscMessageBuilder(address)
+    for value in values:
+        made.add_arg(value)
+    return made.build()
+
+
+def live(clip: Clip, buffer: float) -> dict[str, Any]:
+    """One run in real time."""
+    into, out = free_port(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    out.bind(("127.0.0.1", 0))
+    out.settimeout(0.5)
+    heard, bones, over = [0], set[str](), threading.Event()
+
+    def listen() -> None:
+        while not over.is_set():
+            try:
+                told = messages(out.recv(65_507))
+            except (TimeoutError, PoiseError):
+                continue
+            heard[0] += 1
+            bones.update(str(m.arguments[0]) for m in told if m.address == "/VMC/Ext/Bone/Pos")
+
+    process, host = serve(
+        "--vmc", str(into), "--vmc-out", f"127.0.0.1:{out.getsockname()[1]}", "--buffer", str(buffer)
+    )  # fmt: skip
+    ear, seen = threading.Thread(target=listen), list[tuple[float, dict[str, Any]]]()
+    ear.start()
+
+    async def both() -> float:
+        watching = asyncio.create_task(
+            watch(
+                f"ws://{host}/live", STANDS_S + clip.seconds + 2.0,
+                lambda f: seen.append((time.perf_counter(), f)) if "characters" in f else None,
+            )
+        )  # fmt: skip
+        await asyncio.sleep(1.0)
+        moves = await asyncio.to_thread(send, clip, into)
+        await watching
+        return moves
+
+    try:
+        moves = asyncio.run(both())
+    finally:
+        over.set()
+        process.terminate()
+        process.wait(30)
+        ear.join()
+        out.close()
+    during = [f["characters"][0] for t, f in seen if moves + buffer < t < moves + buffer + clip.seconds]
+    return {
+        "off_mm": {"mean": round(float(np.mean([c["off_mm"] for c in during])), 1),
+                   "figures": len(during)},
+        "lost": seen[-1][1]["characters"][0]["lost"], "refused": seen[-1][1]["refused"],
+        "vmc_out": {"frames": heard[0], "bones": len(bones)},
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("clips", type=Path, nargs="+")
+    parser.add_argument("--buffer", type=float, default=0.3)
+    parser.add_argument("--json", type=Path, required=True)
+    o = parser.parse_args()
+    rows = list[dict[str, Any]]()
+    for path in o.clips:
+        own = read_clip(path)
+        clip = retarget(own, t_pose(standard()))[0]
+        offline = track(clip, controller="policy").card.mpjpe_global_mm
+        row = {"clip": path.stem, "seconds": round(clip.seconds, 1), "offline_mm": round(offline, 1)}
+        rows.append({**row, **live(clip, o.buffer)})
+        print(json.dumps(rows[-1]), flush=True)
+        o.json.write_text(
+            json.dumps({"machine": machine(), "buffer_s": o.buffer, "clips": rows}, indent=1) + "\n"
+        )
+
+
+if __name__ == "__main__":
+    main()
