@@ -19,7 +19,7 @@ import json
 import math
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,8 +91,11 @@ def _summary(rows: Sequence[Measured]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def thrown(tracker: Tracker, counts: dict[float, int], threads: int) -> dict[str, Any]:
-    """The same throws at each level, by both laws and at two physics rates, and by stiffness."""
+def thrown(
+    tracker: Tracker, counts: dict[float, int], threads: int, keep: Callable[[dict[str, Any]], None]
+) -> dict[str, Any]:
+    """The same throws at each level, by both laws and at two physics rates, and by stiffness; `keep` is
+    told what there is after each."""
     out: dict[str, Any] = {}
     for rate, count in counts.items():
         if not count:
@@ -103,6 +106,7 @@ def thrown(tracker: Tracker, counts: dict[float, int], threads: int) -> dict[str
             out[f"{law}, {rate:g} Hz"] = _thrown(
                 tracker, Compliance(law=law), LEVELS, many, rate, threads
             )  # type: ignore[arg-type]
+            keep(out)
     soft = (4000.0, 1000.0, 400.0, 200.0, 100.0, 50.0)
     if counts[60.0]:
         out["stiffness, 60 Hz"] = _thrown(tracker, Stiffness(), soft, counts[60.0], 60.0, threads)
@@ -250,10 +254,16 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
+
+    def keep(found: dict[str, Any]) -> None:
+        told = json.loads(args.json.read_text()) if args.json.exists() else {}
+        told[args.part] = {**told.get(args.part, {}), **found}
+        args.json.write_text(json.dumps(told, indent=1) + "\n")
+
     if args.part == "stiffness":
         found = stiffness(tracker, args.svg, args.threads)
     elif args.part == "throws":
-        found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads)
+        found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads, keep)
     elif args.part == "hands":
         found = hands(tracker, args.threads)
     elif args.part == "door":
@@ -262,9 +272,7 @@ def main() -> None:
         found = scenes(tracker, args.threads, args.only)
     else:
         found = cost(tracker)
-    told = json.loads(args.json.read_text()) if args.json.exists() else {}
-    told[args.part] = {**told.get(args.part, {}), **found}
-    args.json.write_text(json.dumps(told, indent=1) + "\n")
+    keep(found)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""VMC by an independent client in real time: how far the character is off, against the same clip offline.
+"""VMC by an independent client in real time: how far the character is off, and the same clip offline.
 
     python benchmarks/live_vmc.py CLIP ... --json benchmarks/live_vmc.json
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, RewardTerm
-from poise.env.actuation import record
 from poise.env.frame import Frame, LazyPose
+from poise.env.recording import record
 from poise.env.terms.evaluate import MANY
 from poise.sim import CpuBackend, body_linear_velocity_w
 from poise.spatial import (
@@ -27,8 +27,9 @@ from poise.spatial import (
 )
 from toy_human import swing
 
-#: MB that a recording's constant takes, and how many recordings are made and left.
-CONSTANT_MB, RECORDINGS = 32, 4
+#: MB that a recording's constant takes, more than what the C library keeps of what is freed, and how
+#: many recordings are made and left.
+CONSTANT_MB, RECORDINGS = 64, 5
 CLIPS = (swing(0.6), swing(0.5, speed=1.0, bend=0.4, cyclic=True, name="walk"))
 
 
@@ -242,4 +243,5 @@ def test_recordings_that_are_left_leave_no_memory_behind() -> None:
     before = held_mb()
     for _ in range(RECORDINGS):
         record_one()
-    assert held_mb() - before < CONSTANT_MB / 2
+    # torch remembers what it made ready last.
+    assert held_mb() - before < 1.5 * CONSTANT_MB

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from poise.body import Humanoid, make_spec
 from poise.env.frame import Layout, Pose
+from poise.env.recording import Recorded
 from poise.kin import Kinematics
 from poise.spatial import heading_quat, quat_rotate
 
@@ -29,6 +30,7 @@ class Poser:
         self.kinematics = Kinematics(humanoid.table)
         self._fast = Kinematics(humanoid.table, torch.float32, device)
         self._made: dict[int, tuple[Any, ...]] = {}
+        self._turned = Recorded(self._turns)
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> Pose:
         """The poses of `qpos (F, 7 + n)` and `qvel (F, 6 + n)`, float64."""
@@ -69,7 +71,8 @@ class Poser:
         arm = pos - centres[:, None]
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
             moving[..., k] += turning[..., i] * arm[..., j] - turning[..., j] * arm[..., i]
-        small, arrays = qpos.float(), (pos, quat, moving, turning, centres)
+        small, local, heading = self._turned(qpos)
+        arrays = (pos, quat, moving, turning, centres)
         at_pos, at_quat, linvel, angvel, com = (torch.from_numpy(x) for x in arrays)
         return Pose(
             small,
@@ -79,9 +82,13 @@ class Poser:
             linvel.float(),
             angvel.float(),
             com.float(),
-            self.local(small),
-            heading_quat(small[:, 3:7]),
+            local,
+            heading,
         )
+
+    def _turns(self, qpos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        small = qpos.float()
+        return small, self.local(small), heading_quat(small[:, 3:7])
 
     def _worlds(self, frames: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """Models and data of `MANY` bodies and of one, with views of what goes in and comes out; the

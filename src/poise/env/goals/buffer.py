@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from poise.body import Humanoid
 from poise.env.goals.goal import Goal, extrapolated
 from poise.env.plugins import Start
 from poise.env.poser import Poser
+from poise.env.recording import Recorded
 from poise.sim import difference
 
 
@@ -59,6 +61,8 @@ class BufferedGoal(Goal):
         self.low = torch.full((num_envs,), torch.inf, dtype=torch.float64, device=device)
         self.last = torch.full_like(self.count, 2**62)
         self._every = torch.arange(num_envs, device=device)
+        self._moves = Recorded(partial(_moves, rate_hz))
+        self._reads = Recorded(partial(_reads, size))
         self._ahead, self._hinges = self.packed(self._every, self.at), self.qpos[:, 0, 7:].clone()
         # Worlds with a next frame that may have changed since it was looked up.
         self._stale = torch.zeros(num_envs, dtype=torch.bool, device=device)
@@ -74,13 +78,13 @@ class BufferedGoal(Goal):
 
         still: `(n,)` bool, frames that have no velocity, such as those after a jump.
         """
-        at = self.count[ids]
-        before = self.qpos[ids, (at - 1) % self.size]
-        qvel = difference(qpos, before) * self.rate_hz
-        none = at == 0 if still is None else (at == 0) | still
-        self.qvel[ids, at % self.size] = torch.where(none.unsqueeze(-1), 0.0, qvel)
-        self.qpos[ids, at % self.size] = qpos
-        self.packs[ids, at % self.size] = self._pack(qpos, self.qvel[ids, at % self.size])
+        count = self.count[ids]
+        at = count % self.size
+        before = self.qpos[ids, (count - 1) % self.size]
+        none = count == 0 if still is None else (count == 0) | still
+        (qvel,) = self._moves(qpos, before, none)
+        self.qvel[ids, at], self.qpos[ids, at] = qvel, qpos
+        self.packs[ids, at] = self._pack(qpos, qvel)
         self.low[ids] = torch.minimum(self.low[ids], qpos[:, 2])
         self.count[ids] += 1
 
@@ -111,16 +115,13 @@ class BufferedGoal(Goal):
 
     def packed(self, ids: Tensor, index: Tensor) -> Tensor:
         """Packed poses `(n, W)` of frames `index (n,)`; the place says where the motion ends."""
-        known = self.count[ids]
-        kept = torch.minimum(index, self.last[ids])
-        at = torch.maximum(torch.minimum(kept, known - 1), known - self.size).clamp_min(0)
-        out = self.packs[ids, at % self.size]
-        beyond = ((kept >= known) | (known == 0)).nonzero().squeeze(-1)
-        if len(beyond):
-            out[beyond] = self._pack(*self.coordinates(ids[beyond], index[beyond]))
-        end = (index >= self.last[ids]).to(out)
-        low = torch.where(self.low[ids].isfinite(), self.low[ids], 0.0).to(out)
-        out[:, -4:] = torch.stack((torch.zeros_like(end), low, end, torch.zeros_like(end)), 1)
+        out, unknown = self._reads(self.packs, self.count, self.last, self.low, ids, index)
+        beyond = unknown.nonzero().squeeze(-1)
+        if not len(beyond):
+            return out
+        # Recordings give what is not to be written into.
+        out = out.clone()
+        out[beyond, :-4] = self._pack(*self.coordinates(ids[beyond], index[beyond]))[:, :-4]
         return out
 
     def _pack(self, qpos: Tensor, qvel: Tensor) -> Tensor:
@@ -196,3 +197,22 @@ class BufferedGoal(Goal):
     def rows(self) -> dict[str, Tensor]:
         names = ("at", "qpos", "qvel", "packs", "count", "last", "low")
         return {name: getattr(self, name) for name in names}
+
+
+def _moves(rate_hz: float, qpos: Tensor, before: Tensor, none: Tensor) -> tuple[Tensor]:
+    """qvel `(n, 6 + n)` from `before (n, 7 + n)` to `qpos` in a step; nothing where `none (n,)`."""
+    return (torch.where(none.unsqueeze(-1), 0.0, difference(qpos, before) * rate_hz),)
+
+
+def _reads(
+    size: int, packs: Tensor, count: Tensor, last: Tensor, low: Tensor, ids: Tensor, index: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Packed poses `(n, W)` of those frames that are known, and `(n,)` bool, which are not."""
+    known, end = count[ids], last[ids]
+    kept = torch.minimum(index, end)
+    at = torch.maximum(torch.minimum(kept, known - 1), known - size).clamp_min(0)
+    rows, lowest = packs[ids, at % size], low[ids]
+    lowest = torch.where(lowest.isfinite(), lowest, 0.0).to(rows)
+    none, ends = torch.zeros_like(lowest), (index >= end).to(rows)
+    out = torch.cat((rows[:, :-4], torch.stack((none, lowest, ends, none), 1)), 1)
+    return out, (kept >= known) | (known == 0)

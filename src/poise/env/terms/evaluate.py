@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.env.actuation import TensorFunction, record
 from poise.env.frame import DoneTerm, Frame, Observable, ObsTerm, RewardTerm
 from poise.env.observables import Context
+from poise.env.recording import TensorFunction, record
 from poise.errors import PoiseError
 from poise.sim import Backend
 
