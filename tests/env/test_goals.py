@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env import ImitationEnv
+from poise.env import ImitationEnv, recording
 from poise.env.goals import DisplacedGoal, GeneratorGoal, Goal, StreamGoal, extrapolated
 from poise.env.goals.goal import FADE_S
 from poise.env.plugins import Plugin
@@ -68,6 +68,27 @@ def test_a_stream_says_what_its_clip_says(task: Imitation) -> None:
     assert not goal.notes
     env.close()
     clip.close()
+
+
+def test_what_is_recorded_of_a_stream_is_what_was_read_before(
+    task: Imitation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the last bit, for frames that are known and for those that are not."""
+
+    def told(often: int) -> list[Tensor]:
+        monkeypatch.setattr(recording, "OFTEN", often)
+        goal, every, out = stream_of(task, 1, 2), torch.arange(2), list[Tensor]()
+        goal.draw(every)
+        for k in range(1, 12):
+            if k % 4:
+                goal.push(task.reference.qpos[k], None if k % 3 else every[:1])
+            goal.at += 1
+            goal.aim(None, None)
+            out += [goal.now(), goal.ahead(), goal.window((1, 2, 4)), goal.packs, goal.qvel]
+        return [x.clone() for x in out]
+
+    plain, recorded = told(10**9), told(2)
+    assert all(torch.equal(a, b) for a, b in zip(plain, recorded, strict=True))
 
 
 def test_a_stream_that_stalls_comes_to_rest_and_says_so(task: Imitation) -> None:

@@ -63,14 +63,8 @@ class FramePassage:
                 ]
                 self._hanging.append((joints[at], parents[at], np.stack(turns)))
         pairs = [p.joints.limb_pair(f"{s}_thigh") for s in SIDES]
-        self._thighs = [x for x in pairs if x is not None]
-        self._paths = [
-            [(*skeleton.ancestors(j)[::-1], j) for j in joints]
-            for skeleton, joints in (
-                (self.source, [a for a, _ in self._thighs]),
-                (self.target, [b for _, b in self._thighs]),
-            )
-        ]
+        thighs = [x for x in pairs if x is not None]
+        self._ways = _way(self.source, [a for a, _ in thighs]), _way(self.target, [b for _, b in thighs])
 
     def __call__(self, root_pos: np.ndarray, rot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The target's root `(3)` m and world rotations `(J, 4)` for a pose of the source."""
@@ -96,9 +90,19 @@ class FramePassage:
 
     def _middle(self, side: int, root: np.ndarray, world: np.ndarray) -> np.ndarray:
         """The middle between the hip joints of the source (0) or target (1)."""
-        skeleton = (self.source, self.target)[side]
-        ends = [place_of(skeleton, path, root, world) for path in self._paths[side]]
-        return sum(ends) / 2  # type: ignore[return-value]
+        joints, arms = self._ways[side]
+        return root + q.rotate(world[joints], arms).sum(0)
+
+
+def _way(skeleton: Skeleton, ends: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Joints and arms `(n, 3)` m which, turned by them and added up, lead from the root to the middle
+    between the ends."""
+    arms = dict[int, np.ndarray]()
+    for end in ends:
+        path = (*skeleton.ancestors(end)[::-1], end)
+        for above, joint in pairwise(path):
+            arms[above] = arms.get(above, np.zeros(3)) + skeleton.offsets[joint] / len(ends)
+    return np.array(list(arms), dtype=int), np.array(list(arms.values())).reshape(-1, 3)
 
 
 @lru_cache(maxsize=64)
