@@ -13,7 +13,7 @@ import torch
 from poise.eval import Recording
 from poise.jobs.deliver import deliver, finished, floor_of, lost_at, simulated_clip
 from poise.jobs.runs import Evaluation, evaluate
-from poise.kin import sole_slide
+from poise.kin import examine, sole_slide
 from poise.motion import Clip, ClipLibrary, ground_shift, read_clip
 from poise.recipes import ResidualForce, build
 from toy_human import swing
@@ -102,6 +102,9 @@ def test_a_real_evaluation_is_delivered_whole():
     policy = Nothing(len(imitation.humanoid.hinges) + extra)
     out = simulated_clip(imitation, evaluate(imitation, policy, {}))  # type: ignore[arg-type]
     assert (out.frames, out.fps, out.skeleton) == (source.frames, source.fps, source.skeleton)
+    # Between two control steps it goes on as it moves, to the last frame.
+    steps = np.linalg.norm(np.diff(out.positions(), axis=0), axis=-1).mean(1)
+    assert (steps[-3:] > 0.3 * steps[-8:-3].mean()).all()
     # It begins on the first frame and then falls where physics takes it.
     assert np.ptp((out.positions() - source.positions())[0], axis=0).max() < 1e-3
 
@@ -124,6 +127,10 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     made = read_clip(tmp_path / "held/simulated.bvh")
     assert figures["delivered"]["sole_slide_mm_per_s"] == pytest.approx(sole_slide(made), rel=1e-3)
     assert figures["source"]["sole_slide_mm_per_s"] == pytest.approx(sole_slide(source))
+    # So is how deep the body sinks, of all three on the floor of the file.
+    for stage, clip in (("source", source), ("delivered", made)):
+        deep = examine(clip).figures["penetration_mm"]
+        assert figures[stage]["penetration_mm"] == pytest.approx(deep, rel=1e-3, abs=1e-3)
     # It is on its motion for so short a time; where it is taken away from there, that is told.
     r = evaluation.rollouts
     away = r.pos.clone()
@@ -131,7 +138,7 @@ def test_standing_feet_are_held_in_the_written_motion_and_told(tmp_path: Path) -
     assert lost_at(evaluation) == ()
     assert lost_at(replace(evaluation, rollouts=replace(r, pos=away))) == (9 / r.fps,)
     assert set(figures) == {
-        "clip", "held_mean_mm", "held_max_mm", "source", "simulated", "delivered"
+        "clip", "held_mean_mm", "held_max_mm", "left", "source", "simulated", "delivered"
     }  # fmt: skip
     # The score is that of the simulation, however the file was mended.
     assert done.card.foot_slide_mm_per_s == evaluation.card.foot_slide_mm_per_s

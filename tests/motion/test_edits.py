@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.motion import ground_shift, resample, shifted, trim
+from poise.metrics import jerk
+from poise.motion import Clip, ground_shift, resample, shifted, trim
 from poise.spatial import quat_angle, quat_conj, quat_mul
 from toy_human import swing
 
@@ -83,3 +84,27 @@ def test_mistakes_are_told():
         resample(swing(), 0.5)
     with pytest.raises(PoiseError, match="needs at least 2"):
         trim(swing(), 4, 5)
+
+
+def test_a_smooth_motion_stays_smooth_at_a_higher_rate() -> None:
+    """Straight lines between frames have corners, which are a jerk that nobody made."""
+
+    def shake(clip: Clip) -> float:
+        return float(jerk(torch.tensor(clip.positions()), clip.fps).mean())
+
+    fine = swing(2.0, 120.0, speed=1.0, bend=0.5)
+    coarse = resample(fine, 30.0)
+    straight, smooth = resample(coarse, 120.0), resample(coarse, 120.0, smooth=True)
+    assert smooth.frames == straight.frames == fine.frames
+    assert np.abs(smooth.positions() - fine.positions()).max() < 0.002
+    assert shake(smooth) < 1.2 * shake(fine) + 1.0 < 0.5 * shake(straight)
+    # Frames that are known are what they were, whatever sign their quaternions have.
+    flipped = coarse.rot.copy()
+    flipped[::2] *= -1.0
+    other = resample(coarse.replaced(rot=flipped), 120.0, smooth=True)
+    assert apart(other.rot[::4], coarse.rot) < 1e-6
+    assert apart(other.rot, smooth.rot) < 1e-6
+    # To a lower rate there are no corners.
+    np.testing.assert_array_equal(
+        resample(fine, 30.0, smooth=True).root_pos, resample(fine, 30.0).root_pos
+    )

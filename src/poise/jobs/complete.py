@@ -91,10 +91,13 @@ class Completed(Result):
         done = self.tracked.failed_s
         if done:
             return f"Lost: the character fell away from the motion at {done[0]:.1f} s."
-        return (
+        told = (
             f"Without help; keyframes met to {np.mean(self.met_mm):.0f} mm on average, frame "
-            f"{self.keyframes[worst]} worst with {self.met_mm[worst]:.0f} mm."
+            f"{self.keyframes[worst]} worst with {self.met_mm[worst]:.0f} mm"
         )
+        if self.met_mm[worst] <= 1000 * MET_M:
+            return f"{told}."
+        return f"{told}, which is missed: more keyframes, --retime or --controller search may help."
 
     def _shown(self) -> Shown:
         return Shown(self.clip, self.filled.clip, self.card, self.notes, self.at)

@@ -12,11 +12,13 @@ import torch
 
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
-from poise.kin import hold_feet, lowest_height, qpos_to_clip, sole_slide
+from poise.kin import examine, hold_feet, lowest_height, qpos_to_clip
+from poise.kin.doctor.doctor import new_faults
 from poise.kin.doctor.support import SOLE_M
 from poise.kin.feet.height import stands_higher
 from poise.metrics import success
 from poise.motion import Clip, ground_shift, resample
+from poise.motion.edits import blended
 from poise.motion.io import home_suffix, write_clip
 from poise.recipes.imitation import Imitation
 from poise.sim.props import Box
@@ -43,13 +45,20 @@ def simulated_clip(imitation: Imitation, evaluation: Evaluation, index: int = 0)
         template if template.frames == frames else None,
         source.name,
     )
-    out = resample(motion, source.fps)
+    out = resample(motion, source.fps, smooth=True)
     missing = source.frames - out.frames
     if not 0 < missing <= np.ceil(source.fps / rate):
         return out
-    # The source may end between two control steps; its last moment holds the last simulated pose.
+    # The source may end between two control steps; in its last moment the motion goes on as it was.
+    out = resample(_going_on(motion), source.fps, smooth=True)
     tail = np.minimum(np.arange(source.frames), out.frames - 1)
     return out.replaced(root_pos=out.root_pos[tail], rot=out.rot[tail])
+
+
+def _going_on(motion: Clip) -> Clip:
+    """A motion with one more frame, to which it goes on as in its last step."""
+    low = np.minimum(np.arange(motion.frames + 1), motion.frames - 2)
+    return blended(motion, low, np.arange(motion.frames + 1.0) - low)
 
 
 def floor_of(imitation: Imitation, index: int = 0) -> float:
@@ -94,6 +103,8 @@ class Delivery:
     paths: dict[str, Path] = field(default_factory=dict)
 
 
+#: Figures of a motion that are those of `poise doctor` for its file.
+AS_THE_DOCTOR = ("sole_slide_mm_per_s", "penetration_mm")
 #: Puts a motion of the body onto the skeleton that came in; the second says whether feet are held.
 Home = Callable[[Clip, bool], Clip]
 
@@ -123,10 +134,12 @@ def finished(
             before = source or imitation.library.clips[recording.clip]
             between = home(as_high_as_source(raw, imitation, recording.clip), False)
             of = {"source": before, "simulated": _as_file(between), "delivered": _as_file(homes[name])}
-            for stage, motion in of.items():
-                found.setdefault(stage, {})["sole_slide_mm_per_s"] = sole_slide(motion)
+            seen = {stage: examine(motion) for stage, motion in of.items()}
+            for stage, one in seen.items():
+                found.setdefault(stage, {}).update({key: one.figures[key] for key in AS_THE_DOCTOR})
             figures.append(found)
             notes += _sentences(found)
+            notes += new_faults(found["clip"], seen["source"], seen["delivered"])
         raised = float(clips[name].root_pos[0, 2] - clip.root_pos[0, 2])
         notes += _floor_told(clip.name, raised)
     return Delivery(clips, homes, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
@@ -184,14 +197,14 @@ def _held(
 ) -> tuple[Clip, dict[str, Any]]:
     """The clip with its feet held, and figures of the source, the simulation and of what is delivered.
 
-    The source is judged on the floor that its soles tell; its penetration, on that of the file.
+    The source is judged on the floor that its soles tell. What the doctor says of files comes later.
     """
     table, r = imitation.humanoid.table, evaluation.rollouts
     joints = tuple(row.joint for row in table.rows)
     held, moved = hold_feet(clip, table)
     source = imitation.library.clips[index]
     found: dict[str, Any] = {"clip": source.name}
-    found |= {"held_mean_mm": moved.mean_mm, "held_max_mm": moved.max_mm}
+    found |= {"held_mean_mm": moved.mean_mm, "held_max_mm": moved.max_mm, "left": list(moved.left)}
     if r.shapes is not None and r.feet:
         ground = floor_of(imitation, index)
         of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
@@ -217,8 +230,13 @@ def _floor_told(name: str, floor_m: float) -> list[str]:
 
 
 def _sentences(found: dict[str, Any]) -> list[str]:
+    name, left = found["clip"], found["left"]
+    out = [
+        f"{name}: {foot} is not held in the written motion: its leg would turn faster than joints do."
+        for foot in left
+    ]
     if not found["held_max_mm"] > 0.05:
-        return []
+        return out
 
     def three(key: str, digits: int) -> str | None:
         each = [found[k].get(key) for k in ("source", "simulated", "delivered")]
@@ -229,12 +247,11 @@ def _sentences(found: dict[str, Any]) -> list[str]:
 
     slide, depth = three("sole_slide_mm_per_s", 0), three("penetration_mm", 1)
     told = [f"soles slide at {slide} mm/s"] if slide else []
-    told += [f"feet sink by {depth} mm"] if depth else []
+    told += [f"the body sinks by {depth} mm"] if depth else []
     told += [
         f"ankles moved by {found['held_mean_mm']:.0f} mm on average, {found['held_max_mm']:.0f} at most"
     ]
-    name = found["clip"]
-    return [f"{name}: standing feet are held in place in the written motion: {'; '.join(told)}."]
+    return [*out, f"{name}: standing feet are held in the written motion: {'; '.join(told)}."]
 
 
 def make_report(

@@ -1,5 +1,6 @@
 """Clips made from clips: another rate, a part, a shift, backwards. None changes its argument."""
 
+# pyright: reportMissingTypeStubs=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import numpy as np
@@ -10,11 +11,16 @@ from poise.motion.clip import Clip, check_rate
 from poise.spatial import slerp
 
 
-def resample(clip: Clip, fps: float) -> Clip:
+def resample(clip: Clip, fps: float, smooth: bool = False) -> Clip:
     """The clip at another frame rate: positions linear, rotations by slerp, the duration kept.
 
     The last sample falls on or before the clip's last frame (within a hundredth of a frame, since
     files round their frame times).
+
+    Args:
+        smooth: to a higher rate by cubic splines through all frames, accelerations without steps, for
+            motion that is known to be smooth. Straight lines have a corner at each frame, which is a
+            jerk many times the motion's own; but what leaps between two frames rings beside it.
     """
     check_rate(fps, clip.name)
     count = int(np.floor(clip.seconds * fps + 1e-2)) + 1
@@ -25,7 +31,22 @@ def resample(clip: Clip, fps: float) -> Clip:
     at = np.minimum(np.arange(count) / fps * clip.fps, clip.frames - 1)
     low = np.minimum(np.floor(at + 1e-9).astype(int), clip.frames - 2)
     t = np.clip(at - low, 0.0, 1.0)
+    if smooth and fps > clip.fps and clip.frames > 3:
+        return _splined(clip, at).replaced(fps=float(fps))
     return blended(clip, low, t).replaced(fps=float(fps))
+
+
+def _splined(clip: Clip, at: np.ndarray) -> Clip:
+    """Frames `at (N)`, which lie between those of the clip, by cubic splines: q(t) / |q(t)| for
+    rotations, each frame's quaternion on the side of the one before."""
+    from scipy.interpolate import CubicSpline
+
+    rot, every = clip.rot.copy(), np.arange(clip.frames)
+    flips = (rot[1:] * rot[:-1]).sum(-1) < 0
+    rot[1:][np.cumsum(flips, 0) % 2 == 1] *= -1.0
+    turned = CubicSpline(every, rot)(at)
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    return clip.replaced(root_pos=CubicSpline(every, clip.root_pos)(at), rot=turned)
 
 
 def blended(clip: Clip, low: np.ndarray, share: np.ndarray) -> Clip:

@@ -13,7 +13,7 @@ from planted_faults import exchanged, lifted
 from poise.body import Anatomy
 from poise.errors import PoiseError
 from poise.kin import anatomy_of, examine, find_guesses, fit_humanoid, grounded, heal, support_of
-from poise.kin.doctor.doctor import limit_faults
+from poise.kin.doctor.doctor import Examination, limit_faults, new_faults
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import trembling
 from poise.kin.doctor.sides import side_votes
@@ -178,3 +178,16 @@ def test_short_clips_are_no_problem(frames: int) -> None:
     assert isinstance(examine(short).to_dict()["faults"], list)
     assert heal(short).frames == frames
     assert len(human()) == len(short.skeleton)
+
+
+def test_only_what_is_new_is_told() -> None:
+    old = Examination((Fault("foot slide", "a", 0, 5, 4.0), Fault("limit", "a", 0, 5, 4.0)), {}, True)
+    more = (
+        Fault("joint jump", "knee", 7, 9, 46.6), Fault("foot slide", "a", 0, 5, 5.0),
+        Fault("foot slide", "b", 8, 9, 7.7), Fault("limit", "b", 0, 5, 9.0),
+        Fault("limit", "c", 0, 5, 9.0),
+    )  # fmt: skip
+    assert new_faults("x", old, old) == []
+    (told,) = new_faults("x", old, Examination(more, {}, True))
+    assert "1 more of 'foot slide' (the worst 7.7 cm, b 8-9)" in told
+    assert "1 of 'joint jump' (the worst 46.6 rad/s, knee 7-9)" in told and "limit" not in told

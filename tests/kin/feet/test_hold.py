@@ -11,6 +11,8 @@ import torch
 from poise.body import BodyTable, generate_table
 from poise.kin import anatomy_of, hold_feet, lowest_height
 from poise.kin.doctor.support import Support
+from poise.kin.feet import hold as feet_hold
+from poise.kin.feet.lead import led
 from poise.metrics import foot_slide
 from poise.motion import Clip, read_clip
 
@@ -112,3 +114,24 @@ def test_the_walk_is_the_same_walk(walk: Clip, table: BodyTable) -> None:
 def test_a_clip_of_two_frames_comes_back(walk: Clip, table: BodyTable) -> None:
     short = walk.replaced(root_pos=walk.root_pos[:2], rot=walk.rot[:2])
     assert hold_feet(short, table)[0] is short
+
+
+def test_a_foot_whose_leg_would_whip_is_left(
+    walk: Clip, table: BodyTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, moved = hold_feet(walk, table)
+    assert not moved.left and np.abs(held.rot - walk.rot).max() > 1e-4
+    before = Clip.positions
+
+    def swept(*told: object) -> torch.Tensor:
+        """Legs that are led turn by half a turn from one frame to the next."""
+        rot = led(*told)  # type: ignore[arg-type]
+        foot = next(iter(told[3]))  # type: ignore[call-overload]
+        rot[1::2, walk.skeleton.parents[foot]] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=rot.dtype)
+        return rot
+
+    monkeypatch.setattr(feet_hold, "led", swept)
+    left, moved = hold_feet(walk, table)
+    feet = {walk.skeleton.names[r.joint] for r in table.rows if r.kind == "foot"}
+    assert set(moved.left) == feet and moved.max_mm == 0.0
+    assert np.abs(before(left) - before(walk)).max() < 1e-9

@@ -127,7 +127,7 @@ def led_along(
     own = _held(imitation.library.clips, rate, led.of)
     clip = qpos_to_clip(qpos, body.table, own.skeleton, rate, own, own.name)
     whole, first = one_after_another(placed, led.of, led.spans, rate), imitation.library.clips[0]
-    whole = replace(whole, clip=resample(clip, first.fps), qpos=qpos)
+    whole = replace(whole, clip=resample(clip, first.fps, smooth=True), qpos=qpos)
     library = ClipLibrary((whole.clip,), (1.0,))
     reference = Reference(body, [qpos], rate, [own.name])
     out = replace(imitation, library=library, reference=reference)

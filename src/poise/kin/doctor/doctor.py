@@ -12,7 +12,7 @@ import torch
 from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
-from poise.kin.doctor.faults import Fault, by_kind, spell_faults
+from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import mend_path, mend_slides
@@ -28,6 +28,10 @@ from poise.motion import Clip
 BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
+
+
+#: Kinds that tell how a file was written or read, not how the body moves.
+READ_ONLY = ("bone drift", "quaternion length", "rest frame", "limit")
 
 
 @dataclass(frozen=True)
@@ -208,3 +212,22 @@ def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:
 
 def _number(value: torch.Tensor) -> float | None:
     return float(value) if math.isfinite(float(value)) else None
+
+
+def new_faults(name: str, before: Examination, after: Examination) -> list[str]:
+    """One sentence on the kinds of faults that a motion has more of than another, [] without any."""
+    old, told = by_kind(before.faults), list[str]()
+    for kind, faults in by_kind(after.faults).items():
+        more = len(faults) - len(old.get(kind, ()))
+        if more <= 0 or kind in READ_ONLY:
+            continue
+        worst = max(faults, key=lambda f: f.size)
+        where = f"{worst.joint} " if worst.joint else ""
+        size = f"{worst.size:.3g} {KINDS[kind].unit}".strip()
+        times = f"{more} more" if kind in old else f"{more}"
+        told.append(f"{times} of '{kind}' (the worst {size}, {where}{worst.start}-{worst.stop})")
+    if not told:
+        return []
+    return [
+        f"{name}: poise doctor finds in the written motion what the clip has not: {', '.join(told)}."
+    ]

@@ -9,7 +9,7 @@ A simulated sole creeps, rocks and sinks by millimetres, a captured one slides b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,12 +23,14 @@ from poise.kin.feet.lead import lead, led
 from poise.kin.series import smooth_lift
 from poise.kin.solids import lowest_height
 from poise.motion import Clip, Skeleton
-from poise.spatial import forward_kinematics
+from poise.spatial import forward_kinematics, quat_distance
 
 #: How often it is done: a leg that is led back moves its foot a little.
 HOLD_ROUNDS = 2
 #: How much a foot bears that stands for certain, see `Standing`.
 FIRM = 100.0
+#: rad/s of a leg's joint above which a foot is rather not held.
+FASTEST = 25.0
 #: Half the time (s) over which a lift out of the floor is spread.
 LIFT_S = 0.05
 
@@ -80,30 +82,34 @@ def hold(
 @dataclass(frozen=True)
 class Held:
     """What holding moved: mm that an ankle was led away from its path, on average over frames in which a
-    foot bears and at most."""
+    foot bears and at most; and the feet that were left as they were."""
 
     mean_mm: float
     max_mm: float
+    left: tuple[str, ...] = ()
 
 
 def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
     """The clip with its standing feet held, and what that took; all but the legs stays as it is.
 
     A foot bears where an end of its sole is near the floor and neither rises nor swings (`bearing`).
-    Feet that are dragged on purpose are left alone. Soles under the floor are lifted out of it, too.
+    Feet that are dragged on purpose are left alone. Soles under the floor are lifted out of it, too. A
+    foot is left as it is where its leg would turn faster than joints do, and did not before.
 
     Args:
         table: the body with the soles; feet without a box have no sole. The floor is at z = 0.
     """
     if clip.frames < 3:
         return clip, Held(0.0, 0.0)
-    rows, bears = [r.joint for r in table.rows], {}
+    rows, bears, left = [r.joint for r in table.rows], dict[int, np.ndarray](), set[int]()
 
     def standing(pos: Tensor, quat: Tensor) -> dict[int, Standing]:
         pos, quat = pos[:, rows], quat[:, rows]
         soles, low, out = soles_of(table, pos, quat), lowest_height(table, pos, quat), {}
         weights = bearing([sole.ends for sole in soles.values()], clip.fps)
         for (row, sole), weight in zip(soles.items(), weights, strict=True):
+            if rows[row] in left:
+                continue
             weight = weight * ~dragged(sole, weight, clip.fps)[:, None]
             deep = (-low[:, row]).clamp_min(0.0).numpy()
             lift = torch.tensor(smooth_lift(deep, clip.fps, LIFT_S)) if deep.any() else None
@@ -114,8 +120,28 @@ def hold_feet(clip: Clip, table: BodyTable) -> tuple[Clip, Held]:
 
     root, rot = clip.tensors()
     out = hold(clip.skeleton, root, rot, clip.fps, standing)
+    while fast := _too_fast(clip.skeleton, rot, out, clip.fps, bears):
+        left |= fast
+        bears.clear()
+        out = hold(clip.skeleton, root, rot, clip.fps, standing)
     held = clip.replaced(rot=out.numpy()) if bears else clip
     moved = np.linalg.norm(held.positions() - clip.positions(), axis=-1) * 1000
     borne = np.concatenate([moved[when, foot] for foot, when in bears.items()] or [np.zeros(0)])
     most = max((float(moved[:, foot].max()) for foot in bears), default=0.0)
-    return held, Held(float(borne.mean()) if len(borne) else 0.0, most)
+    names = tuple(clip.skeleton.names[foot] for foot in sorted(left))
+    return held, Held(float(borne.mean()) if len(borne) else 0.0, most, names)
+
+
+def _too_fast(
+    skeleton: Skeleton, before: Tensor, after: Tensor, fps: float, feet: Iterable[int]
+) -> set[int]:
+    """Feet with a leg of which a joint turns faster than joints do since it is led."""
+    moved = (before != after).flatten(2).any(-1).any(0)
+    fastest = [fps * quat_distance(x[:-1], x[1:]).amax(0) for x in (before, after)]
+    out = set[int]()
+    for foot in feet:
+        leg = [j for j in (foot, *skeleton.ancestors(foot)) if moved[j]]
+        was, now = (max((float(x[j]) for j in leg), default=0.0) for x in fastest)
+        if now > max(FASTEST, was):
+            out.add(foot)
+    return out
