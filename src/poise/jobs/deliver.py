@@ -12,6 +12,7 @@ import torch
 
 from poise.eval import Recording, RolloutSet, ScoreCard, clip_figures, write_score
 from poise.jobs.runs import Evaluation
+from poise.jobs.settled import as_file, settled
 from poise.kin import examine, hold_feet, lowest_height, qpos_to_clip
 from poise.kin.doctor.doctor import new_faults
 from poise.kin.doctor.support import SOLE_M
@@ -105,7 +106,8 @@ class Delivery:
 
 #: Figures of a motion that are those of `poise doctor` for its file.
 AS_THE_DOCTOR = ("sole_slide_mm_per_s", "penetration_mm")
-#: Puts a motion of the body onto the skeleton that came in; the second says whether feet are held.
+#: Puts a motion of the body onto the skeleton that came in; the second says whether feet are held, which
+#: is its part, too.
 Home = Callable[[Clip, bool], Clip]
 
 
@@ -120,7 +122,6 @@ def finished(
     `deliver`."""
     clips, homes = dict[str, Clip](), dict[str, Clip]()
     figures, notes = [], []
-    home = home or (lambda motion, _: motion)
     for k, recording in enumerate(evaluation.recordings):
         single = len(evaluation.recordings) == 1
         name = "simulated" if single else f"simulated_{imitation.library.names[recording.clip]}"
@@ -128,19 +129,25 @@ def finished(
         found: dict[str, Any] = {}
         if hold:
             clip, found = _held(imitation, evaluation, recording.clip, clip)
-        clips[name] = as_high_as_source(clip, imitation, recording.clip)
-        homes[name] = home(clips[name], hold)
+        before = source or imitation.library.clips[recording.clip]
+        clips[name] = high = as_high_as_source(clip, imitation, recording.clip)
+        if home is None:
+            homes[name] = settled(high, before) if hold else high
+        else:
+            homes[name] = home(high, hold)
+        if homes[name].skeleton.same_bones(high.skeleton):
+            clips[name] = homes[name]
         if hold:
-            before = source or imitation.library.clips[recording.clip]
-            between = home(as_high_as_source(raw, imitation, recording.clip), False)
-            of = {"source": before, "simulated": _as_file(between), "delivered": _as_file(homes[name])}
+            between = as_high_as_source(raw, imitation, recording.clip)
+            between = between if home is None else home(between, False)
+            of = {"source": before, "simulated": as_file(between), "delivered": as_file(homes[name])}
             seen = {stage: examine(motion) for stage, motion in of.items()}
             for stage, one in seen.items():
                 found.setdefault(stage, {}).update({key: one.figures[key] for key in AS_THE_DOCTOR})
             figures.append(found)
             notes += _sentences(found)
             notes += new_faults(found["clip"], seen["source"], seen["delivered"])
-        raised = float(clips[name].root_pos[0, 2] - clip.root_pos[0, 2])
+        raised = float(high.root_pos[0, 2] - clip.root_pos[0, 2])
         notes += _floor_told(clip.name, raised)
     return Delivery(clips, homes, replace(evaluation.card, delivered=tuple(figures)), tuple(notes))
 
@@ -210,13 +217,6 @@ def _held(
         of = (("source", source, ground), ("simulated", clip, 0.0), ("delivered", held, 0.0))
         found |= {name: clip_figures(c, joints, r.shapes, r.feet, floor) for name, c, floor in of}
     return held, found
-
-
-def _as_file(clip: Clip) -> Clip:
-    """A motion as it is read from its file: what tells the soles of some formats is lost in BVH."""
-    if home_suffix(clip) != ".bvh":
-        return clip
-    return clip.replaced(skeleton=clip.skeleton.with_source(format="bvh"))
 
 
 def _floor_told(name: str, floor_m: float) -> list[str]:

@@ -13,6 +13,7 @@ from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, as_high_as_source, deliver, finished, simulated_clip
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
+from poise.jobs.settled import settled
 from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
@@ -108,10 +109,13 @@ class Tracked(Result):
         return self.at_home(as_high_as_source(made, self.imitation), hold)
 
     def at_home(self, motion: Clip, hold: bool) -> Clip:
-        """A motion of the body on the skeleton that came in. hold: limbs that stay put are led there."""
+        """A motion of the body on the skeleton that came in. hold: limbs that stay put are led
+        there, and feet that still slide are held, see `settled`."""
         if self.placed.moved is not None:
             motion = home(motion, self.placed, self.tracker).replaced(name=motion.name)
-        return pinned(motion, self.pins) if hold and self.pins else motion
+        if not hold:
+            return motion
+        return pinned(motion, self.pins) if self.pins else settled(motion, self.placed.source)
 
     def _shown(self) -> Shown:
         return Shown(self.clip, self.placed.source, self.card, self.notes)
