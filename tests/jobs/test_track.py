@@ -272,6 +272,8 @@ def test_a_policy_without_its_critic_acts_without_lookahead(tracker: Tracker) ->
 
 
 def test_what_cannot_be_tracked(tracker: Tracker, pointed: Tracker) -> None:
+    with pytest.raises(PoiseError, match="a file or several of them, got 3"):
+        track(3, tracker)  # type: ignore[arg-type]
     with pytest.raises(PoiseError, match="needs at least 3"):
         track(walk(0, 2), tracker, controller="policy")
     chain = Skeleton(("a", "b", "c"), (-1, 0, 1), np.array([[0, 0, 0], [0, 0, 1.0], [0, 0, 1.0]]))

@@ -313,7 +313,7 @@ def outcome(tracked: Tracked, reset: bool, hint: bool = True) -> str:
 
     reference, times = tracked.imitation.reference, tracked.failed_s
     seconds = (int(reference.length[0]) - 1) / reference.rate_hz
-    off = f"{tracked.card.mpjpe_global_mm:.0f} mm off on average"
+    off = f"{tracked.card.mpjpe_global_mm:.0f} mm off on average, place included"
     if parts := tracked.parts:
         done, waits = sum(p.done for p in parts), max(p.after or 0.0 for p in parts)
         return (

@@ -164,6 +164,7 @@ def deliver(
     keys: tuple[int, ...] = (),
     lost: tuple[float, ...] | None = None,
     home: Home | None = None,
+    done: Delivery | None = None,
 ) -> Delivery:
     """Writes the motion, `score.json` and `report.html` into `out`.
 
@@ -181,10 +182,11 @@ def deliver(
         keys: frames of the source that stay visible in the report.
         lost: s, when the first clip was lost; by default as the score's rule judges its episode.
         home: of a body that is not the skeleton that came in; what is written here is on the body's.
+        done: what `finished` came to, where that is known.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
-    done = finished(imitation, evaluation, hold, source, home)
+    done = done or finished(imitation, evaluation, hold, source, home)
     for name, clip in done.clips.items():
         single = len(done.clips) == 1
         paths[name] = motion if single and motion else out / f"{name}{home_suffix(clip)}"

@@ -14,8 +14,9 @@ from poise.metrics import jerk
 from poise.motion import Clip
 from poise.motion.io import home_suffix
 
-#: By how much the largest jerk may grow with a foot that is held.
-ROUGHER = 1.25
+#: By how much the largest jerk may grow with a foot that is held; s around where it slides that are
+#: looked at; how often what is rougher is left out.
+ROUGHER, AROUND_S, ROUNDS = 1.25, 0.5, 3
 
 
 def as_file(clip: Clip) -> Clip:
@@ -34,16 +35,17 @@ def settled(clip: Clip, source: Clip) -> Clip:
     Args:
         source: what the clip follows, frame by frame.
     """
-    out = clip
-    for fault in _new_slides(clip, source):
-        held = as_file(out)
-        support = support_of(held, anatomy_of(held))
-        if support is None:
+    faults, held = _new_slides(clip, source), as_file(clip)
+    support = support_of(held, anatomy_of(held)) if faults else None
+    for _ in range(ROUNDS):
+        if support is None or not faults:
             break
-        mended = mend_slides(held, support, [fault])
-        if not _rougher(held, mended):
-            out = clip.replaced(rot=mended.rot)
-    return out
+        mended = mend_slides(held, support, faults)
+        kept = _smooth(held, mended, faults)
+        if len(kept) == len(faults):
+            return clip.replaced(rot=mended.rot)
+        faults = kept
+    return clip
 
 
 def _new_slides(clip: Clip, source: Clip) -> list[Fault]:
@@ -60,10 +62,18 @@ def _new_slides(clip: Clip, source: Clip) -> list[Fault]:
     ]
 
 
-def _rougher(before: Clip, after: Clip) -> bool:
-    """Whether a repair jerks the body, or turns a joint faster than joints do."""
-    was, now = (float(body_steps(c).max()) * c.fps for c in (before, after))
-    if now > max(was, FASTEST):
-        return True
-    shakes = [jerk(torch.tensor(c.positions()), c.fps) for c in (before, after)]
-    return len(shakes[0]) > 0 and float(shakes[1].max()) > ROUGHER * float(shakes[0].max())
+def _smooth(before: Clip, after: Clip, faults: list[Fault]) -> list[Fault]:
+    """Those faults around which a repair neither jerks the body nor turns a joint too fast."""
+    was, now = (body_steps(c).max(-1) * c.fps for c in (before, after))
+    shook, shakes = (jerk(torch.tensor(c.positions()), c.fps).numpy() for c in (before, after))
+    most, around, out = (
+        ROUGHER * float(shook.max(initial=0.0)),
+        round(AROUND_S * before.fps),
+        list[Fault](),
+    )
+    for f in faults:
+        here = slice(max(0, f.start - around), f.stop + around)
+        fast = float(now[here].max(initial=0.0)) > max(FASTEST, float(was[here].max(initial=0.0)))
+        if not fast and float(shakes[here].max(initial=0.0)) <= most:
+            out.append(f)
+    return out

@@ -92,8 +92,12 @@ class Tracked(Result):
     @cached_property
     def card(self) -> ScoreCard:
         """The score of the simulation, help 0, with what holding the feet did."""
-        source = self.placed.source
-        return finished(self.imitation, self.evaluation, True, source, self.at_home).card
+        return self.finished.card
+
+    @cached_property
+    def finished(self) -> Delivery:
+        """What is written, standing feet held: made once, for the card and for the files."""
+        return finished(self.imitation, self.evaluation, True, self.placed.source, self.at_home)
 
     @property
     def clip(self) -> Clip:
@@ -160,7 +164,7 @@ def write(
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(
         t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s,
-        t.at_home,
+        t.at_home, t.finished if hold else None,
     )  # fmt: skip
     (out / FILE).unlink(missing_ok=True)
     if t.simulation is not None:

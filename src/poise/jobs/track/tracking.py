@@ -6,7 +6,7 @@ tracked.card, tracked.clip, tracked.save("out")
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from poise.body.humanoid import make_humanoid
 from poise.env import Reference
+from poise.errors import PoiseError
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track.config import TrackConfig
@@ -87,6 +88,8 @@ def track(
         tracker = policy
     else:
         tracker = (policy if isinstance(policy, Run) else open_run(policy)).tracker
+    if not isinstance(clip, Motion | Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise PoiseError(f"a motion is a clip, keypoints, a file or several of them, got {clip!r}")
     motions = [clip] if isinstance(clip, Motion) else list(clip)
     config.check(len(motions))
     motions = [read_motion(m) for m in motions]
