@@ -114,7 +114,7 @@ def test_eval_gives_the_score_of_the_result(
     said = answered("eval", trained)["result"]
     result = json.loads((trained / "score.json").read_text())
     # Only a delivery writes a motion with feet that can be told.
-    assert result.pop("delivered")[0]["delivered"]["penetration_mm"] < 0.01
+    assert result.pop("delivered")[0]["delivered"]["point_penetration_mm"] < 0.01
     # Only an evaluation says what doing nothing comes to.
     assert set(said["nothing"]) == {"succ", *TRACKING}
     assert said == {**result, "delivered": [], "nothing": said["nothing"]}

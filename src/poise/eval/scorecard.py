@@ -252,8 +252,8 @@ def _spread(p: _Part, trials: Sequence[Tensor], weighting: Weighting) -> dict[st
 def clip_figures(
     clip: Clip, joints: Sequence[int], shapes: Shapes, feet: Sequence[int], ground: float = 0.0
 ) -> dict[str, float]:
-    """`point_slide_mm_per_s` (the score's foot slide, at the clip's own rate) and `penetration_mm` of a
-    clip with a character's shapes (docs/metrics.md).
+    """`point_slide_mm_per_s` (the score's foot slide, at the clip's own rate) and
+    `point_penetration_mm` of a clip with a character's shapes (docs/metrics.md).
 
     Args:
         joints: the clip's joint that each body of `shapes` is fixed to. feet: the bodies that are feet.
@@ -263,5 +263,5 @@ def clip_figures(
     slide = foot_slide(foot_points(pos, quat, shapes, feet), clip.fps, ground=ground)
     return {
         "point_slide_mm_per_s": float(slide),
-        "penetration_mm": float(penetration(lowest_points(pos, quat, shapes)).mean_mm),
+        "point_penetration_mm": float(penetration(lowest_points(pos, quat, shapes)).mean_mm),
     }
