@@ -3,9 +3,10 @@
     python benchmarks/live_vmc.py CLIP ... --json benchmarks/live_vmc.json
 
 `poise live --vmc` runs in a process of its own. python-osc sends each clip once, on a VRM model, at
-30 Hz: it stands for 3 s and then does the motion. The character's distance from its goal is what
-`poise live` tells pages meanwhile; offline the same policy tracks the same clip alone. What
-`--vmc-out` sends is heard, too: it must be whole frames of the model that came in.
+30 Hz: it stands in its first pose for 3 s and then does the motion. How far the character is from its
+goal is what `poise live` tells pages meanwhile; offline the same policy tracks the same frames, those
+3 s too, of which the motion counts. What `--vmc-out` sends is heard, too: it must be whole frames of
+the model that came in.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from poise.jobs.track import track
 from poise.kin import retarget
 from poise.live.sources.osc import messages
 from poise.live.vrm import standard, t_pose, to_unity
-from poise.motion import Clip, read_clip
+from poise.motion import Clip, read_clip, resample
 
 #: s that it stands before the motion, Hz of the messages.
 STANDS_S, RATE = 3.0, 30.0
@@ -45,14 +46,20 @@ def free_port() -> int:
         return int(s.getsockname()[1])
 
 
+def standing_first(clip: Clip) -> Clip:
+    """The clip at 30 Hz, its first pose held for `STANDS_S` before it."""
+    timed = resample(clip, RATE)
+    at = np.maximum(np.arange(timed.frames + round(STANDS_S * RATE)) - round(STANDS_S * RATE), 0)
+    return timed.replaced(root_pos=timed.root_pos[at], rot=timed.rot[at])
+
+
 def send(clip: Clip, port: int) -> float:
-    """Sends the clip, a bundle a frame; `time.perf_counter()` at which the motion began."""
+    """Sends a clip that stands first, a bundle a frame; `time.perf_counter()` at which it moves."""
     client, began = SimpleUDPClient("127.0.0.1", port), time.perf_counter()
-    for step in range(round((STANDS_S + clip.seconds) * RATE)):
-        frame = min(clip.frames - 1, max(0, round((step / RATE - STANDS_S) * clip.fps)))
+    for step in range(clip.frames):
         pos = clip.skeleton.offsets.copy()
-        pos[0] = clip.root_pos[frame]
-        places, turns = to_unity(pos, clip.rot[frame])
+        pos[0] = clip.root_pos[step]
+        places, turns = to_unity(pos, clip.rot[step])
         bundle = OscBundleBuilder(IMMEDIATELY)  # type: ignore[arg-type]
         bundle.add_content(_message("/VMC/Ext/OK", 1))
         bundle.add_content(_message("/VMC/Ext/T", step / RATE))
@@ -96,7 +103,7 @@ def live(clip: Clip, buffer: float) -> dict[str, Any]:
     async def both() -> float:
         watching = asyncio.create_task(
             watch(
-                f"ws://{host}/live", STANDS_S + clip.seconds + 2.0,
+                f"ws://{host}/live", clip.seconds + 2.0,
                 lambda f: seen.append((time.perf_counter(), f)) if "characters" in f else None,
             )
         )  # fmt: skip
@@ -113,7 +120,8 @@ def live(clip: Clip, buffer: float) -> dict[str, Any]:
         process.wait(30)
         ear.join()
         out.close()
-    during = [f["characters"][0] for t, f in seen if moves + buffer < t < moves + buffer + clip.seconds]
+    last = moves + buffer + clip.seconds - STANDS_S
+    during = [f["characters"][0] for t, f in seen if moves + buffer < t < last]
     return {
         "off_mm": {"mean": round(float(np.mean([c["off_mm"] for c in during])), 1),
                    "figures": len(during)},
@@ -131,8 +139,10 @@ def main() -> None:
     rows = list[dict[str, Any]]()
     for path in o.clips:
         own = read_clip(path)
-        clip = retarget(own, t_pose(standard()))[0]
-        offline = track(clip, controller="policy").card.mpjpe_global_mm
+        clip = standing_first(retarget(own, t_pose(standard()))[0])
+        r = track(clip, controller="policy").evaluation.rollouts
+        off = 1000 * (r.pos[0] - r.ref_pos[0]).norm(dim=-1).mean(-1)
+        offline = float(off[round(STANDS_S * r.fps) : clip.frames].mean())
         row = {"clip": path.stem, "seconds": round(clip.seconds, 1), "offline_mm": round(offline, 1)}
         rows.append({**row, **live(clip, o.buffer)})
         print(json.dumps(rows[-1]), flush=True)
