@@ -108,3 +108,14 @@ def test_a_smooth_motion_stays_smooth_at_a_higher_rate() -> None:
     np.testing.assert_array_equal(
         resample(fine, 30.0, smooth=True).root_pos, resample(fine, 30.0).root_pos
     )
+
+
+def test_splines_do_not_ring_where_the_root_leaps() -> None:
+    """As where a character that fell was put back on its motion."""
+    clip = resample(swing(2.0, 120.0, speed=1.0, bend=0.5), 30.0)
+    root = clip.root_pos.copy()
+    root[30:, 0] += 1.5
+    before, after = (resample(c, 120.0, smooth=True) for c in (clip, clip.replaced(root_pos=root)))
+    off = after.root_pos[:, 0] - before.root_pos[:, 0]
+    assert np.abs(off[: 29 * 4 - 40]).max() < 1e-3 and np.abs(off[30 * 4 + 40 :] - 1.5).max() < 1e-3
+    assert off.min() > -0.01 and off.max() < 1.51

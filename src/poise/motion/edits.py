@@ -3,12 +3,17 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownVariableType=false
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_rate
 from poise.spatial import slerp
+
+#: m/s of the root above which a motion leaps.
+LEAPS = 12.0
 
 
 def resample(clip: Clip, fps: float, smooth: bool = False) -> Clip:
@@ -20,7 +25,7 @@ def resample(clip: Clip, fps: float, smooth: bool = False) -> Clip:
     Args:
         smooth: to a higher rate by cubic splines through all frames, accelerations without steps, for
             motion that is known to be smooth. Straight lines have a corner at each frame, which is a
-            jerk many times the motion's own; but what leaps between two frames rings beside it.
+            jerk many times the motion's own. Where the root leaps lines stay straight; other leaps ring.
     """
     check_rate(fps, clip.name)
     count = int(np.floor(clip.seconds * fps + 1e-2)) + 1
@@ -31,22 +36,32 @@ def resample(clip: Clip, fps: float, smooth: bool = False) -> Clip:
     at = np.minimum(np.arange(count) / fps * clip.fps, clip.frames - 1)
     low = np.minimum(np.floor(at + 1e-9).astype(int), clip.frames - 2)
     t = np.clip(at - low, 0.0, 1.0)
-    if smooth and fps > clip.fps and clip.frames > 3:
-        return _splined(clip, at).replaced(fps=float(fps))
-    return blended(clip, low, t).replaced(fps=float(fps))
+    out = blended(clip, low, t)
+    if smooth and fps > clip.fps:
+        out = _splined(clip, at, out)
+    return out.replaced(fps=float(fps))
 
 
-def _splined(clip: Clip, at: np.ndarray) -> Clip:
+def _splined(clip: Clip, at: np.ndarray, straight: Clip) -> Clip:
     """Frames `at (N)`, which lie between those of the clip, by cubic splines: q(t) / |q(t)| for
-    rotations, each frame's quaternion on the side of the one before."""
+    rotations, each frame's quaternion on the side of the one before. Where the root leaps, as where a
+    character was put back, one spline ends and the next begins; `straight` is what lies between them."""
     from scipy.interpolate import CubicSpline
 
-    rot, every = clip.rot.copy(), np.arange(clip.frames)
+    rot, root_pos, turned = clip.rot.copy(), straight.root_pos.copy(), straight.rot.copy()
     flips = (rot[1:] * rot[:-1]).sum(-1) < 0
     rot[1:][np.cumsum(flips, 0) % 2 == 1] *= -1.0
-    turned = CubicSpline(every, rot)(at)
-    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
-    return clip.replaced(root_pos=CubicSpline(every, clip.root_pos)(at), rot=turned)
+    speed = np.linalg.norm(np.diff(clip.root_pos, axis=0), axis=-1) * clip.fps
+    ends = [0, *(np.flatnonzero(speed > LEAPS) + 1).tolist(), clip.frames]
+    for first, end in pairwise(ends):
+        here = (at >= first) & (at <= end - 1)
+        if end - first < 4 or not here.any():
+            continue
+        every = np.arange(first, end)
+        root_pos[here] = CubicSpline(every, clip.root_pos[first:end])(at[here])
+        smooth = CubicSpline(every, rot[first:end])(at[here])
+        turned[here] = smooth / np.linalg.norm(smooth, axis=-1, keepdims=True)
+    return straight.replaced(root_pos=root_pos, rot=turned)
 
 
 def blended(clip: Clip, low: np.ndarray, share: np.ndarray) -> Clip:

@@ -22,7 +22,6 @@ from poise.jobs.track.recovering import Losses
 from poise.jobs.track.simulation import FILE, Simulation
 from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
-from poise.kin import hold_feet
 from poise.kin.directed import Pin, pinned
 from poise.kin.supports import Support
 from poise.motion import Clip
@@ -107,10 +106,9 @@ class Tracked(Result):
     def delivered(self, character: int = 0, hold: bool = True) -> Clip:
         """A character's motion on the skeleton that came in, as high as there. hold: standing feet are
         held."""
-        made = self.motion(character)
         if hold:
-            made = hold_feet(made, self.imitation.humanoid.table)[0]
-        return self.at_home(as_high_as_source(made, self.imitation), hold)
+            return tuple(self.finished.home.values())[character]
+        return self.at_home(as_high_as_source(self.motion(character), self.imitation), False)
 
     def at_home(self, motion: Clip, hold: bool) -> Clip:
         """A motion of the body on the skeleton that came in. hold: limbs that stay put are led
