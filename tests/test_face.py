@@ -82,6 +82,13 @@ def test_what_it_shows(imitated: poise.Imitated, tmp_path: Path) -> None:
     assert page.count("<svg") == 1 and "Success" in page and "<script" not in page
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
     assert imitated.save(tmp_path / "one.bvh") == {"motion": tmp_path / "one.bvh"}
+    with pytest.raises(poise.PoiseError, match=r"is there already.*force=True"):
+        imitated.save(tmp_path / "one.bvh")
+    (tmp_path / "all").mkdir()
+    (tmp_path / "all" / "score.json").write_text("{}")
+    with pytest.raises(poise.PoiseError, match=r"score.json: is there already.*force=True"):
+        imitated.save(tmp_path / "all")
+    assert imitated.save(tmp_path / "one.bvh", force=True) == {"motion": tmp_path / "one.bvh"}
     with pytest.raises(poise.PoiseError, match="cannot be written as"):
         imitated.save(tmp_path / "one.fbx")
 

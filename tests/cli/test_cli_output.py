@@ -10,8 +10,9 @@ import pytest
 from tiny_clips import MINIATURE, put
 
 from poise.cli.main import main
-from poise.cli.output import may_write, places
+from poise.cli.output import places
 from poise.errors import PoiseError
+from poise.jobs.keep import may_write
 
 
 def test_names_with_dots() -> None:

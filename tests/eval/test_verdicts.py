@@ -68,3 +68,12 @@ def test_every_key_is_documented():
     found = card().to_dict()
     keys = [*found, *(f"help.{k}" for k in found["help"])]
     assert [k for k in keys if k != "help" and f"`{k}`" not in page] == []
+
+
+def test_figures_of_a_lost_motion_are_not_called_good():
+    lost = card(succ=0.0, per_clip=({"clip": "flip", "episodes": 1},))
+    rows = {row[0]: row[3] for row in table(lost)}
+    assert rows["Joint error, root-relative"] == rows["Foot slide"] == rows["Jerk"] == ""
+    assert rows["Velocity error"] == "poor" and rows["Success (phc)"] == "poor"
+    many = card(succ=0.0, per_clip=({"clip": "flip", "episodes": 30},))
+    assert {row[0]: row[3] for row in table(many)}["Joint error, root-relative"] == "good"

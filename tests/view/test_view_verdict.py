@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from fake_report import make_report, score
 
@@ -107,3 +109,15 @@ def test_the_written_motion_is_told_beside_the_simulation():
     told = "the motion it follows: 41 mm/s; soles of the written motion, feet held: 6 mm/s"
     assert grades({**score(), **written})[3].detail == told
     assert grades({**score(), "delivered": [{"clip": "no feet"}]})[3].detail.endswith("41 mm/s")
+
+
+def test_figures_of_a_lost_motion_are_said_to_end_at_the_loss():
+    lost = {**score(), "succ": 0.0, "per_clip": [{"clip": "flip", "episodes": 1}]}
+    error, slide = grades(lost)[1], grades(lost)[3]
+    assert error.level == slide.level == "unknown"
+    assert error.detail.startswith("only of what comes before the loss")
+    assert overall(lost) == "poor"
+    assert not any(row.mark == "better" for row in score_rows(lost))
+    assert any(row.mark == "better" for row in score_rows(score()))
+    assert "not judged" in render(replace(make_report(), score=lost))
+    assert grades({**lost, "mpjpe_mm": 300.0})[1].level == "poor"

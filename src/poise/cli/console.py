@@ -118,7 +118,8 @@ def print_card(card: ScoreCard) -> None:
         for label, value, unit, verdict in rows_of(card)
     ]
     episodes = "1 episode" if card.episodes == 1 else f"{card.episodes} episodes"
-    title = f"{card.clip or 'run'}: {episodes}, {card.frames:,} frames"
+    until = " until it was lost" if card.cut else ""
+    title = f"{card.clip or 'run'}: {episodes}, {card.frames:,} frames{until}"
     table(title, ("", "value", "unit", "verdict"), rows)
     say(sentence(card.to_dict()))
 

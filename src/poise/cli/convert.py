@@ -13,8 +13,9 @@ from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading
-from poise.cli.output import claimed, may_write
+from poise.cli.output import claimed
 from poise.errors import PoiseError
+from poise.jobs.keep import may_write
 
 
 @dataclass(frozen=True)

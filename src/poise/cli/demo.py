@@ -15,8 +15,8 @@ from poise.cli.console import say
 from poise.cli.imitate import Options as Whole
 from poise.cli.imitate import run as run_whole
 from poise.cli.options import Flag, Training
-from poise.cli.output import may_deliver
 from poise.errors import PoiseError
+from poise.jobs.keep import may_deliver
 
 #: The clip that comes with Poise.
 WALK = Path(__file__).parents[1] / "data" / "walk.bvh"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from poise.cli.answer import Answer
 from poise.cli.console import say, table
-from poise.cli.output import may_write
 from poise.errors import PoiseError
+from poise.jobs.keep import may_write
 
 if TYPE_CHECKING:
     from poise.cli.doctor import Options

@@ -12,9 +12,9 @@ from tyro.conf import Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import print_card
 from poise.cli.options import Device, Flag, Rule, check_device
-from poise.cli.output import may_write
 from poise.cli.progress import working
 from poise.errors import PoiseError
+from poise.jobs.keep import may_write
 
 
 @dataclass(frozen=True)

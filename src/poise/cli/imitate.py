@@ -15,11 +15,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import launched, print_card
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
-from poise.cli.output import may_deliver, places
+from poise.cli.output import places
 from poise.cli.progress import working
 from poise.cli.settings import given
 from poise.cli.training import Job, command_line, first_delivery, stopped
 from poise.errors import PoiseError
+from poise.jobs.keep import may_deliver
 
 if TYPE_CHECKING:
     from poise.recipes import ResidualForce

@@ -13,9 +13,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import say, tell
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import may_write
 from poise.cli.progress import left, showing
 from poise.errors import PoiseError
+from poise.jobs.keep import may_write
 
 if TYPE_CHECKING:
     from poise.motion import Clip

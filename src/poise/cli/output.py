@@ -9,36 +9,6 @@ from pathlib import Path
 
 from poise.errors import PoiseError
 
-#: What `imitate` and `track` write into their folder.
-_RESULTS = (
-    "simulated.*", "simulated_*.*", "body.bvh", "score.json", "report.html", "simulation.safetensors",
-)  # fmt: skip
-
-
-def may_write(path: Path, force: bool, *read: Path, flag: str = "--force") -> None:
-    """Refuses to write where something would be lost, before any work is done.
-
-    Args:
-        force: an existing file may be written over.
-        read: files that are read, which nothing is written over.
-        flag: the option by which it may.
-
-    Raises:
-        PoiseError: a file that is there or is read; a folder, a symbolic link, a pipe or a device.
-    """
-    if path.is_symlink():
-        raise PoiseError("is a symbolic link, which a file would replace", path, "Name the file itself")
-    if not path.exists():
-        return
-    if any(source.exists() and path.samefile(source) for source in read):
-        raise PoiseError("the clip would be written over itself", path, "Give OUT another name")
-    if path.is_dir():
-        raise PoiseError("is a folder", path, "Name a file in it")
-    if not path.is_file():
-        raise PoiseError("is a pipe or a device, which a file would replace", path, "Name a file")
-    if not force:
-        raise PoiseError("is there already", path, f"Choose another name, or write over it with {flag}")
-
 
 def places(out: Path) -> tuple[Path, Path | None]:
     """The folder of the results, and the file of the motion where `out` names one.
@@ -57,15 +27,6 @@ def places(out: Path) -> tuple[Path, Path | None]:
         return out, None
     check_writable(out)
     return out.with_suffix(""), out
-
-
-def may_deliver(
-    folder: Path, motion: Path | None, force: bool, *read: Path, flag: str = "--force"
-) -> None:
-    """Refuses to write results over others, see `may_write`."""
-    held = sorted(p for name in _RESULTS for p in folder.glob(name))
-    for path in (*([motion] if motion else ()), *held):
-        may_write(path, force, *read, flag=flag)
 
 
 @contextlib.contextmanager

@@ -12,9 +12,9 @@ from tyro.conf import Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.options import Flag
-from poise.cli.output import may_write
 from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
+from poise.jobs.keep import may_write
 
 if TYPE_CHECKING:
     from poise.recipes.imitation import Imitation

@@ -12,8 +12,8 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from poise.cli.answer import Answer
 from poise.cli.console import say, table
 from poise.cli.options import Flag, Reading
-from poise.cli.output import may_write
 from poise.errors import PoiseError
+from poise.jobs.keep import may_write
 
 if TYPE_CHECKING:
     from poise.kin import RetargetReport

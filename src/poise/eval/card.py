@@ -83,6 +83,13 @@ class ScoreCard:
         """Whether all episodes succeed by the rule, and yet not all are tracked."""
         return self.succ == 1.0 and self.tracked < 1.0
 
+    @property
+    def cut(self) -> bool:
+        """Whether each clip was played once, from its start, and lost: figures end there."""
+        return (
+            self.succ == 0.0 and bool(self.per_clip) and all(c["episodes"] == 1 for c in self.per_clip)
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values with the keys in field order; what is not finite becomes None."""
         return plain(self)
@@ -209,9 +216,15 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
     """Rows (label, value, unit, verdict) for the command line and the report, most important first.
 
     Each row is followed by what stands beside it, without a verdict: the error over all frames, the
-    spread over perturbed starts, what doing nothing comes to, the reference's own figure.
+    spread over perturbed starts, what doing nothing comes to, the reference's own figure. Figures of a
+    motion that is lost are of what comes before, so that none of them is called good or fair.
     """
     t = THRESHOLDS
+
+    def judged(key: str, value: float) -> Verdict:
+        verdict = t[key].verdict(value)
+        return "" if card.cut and verdict != "poor" else verdict
+
     rows: list[tuple[str, float, str, Verdict]] = [
         Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
         *_beside(card, "succ", "Success", "%", 100.0),
@@ -223,10 +236,10 @@ def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
         reference = card.reference.get(key, math.nan)
         if key == "jerk":
             ratio = value / reference if reference > 0 else math.nan
-            rows.append(Row(label, value, unit, t["jerk_ratio"].verdict(ratio)))
+            rows.append(Row(label, value, unit, judged("jerk_ratio", ratio)))
         else:
             rows += [
-                Row(label, value, unit, t[key].verdict(value)),
+                Row(label, value, unit, judged(key, value)),
                 *_beside(card, key, label, unit),
             ]
         if math.isfinite(reference):

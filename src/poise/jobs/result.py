@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from poise.eval import ScoreCard
 from poise.eval import table as rows_of
+from poise.jobs.keep import may_deliver, may_write
 from poise.motion import Clip, read_clip
 from poise.motion.io import check_writable, write_clip
 from poise.view.notebook import result_html
@@ -36,18 +37,24 @@ class Result(ABC):
     @abstractmethod
     def _save_all(self, folder: Path) -> dict[str, Path]: ...
 
-    def save(self, path: str | Path) -> dict[str, Path]:
+    def save(self, path: str | Path, *, force: bool = False) -> dict[str, Path]:
         """Writes the motion into the file `path`, or all there is into the folder `path`; what was
         written, by name.
 
+        Args:
+            force: what is there already may be written over.
+
         Raises:
-            PoiseError: a suffix of no motion format, or nothing can be written there.
+            PoiseError: a suffix of no motion format, something is there already, or nothing can be
+                written there.
         """
         path = Path(path)
         if path.suffix and not path.is_dir():
             check_writable(path)
+            may_write(path, force, flag="force=True")
             write_clip(self._shown().clip, path)
             return {"motion": path}
+        may_deliver(path, None, force, flag="force=True")
         path.mkdir(parents=True, exist_ok=True)
         return self._save_all(path)
 

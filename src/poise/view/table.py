@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from poise.view.data import number
-from poise.view.verdict import percent
+from poise.view.verdict import cut, percent
 
 _ROWS: tuple[tuple[str, str, str, str], ...] = (
     ("mpjpe_mm", "Joint error", "mm", "mean joint distance after the roots are laid together"),
@@ -83,6 +83,7 @@ def score_rows(score: dict[str, Any]) -> list[Row]:
         rows.append(Row("Tracked", percent(whole), "", "success, upright and on its feet"))
     for key, name, unit, meaning in _ROWS:
         mark = _mark(number(score.get(key)), number(before.get(key)))
+        mark = "" if cut(score) and mark == "better" else mark
         beside = amount(before[key], unit) if key in before else ""
         rows.append(Row(name, amount(score.get(key), unit), beside, meaning, mark))
     reward = score.get("reward")

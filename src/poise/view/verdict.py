@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from poise.view.data import number
@@ -91,7 +91,8 @@ def joint_error(score: dict[str, Any]) -> Grade:
     error = number(score.get("mpjpe_mm"))
     rule = _rule("mpjpe_mm", "mm")
     text = "not measured" if error is None else f"{error:.0f} mm"
-    return Grade("Joint error", text, _level(error, "mpjpe_mm"), rule, "mean distance, root-relative")
+    detail = "mean distance, root-relative"
+    return _before_loss(score, Grade("Joint error", text, _level(error, "mpjpe_mm"), rule, detail))
 
 
 def help_given(score: dict[str, Any]) -> Grade:
@@ -132,7 +133,16 @@ def foot_slide(score: dict[str, Any]) -> Grade:
         if written is not None:
             told.append(f"soles of the written motion, feet held: {written:.0f} mm/s")
     detail = "; ".join(told)
-    return Grade("Foot slide", text, _level(slide, key), _rule(key, "mm/s"), detail, False)
+    grade = Grade("Foot slide", text, _level(slide, key), _rule(key, "mm/s"), detail, False)
+    return _before_loss(score, grade)
+
+
+def _before_loss(score: dict[str, Any], grade: Grade) -> Grade:
+    """A figure of a motion that is lost is of what comes before it: poor, or not judged."""
+    if not cut(score) or grade.level == "unknown":
+        return grade
+    told = "; ".join(t for t in ("only of what comes before the loss", grade.detail) if t)
+    return replace(grade, level="poor" if grade.level == "poor" else "unknown", detail=told)
 
 
 def grades(score: dict[str, Any]) -> tuple[Grade, ...]:
@@ -155,6 +165,11 @@ def sentence(score: dict[str, Any]) -> str:
     track, error, aid, _ = grades(score)
     began = "its first frame" if _only_from_the_first(score) else "every start"
     return f"{track.name} from {began}: {track.value} · joint error {error.value} · help {aid.value}"
+
+
+def cut(score: dict[str, Any]) -> bool:
+    """Whether each clip was played once, from its start, and lost."""
+    return number(score.get("succ")) == 0.0 and _only_from_the_first(score)
 
 
 def _only_from_the_first(score: dict[str, Any]) -> bool:
