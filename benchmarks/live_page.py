@@ -1,7 +1,7 @@
 """The page of live motion in browsers: seconds until something moves, frames a second, a picture.
 
     python benchmarks/live_page.py chromium --minutes 5 --picture OUT.png --json OUT.json
-    python benchmarks/live_page.py firefox --minutes 0 --picture OUT.png --json OUT.json
+    xvfb-run python benchmarks/live_page.py firefox --minutes 0 --picture OUT.png --json OUT.json
 
 `poise live` starts in a process of its own with the walk that it plays by default, and a headless
 browser that draws without a graphics card opens its page. The first second counts from the start of
@@ -51,8 +51,11 @@ def firefox(url: str, profile: Path) -> Iterator[tuple[Callable[[str], Any], Cal
     """What runs scripts in a page of Firefox and what takes its picture, by WebDriver BiDi."""
     prefs = [f'user_pref("{k}", {json.dumps(v)});\n' for k, v in PREFS.items()]
     (profile / "user.js").write_text("".join(prefs))
+    # Without a window Firefox has no WebGL on machines without a graphics card; a display that Xvfb
+    # makes will do.
+    headless = () if os.environ.get("DISPLAY") else ("--headless",)
     with subprocess.Popen(
-        ["firefox-esr", "--headless", "--no-remote", "--profile", str(profile),
+        ["firefox-esr", *headless, "--no-remote", "--profile", str(profile),
          "--remote-debugging-port", "0", "--window-size", "1280,800"],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "LIBGL_ALWAYS_SOFTWARE": "1"},

@@ -119,6 +119,7 @@
     $("off").textContent = c.off_mm;
     $("falls").textContent = c.falls;
     $("recovered").textContent = c.recovered;
+    $("losses").textContent = c.lost;
     $("help").textContent = message.help_n.toFixed(0);
     $("refused").textContent = Object.values(message.refused).reduce((a, b) => a + b, 0);
     $("refused").title = Object.entries(message.refused).map(([why, count]) => `${why}: ${count}`).join(", ");
