@@ -36,6 +36,7 @@ from poise.jobs.compliant.play import play
 from poise.jobs.compliant.standing import standing
 from poise.jobs.compliant.stiffness import Measured, measure
 from poise.jobs.compliant.throws import slope, throws
+from poise.jobs.compliant.training import Learned, shipped
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
@@ -215,12 +216,16 @@ def doors(tracker: Tracker, threads: int) -> dict[str, Any]:
 
 def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str, Any]:
     """Trampoline, ball and chicken fight, each beside its twin that does not give way."""
-    cases: dict[str, tuple[PlayScene, dict[str, Compliance | Stiffness | None]]] = {
+    learned = shipped("ball", tracker)
+    assert learned is not None
+    ball: dict[str, Compliance | Stiffness | Learned | None] = {"linear law": None, "learned": learned}
+    cases: dict[str, tuple[PlayScene, dict[str, Compliance | Stiffness | Learned | None]]] = {
         "trampoline": (
             Trampoline(), {"level 0.16": Compliance(0.16), "level 0.04": Compliance(0.04)}
         ),
-        "ball": (Balance(), {"linear law": None}),
-        "ball, pushed with 50 N": (Balance(pushes=50.0), {"linear law": None}),
+        "ball": (Balance(), ball),
+        "ball, pushed with 50 N": (Balance(pushes=50.0), ball),
+        "ball, pushed with 100 N": (Balance(pushes=100.0), ball),
         "chicken, heavy and light": (
             Chicken(against="rival"),
             {"level 0.16": Compliance(0.16), "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5)},
@@ -234,7 +239,10 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
             continue
         rows: dict[str, Any] = {}
         for way, given in ways.items():
-            made = play(scene, tracker, None, given, 8, 8.0, threads)
+            own = given if isinstance(given, Learned) else None
+            how = None if isinstance(given, Learned) else given
+            seconds = 30.0 if isinstance(scene, Balance) else 8.0
+            made = play(scene, tracker, None, how, 8, seconds, threads, learned=own)
             rows["without"] = dict(made.stiff)
             rows[way] = dict(made.figures)
         out[name] = rows

@@ -15,7 +15,7 @@ from poise.env.on_top import Added, OnTop
 from poise.env.scenes.ball import FictionalForces
 from poise.errors import PoiseError
 from poise.jobs.compliant.play import play
-from poise.jobs.compliant.training import open_learned, scene_task, train
+from poise.jobs.compliant.training import open_learned, save_learned, scene_task, shipped, train
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
@@ -70,10 +70,27 @@ def test_a_tiny_training_goes_on_and_is_played(tracker: Tracker, tmp_path: Path)
     learned = open_learned(tmp_path / "a", tracker)
     made = play(TINY.play(), tracker, None, None, 2, 0.5, 1, "ball", learned)
     assert made.figures["goal_moved_m"] > 0.0 and made.figures["stays_s"] > 0.3
+    one = tmp_path / "one.safetensors"
+    save_learned(learned, tracker, one)
+    again = open_learned(one, tracker)
+    assert again.config == TINY and again.added == learned.added
+    seen = torch.randn(3, learned.top.num_obs)
+    torch.testing.assert_close(again.top.act(seen), learned.top.act(seen), atol=1e-2, rtol=1e-2)
     with pytest.raises(PoiseError, match="a run with other settings"):
         train(replace(TINY, seed=1), tracker, tmp_path / "a", Until(iterations=3), threads=1)
     with pytest.raises(PoiseError, match="holds no run of the recipe compliant"):
         open_learned(tmp_path, tracker)
+
+
+def test_what_comes_along_for_the_ball_balances_it(tracker: Tracker) -> None:
+    learned = shipped("ball", tracker)
+    assert learned is not None and shipped("door", tracker) is None
+    made = play(learned.config.play(), tracker, None, None, 2, 5.0, 1, "ball", learned)
+    # A rod that nobody balances has fallen after 1.5 s.
+    assert made.figures["stays_s"] > 4.9 and made.stiff["stays_s"] < 2.0 and made.figures["lost"] == 0
+    other = replace(tracker, policy=tracker.policy.copy())
+    other.policy.load_state({k: 1.01 * v for k, v in tracker.policy.state().items()})
+    assert shipped("ball", other) is None
 
 
 def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

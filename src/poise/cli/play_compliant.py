@@ -78,8 +78,9 @@ class Options:
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """A policy file, the folder of a run of poise train perpetual, or keypoints, the policy that comes
     along and is told places alone; by default the one for rotations that comes with Poise."""
-    learned: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
-    """What was learned on top of the policy: the folder of poise train compliant SCENE."""
+    learned: Annotated[Path | None, arg(metavar="RUN|none", help_behavior_hint="")] = None
+    """What was learned on top of the policy: the folder of poise train compliant SCENE. For the ball
+    something comes along; none goes without."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores; 0 is all."""
     open: Flag = False
@@ -100,18 +101,22 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
     from poise.jobs.compliant.play import play
-    from poise.jobs.compliant.training import open_learned
+    from poise.jobs.compliant.training import open_learned, shipped
     from poise.jobs.open import open_run
 
     scene, given = scene_of(o), given_of(o)
     clip = None if o.clip is None else o.reading.read(o.clip)
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
-        learned = None if o.learned is None else open_learned(o.learned, tracker)
+        stated = o.level is not None or o.stiffness is not None
+        if o.learned is None:
+            learned = None if stated else shipped(o.scene, tracker)
+        else:
+            learned = None if str(o.learned) == "none" else open_learned(o.learned, tracker)
     if learned is not None and learned.config.scene != o.scene:
         what = f"the run learned the scene '{learned.config.scene}', not '{o.scene}'"
         raise PoiseError(what, o.learned, f"Write poise play compliant {learned.config.scene}")
-    if learned is not None and (o.level is not None or o.stiffness is not None):
+    if learned is not None and stated:
         raise PoiseError("a run gives way as it has learned to", hint="Leave --level, --stiffness out")
     with claimed(o.out):
         with working("simulating"):

@@ -171,7 +171,7 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
     packed, clip = pack_clips([example])
     # The rotations only show how the skeleton stands; offsets are the body's and stay exact.
     small = {k: v if "offsets" in k else v.float() for k, v in packed.items()}
-    tensors = {k: _halved(k, v) for k, v in tracker.policy.state().items()}
+    tensors = {k: halved(k, v) for k, v in tracker.policy.state().items()}
     meta = {
         "kind": KIND,
         "tracker": VERSION,
@@ -186,7 +186,7 @@ def save_tracker(tracker: Tracker, path: Path) -> None:
     if tracker.recovery_clips is not None:
         tensors |= {_WAYS + k: v.float() for k, v in tracker.recovery_clips.state().items()}
     if tracker.value is not None:
-        tensors |= {k: _halved(k, v) for k, v in prefixed("value", tracker.value.state()).items()}
+        tensors |= {k: halved(k, v) for k, v in prefixed("value", tracker.value.state()).items()}
     save_checkpoint(path, tensors, meta)
 
 
@@ -251,7 +251,7 @@ def _foreign(meta: Mapping[str, Any], path: Path) -> PoiseError:
     )
 
 
-def _halved(name: str, value: Tensor) -> Tensor:
+def halved(name: str, value: Tensor) -> Tensor:
     """Matrices of the networks in half precision, where its range holds them."""
     if not name.startswith(("policy/", "value/")) or value.ndim < 2 or not value.is_floating_point():
         return value

@@ -4,10 +4,13 @@ run/
     compliant.json          the settings
     checkpoint.safetensors  the training as it stands, with the policy on top
     log.csv                 the learning curve
+
+What is on top of a policy is one file, too, `save_learned`: such a file comes along for the ball.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,7 +23,7 @@ from poise.jobs.compliant.motions import motion_of
 from poise.jobs.compliant.standing import standing
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.jobs.tracker import Tracker
+from poise.jobs.tracker import Tracker, halved
 from poise.learn import (
     LATEST,
     IterationStats,
@@ -32,7 +35,9 @@ from poise.learn import (
     load_policy,
     run,
 )
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.lock import only_writer
+from poise.learn.policy import policy_in
 from poise.machine import cores
 from poise.recipes import compliant as recipe
 from poise.recipes.compliant import Compliant
@@ -41,6 +46,8 @@ from poise.settings import to_data
 
 #: What a run begins with.
 RUN_FILE = "compliant.json"
+#: What comes along on top of the policy that comes along, by scene.
+SHIPPED = {"ball": Path(__file__).parents[2] / "data" / "ball.safetensors"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,21 +122,60 @@ def train(
             trainer.close()
 
 
+def save_learned(learned: Learned, tracker: Tracker, path: Path) -> None:
+    """Writes what was learned on top of a policy as one file, its matrices in half precision."""
+    meta = {
+        "kind": "policy", **learned.top.identity(tracker.humanoid.identity),
+        "metadata": {
+            "recipe": "compliant", "config": to_data(learned.config), "below": digest_of(tracker.policy)
+        },
+    }  # fmt: skip
+    save_checkpoint(path, {k: halved(k, v) for k, v in learned.top.state().items()}, meta)
+
+
+def digest_of(policy: PolicyBundle) -> str:
+    """16 hexadecimal digits that tell one policy's weights from another's."""
+    told = hashlib.sha256()
+    for name, value in sorted(policy.state().items()):
+        told.update(name.encode() + value.contiguous().numpy().tobytes())
+    return told.hexdigest()[:16]
+
+
+def shipped(scene: str, tracker: Tracker) -> Learned | None:
+    """What comes along for a scene; None where there is nothing, or it belongs to another policy."""
+    path = SHIPPED.get(scene)
+    if path is None or load_checkpoint(path)[1]["metadata"]["below"] != digest_of(tracker.policy):
+        return None
+    return open_learned(path, tracker)
+
+
 def open_learned(folder: Path, tracker: Tracker) -> Learned:
-    """What a run has learned so far.
+    """What a run has learned so far, or the file that `save_learned` wrote.
 
     Raises:
         PoiseError: no run of the recipe, nothing trained yet, or a policy of another body.
     """
+    if folder.is_file():
+        tensors, meta = load_checkpoint(folder)
+        told = meta.get("metadata", {})
+        if told.get("recipe") != "compliant":
+            hint = "Give the folder of poise train compliant, or a file that was saved from it"
+            raise PoiseError("holds nothing of the recipe compliant", folder, hint)
+        config = recipe.config_of(told["config"], folder)
+        return _fitting(policy_in(tensors, meta, folder), config, tracker, folder)
     file = folder / RUN_FILE
     if not file.exists():
         hint = "Give the folder of poise train compliant"
         raise PoiseError("holds no run of the recipe compliant", folder, hint)
     config = _read(file)
-    added = config.added(tracker.policy.num_obs)
     if not (folder / LATEST).exists():
         raise PoiseError("nothing was trained in it yet", folder, "Train it for some minutes")
-    top = load_policy(folder / LATEST)
+    return _fitting(load_policy(folder / LATEST), config, tracker, folder)
+
+
+def _fitting(top: PolicyBundle, config: Compliant, tracker: Tracker, folder: Path) -> Learned:
+    """Refuses what was trained on another body."""
+    added = config.added(tracker.policy.num_obs)
     if top.num_actions != added.width(len(tracker.humanoid.hinges)):
         raise PoiseError("it was trained on another body", folder, "Give the policy it was trained on")
     return Learned(config, top, added)
