@@ -25,6 +25,7 @@ from poise.motion import Clip, write_clip
 from poise.plan import LookaheadConfig
 from poise.synth.retime import retimed
 from toy_human import swing
+from toy_policy import walk
 
 FEW = LookaheadConfig(candidates=12, smoothing=(0.0, 0.5))
 
@@ -55,6 +56,20 @@ def test_limbs_are_pinned_and_touch() -> None:
     # What was simulated is held at its middle place.
     still = pinned(clip, (Pin("left_foot", 10, 13),))
     assert np.ptp(end(still, "foot", "left")[10:14], axis=0).max() < 3e-3
+
+
+@pytest.mark.parametrize("how", ["led", "held"])
+def test_a_pinned_foot_stays_from_heel_to_toe(how: str) -> None:
+    clip = walk()
+    foot = find_anatomy(clip.skeleton).of("foot", "left")[0]
+    toe = next(j for j, parent in enumerate(clip.skeleton.parents) if parent == foot)
+    pins = (Pin("left_foot", 12, 20),)
+    made = directed(clip, pins)[0] if how == "led" else pinned(clip, pins)
+    assert np.ptp(clip.positions()[12:21, toe], axis=0).max() > 0.02
+    assert np.ptp(made.positions()[12:21, toe], axis=0).max() < 3e-3
+    # As the motion comes to the pin and leaves it, the toe sinks no deeper than it does anyway.
+    low = min(0.0, clip.positions()[:, toe, 2].min())
+    assert made.positions()[:, toe, 2].min() > low - 0.01
 
 
 def test_what_cannot_be_is_said() -> None:

@@ -18,9 +18,10 @@ from poise.jobs.track import Tracked, track, write
 from poise.jobs.track.direction import Direction, Weight
 from poise.jobs.track.retaking import FADE_S, SETTLE_S, eased, part_of
 from poise.jobs.track.simulation import FILE, Retake, Simulation, read_simulation, retake_of
+from poise.jobs.track.splice import changed_s
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.motion import Clip, trim, write_clip
+from poise.motion import Clip, read_clip, trim, write_clip
 from poise.plan import LookaheadConfig
 from toy_policy import walk
 
@@ -89,8 +90,25 @@ def test_files_hold_what_is_needed(tracker: Tracker, clip: Clip, earlier: Tracke
     assert earlier.simulation is not None
     assert torch.equal(kept.qpos, earlier.simulation.qpos)
     assert torch.equal(kept.action, earlier.simulation.action)
-    made = track(clip, tracker, retake=Retake(tmp_path / "out", 0.3, 0.6), **HOW)
+    hands = Direction((Weight("arms", 5.0),))
+    made = track(clip, tracker, retake=Retake(tmp_path / "out", 0.3, 0.6), direction=hands, **HOW)
     assert made.simulation is not None
+    # So is what is written: elsewhere it is as it was, in a folder or not.
+    first, last = changed_s(kept, made.simulation)
+    t = np.arange(clip.frames) / clip.fps
+    beside = (t <= first) | (t >= last)
+    assert 5 < beside.sum() < clip.frames
+    two = write(made, tmp_path / "two").paths["simulated"]
+    written = [read_clip(p).positions() for p in (paths["simulated"], two)]
+    np.testing.assert_allclose(written[1][beside], written[0][beside], atol=2e-6, rtol=0)
+    assert np.abs(written[1][~beside] - written[0][~beside]).max() > 1e-4
+    asked = Retake(earlier.simulation, 0.3, 0.6)
+    again = track(clip, tracker, retake=asked, direction=hands, **HOW)
+    np.testing.assert_allclose(
+        again.clip.positions()[beside], earlier.clip.positions()[beside], atol=1e-9, rtol=0
+    )
+    free = again.delivered(hold=False).positions(), earlier.delivered(hold=False).positions()
+    np.testing.assert_allclose(free[0][beside], free[1][beside], atol=1e-9, rtol=0)
     # Keyframes are completed anew in part, too.
     keys = (0, clip.frames // 2, clip.frames - 1)
     one = complete(clip, keys, tracker, adapt=0, **HOW)

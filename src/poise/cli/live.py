@@ -109,7 +109,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             tracker = tracker.with_bones_of(o.reading.read(o.bones))
         session = Session(tracker, config, wanted)
     try:
-        say(f"Poise live: {session.server.url}", "bold")
+        (tell if o.json else say)(f"Poise live: {session.server.url}", "bold")
         if token is not None:
             tell(f"Others can reach this machine at {o.host}. The token in the address lets them in.")
         if session.door is not None:

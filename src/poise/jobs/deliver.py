@@ -117,9 +117,15 @@ def finished(
     hold: bool = True,
     source: Clip | None = None,
     home: Home | None = None,
+    undirected: Clip | None = None,
 ) -> Delivery:
     """The simulated motion of every clip, its standing feet held to the spot, as high as its source; see
-    `deliver`."""
+    `deliver`.
+
+    Args:
+        undirected: the motion before pins and touch points led it, beside which the doctor's findings
+            are new.
+    """
     clips, homes = dict[str, Clip](), dict[str, Clip]()
     figures, notes = [], []
     for k, recording in enumerate(evaluation.recordings):
@@ -140,7 +146,11 @@ def finished(
         if hold:
             between = as_high_as_source(raw, imitation, recording.clip)
             between = between if home is None else home(between, False)
-            of = {"source": before, "simulated": as_file(between), "delivered": as_file(homes[name])}
+            of = {
+                "source": undirected or before,
+                "simulated": as_file(between),
+                "delivered": as_file(homes[name]),
+            }
             seen = {stage: examine(motion) for stage, motion in of.items()}
             for stage, one in seen.items():
                 found.setdefault(stage, {}).update({key: one.figures[key] for key in AS_THE_DOCTOR})

@@ -14,7 +14,7 @@ from poise.errors import PoiseError, did_you_mean
 from poise.kin.limbs import match_positions
 from poise.kin.series import gaussian_sums
 from poise.motion import Clip, Skeleton
-from poise.spatial import forward_kinematics
+from poise.spatial import forward_kinematics, normalize, quat_conj, quat_mul, slerp
 
 #: Ends of limbs that can be pinned and can touch; the pelvis, too, can be led to a point.
 LIMBS = ("left_foot", "right_foot", "left_hand", "right_hand")
@@ -38,7 +38,7 @@ class Pin:
 
     Attributes:
         limb: one of `LIMBS`.
-        first, last: frames of the clip, both pinned; its place is that of the first.
+        first, last: frames of the clip, both pinned; its place is that of the first, and a foot's turn.
     """
 
     limb: str
@@ -90,8 +90,9 @@ def directed(
     """The motion with limbs on their pins and touch points, and what of that is doubtful.
 
     A limb is led there by its own joints, and comes and goes in `EASE_S`; hands and feet keep their
-    turn in the world. Where the limb is too short the body follows by a few centimetres, with its feet
-    where they are; what is out of reach then is approached as far as it goes.
+    turn in the world, but for a pinned foot, which stays as it is from heel to toe. Where the limb is
+    too short the body follows by a few centimetres, with its feet where they are; what is out of reach
+    then is approached as far as it goes.
 
     Raises:
         PoiseError: frames that the clip does not have, or limbs that the skeleton does not have.
@@ -117,7 +118,10 @@ def directed(
         place = pos[span[0]] if isinstance(what, Pin) else torch.tensor(what.point).to(pos)
         share = ease(clip.frames, *span, clip.fps).to(pos)[:, None]
         goal = torch.lerp(pos, place.expand_as(pos), share)
+        still = _foot(clip.skeleton, what.limb, root, rot, joint, (span[0], span[0]))
         root, rot = _led(clip, root, rot, joint, goal)
+        if isinstance(what, Pin):
+            rot = _still(clip.skeleton, root, rot, still, share[:, 0])
         notes += _doubts(clip, what, pos, _ends(clip.skeleton, root, rot, joint), place)
     return clip.replaced(root_pos=root.numpy(), rot=rot.numpy()), tuple(notes)
 
@@ -135,8 +139,41 @@ def pinned(clip: Clip, pins: Sequence[Pin]) -> Clip:
         place = pos[pin.first : last + 1].median(0).values
         share = ease(clip.frames, pin.first, last, clip.fps).to(pos)[:, None]
         goal = torch.lerp(pos, place.expand_as(pos), share)
+        still = _foot(clip.skeleton, pin.limb, root, rot, joint, (pin.first, last))
         root, rot = _led(clip, root, rot, joint, goal)
+        rot = _still(clip.skeleton, root, rot, still, share[:, 0])
     return clip.replaced(root_pos=root.numpy(), rot=rot.numpy())
+
+
+def _foot(
+    skeleton: Skeleton, limb: str, root: Tensor, rot: Tensor, joint: int, span: tuple[int, int]
+) -> dict[int, Tensor]:
+    """The mean turns in the world of a foot and of all that hangs on it, over a span; none of a hand."""
+    if not limb.endswith("foot"):
+        return {}
+    of = [joint]
+    of += [j for j in range(joint + 1, len(skeleton)) if skeleton.parents[j] in of]
+    world = _turns(skeleton, root, rot)[span[0] : span[1] + 1, of]
+    sides = torch.where((world * world[:1]).sum(-1, keepdim=True) < 0, -world, world)
+    return dict(zip(of, normalize(sides.mean(0)), strict=True))
+
+
+def _still(
+    skeleton: Skeleton, root: Tensor, rot: Tensor, still: dict[int, Tensor], share: Tensor
+) -> Tensor:
+    """Rotations with joints turned in the world by a share `(T)` of the way to how they stay."""
+    rot, world = rot.clone(), _turns(skeleton, root, rot)
+    for j, turn in still.items():
+        wanted = slerp(world[:, j], turn.expand_as(world[:, j]), share)
+        above = world[:, skeleton.parents[j]]
+        rot[:, j] = torch.where(share[:, None] > 0, quat_mul(quat_conj(above), wanted), rot[:, j])
+        world[:, j] = torch.where(share[:, None] > 0, wanted, world[:, j])
+    return rot
+
+
+def _turns(skeleton: Skeleton, root: Tensor, rot: Tensor) -> Tensor:
+    offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
+    return forward_kinematics(skeleton.parents, offsets, root, rot)[1]
 
 
 def _led(clip: Clip, root: Tensor, rot: Tensor, joint: int, goal: Tensor) -> tuple[Tensor, Tensor]:

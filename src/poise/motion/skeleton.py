@@ -122,6 +122,14 @@ class Skeleton:
     def __hash__(self) -> int:
         return hash((self.names, self.parents, self.offsets.tobytes()))
 
+    @property
+    def tips(self) -> tuple[tuple[int, tuple[float, float, float]], ...]:
+        """The `ends` that may be a body's: files have some that are longer than any of their bones, and
+        mean nothing."""
+        bones = [o for o, parent in zip(self.offsets, self.parents, strict=True) if parent >= 0]
+        longest = max((float(np.linalg.norm(o)) for o in bones), default=np.inf)
+        return tuple((j, tip) for j, tip in self.ends if np.linalg.norm(tip) <= longest)
+
     def index(self, name: str) -> int:
         """The index of joint `name`; an unknown name is answered with the nearest one."""
         try:

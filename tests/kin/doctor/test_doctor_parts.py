@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from importlib.resources import as_file, files
 
 import numpy as np
@@ -157,6 +158,15 @@ def test_joints_without_a_body_are_examined_as_far_as_they_can_be() -> None:
     assert values["sides"] is None and values["feet"] is None and values["ground"] is None
     with pytest.raises(PoiseError, match="floor cannot be guessed"):
         grounded(clip, None, None)
+
+
+def test_a_tip_that_no_hand_has_is_not_believed(walk: Clip) -> None:
+    s = walk.skeleton
+    hand = anatomy_of(walk).of("hand")[0]
+    ends = (*((j, tip) for j, tip in s.ends if j != hand), (hand, (0.0, -3.0, 0.0)))
+    odd = walk.replaced(skeleton=replace(s, ends=ends))
+    assert (hand, (0.0, -3.0, 0.0)) not in odd.skeleton.tips and len(odd.skeleton.tips) > 2
+    assert not [f for f in examine(odd).faults if f.kind == "penetration"]
 
 
 def test_a_stated_floor_is_believed_by_the_body() -> None:

@@ -19,7 +19,8 @@ from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
 from poise.jobs.track.pushed import Pushed
 from poise.jobs.track.recovering import Losses
-from poise.jobs.track.simulation import FILE, Simulation
+from poise.jobs.track.simulation import FILE, Retake, Simulation
+from poise.jobs.track.splice import changed_s, spliced, written_as
 from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
 from poise.kin.directed import Pin, pinned
@@ -64,7 +65,8 @@ class Tracked(Result):
     what became of each of several clips; none where it was one. supports: what stands in the world for
     the motion to rest on, in the world of the body. pins: limbs that stay put. simulation: the states of
     a single character on a single clip, of which a part can be simulated anew (`Retake`). pushed: what
-    came of a push; None without one.
+    came of a push; None without one. undirected: the motion before pins and touch points led it; None
+    without any. retake: the part that was simulated anew; None where all was simulated.
     """
 
     tracker: Tracker
@@ -82,6 +84,8 @@ class Tracked(Result):
     pins: tuple[Pin, ...] = ()
     simulation: Simulation | None = None
     pushed: Pushed | None = None
+    undirected: Clip | None = None
+    retake: Retake | None = None
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -96,7 +100,8 @@ class Tracked(Result):
     @cached_property
     def finished(self) -> Delivery:
         """What is written, standing feet held: made once, for the card and for the files."""
-        return finished(self.imitation, self.evaluation, True, self.placed.source, self.at_home)
+        source, before = self.placed.source, self.undirected
+        return finished(self.imitation, self.evaluation, True, source, self.at_home, before)
 
     @property
     def clip(self) -> Clip:
@@ -112,12 +117,26 @@ class Tracked(Result):
 
     def at_home(self, motion: Clip, hold: bool) -> Clip:
         """A motion of the body on the skeleton that came in. hold: limbs that stay put are led
-        there, and feet that still slide are held, see `settled`."""
+        there, and feet that still slide are held, see `settled`. Where a part was simulated anew, all
+        else is as it was."""
         if self.placed.moved is not None:
             motion = home(motion, self.placed, self.tracker).replaced(name=motion.name)
-        if not hold:
-            return motion
-        return pinned(motion, self.pins) if self.pins else settled(motion, self.placed.source)
+        if hold:
+            motion = pinned(motion, self.pins) if self.pins else settled(motion, self.placed.source)
+        return motion if self.retake is None else self._as_it_was(motion, self.retake, hold)
+
+    def _as_it_was(self, motion: Clip, retake: Retake, hold: bool) -> Clip:
+        """The motion with all that was not simulated anew as it was written, or would be."""
+        before, recordings = retake.opened(), self.evaluation.recordings
+        assert self.simulation is not None
+        span = changed_s(before, self.simulation)
+        earlier = None
+        if hold and not isinstance(retake.of, Simulation):
+            earlier = written_as(Path(retake.of), motion)
+        if earlier is None:
+            was = replace(self.evaluation, recordings=[replace(recordings[0], qpos=before.qpos.numpy())])
+            earlier = replace(self, evaluation=was, retake=None).delivered(0, hold)
+        return spliced(earlier, motion, span)
 
     def _shown(self) -> Shown:
         return Shown(self.clip, self.placed.source, self.card, self.notes)

@@ -95,7 +95,7 @@ def track(
     motions = [read_motion(m) for m in motions]
     motion = motions[0]
     given, points = _input(motion, config)
-    given, directions = config.direction.applied(given)
+    undirected, (given, directions) = given, config.direction.applied(given)
     several = len(motions) > 1
     if config.recover or several:
         all_placed = place_all([given, *(_input(m, config)[0] for m in motions[1:])], tracker)
@@ -172,6 +172,7 @@ def track(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
         done.controller, parts, supports, config.direction.pins,
         None if several or config.recover else done.simulation, done.pushed,
+        undirected if config.direction else None, config.retake,
     )  # fmt: skip
 
 

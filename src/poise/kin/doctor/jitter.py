@@ -116,7 +116,7 @@ def _bones(clip: Clip) -> list[list[Tensor]]:
     for j, parent in enumerate(skeleton.parents):
         if parent >= 0:
             out[parent].append(torch.tensor(skeleton.offsets[j]))
-    for j, tip in skeleton.ends:
+    for j, tip in skeleton.tips:
         out[j].append(torch.tensor(tip, dtype=torch.float64))
     return [
         sorted((v for v in b if float(v.norm()) > 0.01), key=lambda v: -float(v.norm())) for b in out

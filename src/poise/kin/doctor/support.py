@@ -139,7 +139,7 @@ def _low_points(
     joints = list(dict.fromkeys([p.joint for p in anatomy.parts] + [j for _, j in anatomy.toes]))
     columns, margins = [pos[:, j, 2] for j in joints], [JOINT_M] * len(joints)
     names = [skeleton.names[j] for j in joints]
-    for j, tip in skeleton.ends:
+    for j, tip in skeleton.tips:
         if j in joints:
             columns.append(carried(pos[:, j], quat[:, j], tip)[:, 2])
             margins.append(TIP_M)
