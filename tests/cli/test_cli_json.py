@@ -125,3 +125,21 @@ def test_the_page_documents_every_key_and_verb() -> None:
     assert tuple(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)[: len(KEYS)]) == KEYS
     for verb in VERBS:
         assert hasattr(import_module(f"poise.cli.{verb}").Options, "json") and f"`{verb}`" in page
+
+
+def test_live_says_on_stderr_where_the_page_is(short: Path, tmp_path: Path, capfd) -> None:
+    argv = [
+        "live",
+        str(short),
+        "--seconds",
+        "0.2",
+        "--port",
+        "0",
+        "-o",
+        str(tmp_path / "o.bvh"),
+        "--json",
+    ]
+    assert main(argv) == 0
+    out, err = capfd.readouterr()
+    assert re.search(r"Poise live: http://127\.0\.0\.1:\d+", err) and "Poise live:" not in out
+    check(json.loads(out))

@@ -196,6 +196,15 @@ def test_convert_and_resample(
     assert facts["frames"] == 8 and facts["fps"] == pytest.approx(15.0)
 
 
+def test_convert_takes_a_part(clip: Path, tmp_path: Path, answered, refused) -> None:
+    whole, part = poise.read(clip), tmp_path / "part.bvh"
+    assert answered("convert", clip, part, "--frames", "2-7")["result"]["frames"] == 6
+    got = poise.read(part)
+    np.testing.assert_allclose(got.root_pos, whole.root_pos[2:8], atol=1e-5)
+    for words in ("7-2", "0-9999", "-1-3", "a-b", "3"):
+        refused("convert", clip, tmp_path / "x.bvh", f"--frames={words}", words=("--frames",))
+
+
 def test_convert_refuses_unknown_suffixes_and_itself(clip: Path, tmp_path: Path, refused) -> None:
     refused("convert", clip, tmp_path / "x.fbx", words=("fbx", ".bvh"))
     refused("convert", clip, clip, words=("over itself",))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from poise.cli.answer import LOST, Answer
-from poise.cli.console import print_card, say, table
+from poise.cli.console import print_card, say, table, tell
 from poise.cli.inbetween import frames_of
 from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import claimed, places
@@ -21,6 +21,10 @@ from poise.jobs.keep import may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.complete import Completed
+    from poise.motion import Clip
+
+#: s outside the keyframes that are worth a sentence.
+LONG_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     clip = o.reading.read(o.clip)
     keys = tuple(range(clip.frames)) if every else keys
     check_keyframes(keys, clip.frames, str(o.clip))
+    _beside(keys, clip, o.clip)
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
     with claimed(out):
@@ -142,6 +147,17 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     word = "lost" if lost else "completed"
     told = (*done.notes, *delivered.notes)
     return Answer(result, delivered.paths, told, LOST if lost else 0, word, delivered.card.mpjpe_mm)
+
+
+def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:
+    """Says how much is simulated before the first keyframe and after the last, where that is most."""
+    first, last = min(keys, default=0), max(keys, default=clip.frames - 1)
+    beside = clip.frames - 1 - (last - first)
+    if beside > max(last - first, LONG_S * clip.fps):
+        tell(
+            f"{beside / clip.fps:.1f} s lie outside the keyframes and are simulated as they are; "
+            f"poise convert {path.name} part.bvh --frames {first}-{last} leaves them out."
+        )
 
 
 def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:

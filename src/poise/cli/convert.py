@@ -20,7 +20,7 @@ from poise.jobs.keep import may_write
 
 @dataclass(frozen=True)
 class Options:
-    """Write a motion file in another format or at another frame rate."""
+    """Write a motion file in another format or at another frame rate, or a part of it."""
 
     source: Annotated[Positional[Path], arg(metavar="IN")]
     """The motion file to read, or a folder of such files."""
@@ -30,6 +30,8 @@ class Options:
     """The same as OUT."""
     resample: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None
     """Frames per second of the result."""
+    frames: Annotated[str | None, arg(metavar="A-B", help_behavior_hint="")] = None
+    """Only the frames from A to B, both of them, counted from 0 as they are read."""
     to: Annotated[str, arg(metavar="FORMAT")] = "bvh"
     """The format of the files that are made of a folder: bvh, glb, npz, ..."""
     force: Flag = False
@@ -41,7 +43,7 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads, resamples where asked to, writes."""
-    from poise.motion import resample
+    from poise.motion import resample, trim
     from poise.motion.io import check_writable, write_clip
 
     target = target_of(options)
@@ -58,6 +60,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             return each("convert", (options.source,), target, one)
     may_write(target, options.force, options.source)
     clip = options.reading.read(options.source)
+    if options.frames is not None:
+        first, last = _span(options.frames, clip.frames, options.source)
+        clip = trim(clip, first, last + 1)
     if options.resample is not None:
         clip = resample(clip, options.resample)
     write_clip(clip, target)
@@ -65,6 +70,18 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     figures = {"frames": clip.frames, "fps": clip.fps, "seconds": clip.seconds}
     notes, outcome = clip.skeleton.source.notes, f"{clip.frames} frames"
     return Answer(figures, {"clip": target}, notes, outcome=outcome)
+
+
+def _span(words: str, frames: int, where: Path) -> tuple[int, int]:
+    """The first and the last frame that are wanted."""
+    try:
+        first, last = (int(w) for w in words.split("-"))
+    except ValueError:
+        raise PoiseError(f"--frames '{words}' makes no sense", hint="Write --frames 30-240") from None
+    if not 0 <= first < last < frames:
+        what = f"--frames must rise within 0 to {frames - 1}, got {words}"
+        raise PoiseError(what, where, "Two frames are the fewest")
+    return first, last
 
 
 def target_of(options: Options) -> Path:
