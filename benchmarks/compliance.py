@@ -241,7 +241,7 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
         for way, given in ways.items():
             own = given if isinstance(given, Learned) else None
             how = None if isinstance(given, Learned) else given
-            seconds = 30.0 if isinstance(scene, Balance) else 8.0
+            seconds = 20.0 if isinstance(scene, Balance) else 8.0
             made = play(scene, tracker, None, how, 8, seconds, threads, learned=own)
             rows["without"] = dict(made.stiff)
             rows[way] = dict(made.figures)

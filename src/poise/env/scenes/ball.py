@@ -12,7 +12,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.control import Compliance, Stiffness
-from poise.env.events import InScene, Pushes, Switch, always
+from poise.env.events import InScene, Pushes, Switch, near
 from poise.env.events.event import Drawn
 from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.goals.displaced import DisplacedGoal
@@ -29,6 +29,8 @@ from poise.spatial import heading_quat, into_heading, quat_rotate
 SHARPNESS = 2.0
 #: m above the head's joint where the rod stands.
 UP_M = 0.2
+#: m by which the rod's middle may be farther from the head when it is put there.
+NEAR_M = 0.15
 #: N for a fictional force of 1 that a policy asks for, and the most of one.
 UNIT_N, MOST_N = 100.0, 150.0
 #: Of the linear law, N/m and N s/m.
@@ -89,9 +91,11 @@ class Balance:
         to = quat_rotate(pose.quat[0, head] * torch.tensor([1.0, -1.0, -1.0, -1.0]), up)
         a, b, c = (float(v) for v in to)
         link = Link("stands", humanoid.bodies[head], top.name, "ball", to=(a, b, c))
+        close = near(humanoid.bodies[head], top.name, UP_M + self.length + NEAR_M)
+        stands = Switch(link.name, lambda sim: close(sim) & ~leans(sim), leans)
         part = InScene(
             sees=(top.name,),
-            events=(Tilted(top, self.spread, self.seed), Switch(link.name, always)),
+            events=(Tilted(top, self.spread, self.seed), stands),
         )
         chest = (humanoid.rows_of("spine") or (0,))[-1]
         force, rate = (self.pushes, self.pushes), reference.rate_hz
@@ -218,6 +222,11 @@ def tipped(sim: SceneSim, length: float) -> tuple[Tensor, Tensor]:
     arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
     qvel = state.qvel[:, place.dofs]
     return pos + arm, qvel[:, :3] + torch.linalg.cross(quat_rotate(quat, qvel[:, 3:]), arm)
+
+
+def leans(sim: SceneSim) -> Tensor:
+    """`(N,)` bool: the rod leans by more than 45 degrees, and falls off the head."""
+    return upright_of(sim) < COS_45
 
 
 def upright_of(sim: SceneSim) -> Tensor:
