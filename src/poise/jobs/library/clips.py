@@ -43,7 +43,7 @@ class LibraryConfig:
         leave_out: of clips that are not taken.
         skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
         rates: (pattern, frames per second) pairs for files that state none or a wrong one.
-        allow_pickle: pickled files that are given by name are read too.
+        allow_pickle: pickled files are read too, `.pkl` where they are given by name.
         level: feet are turned to stand flat on the humanoid's soles, see `level_feet`, which motion that
             is not simulated has no need of.
         mirror: each clip is taken in a mirror, too.

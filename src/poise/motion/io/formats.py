@@ -48,14 +48,15 @@ from poise.motion.io.usd.write import write_usd
 class Reader:
     """A format: its name, its suffixes, whether a file's first bytes look like it, its reader.
 
-    asks: the file is read only when it is named (and a flag allows it), never found in a folder.
+    asks: suffixes of files that are read only when they are named (and a flag allows it), never found
+    in a folder.
     """
 
     name: str
     suffixes: tuple[str, ...]
     looks_like: Callable[[bytes], bool]
     read: Callable[[Path, ReadOptions], Clip]
-    asks: bool = False
+    asks: tuple[str, ...] = ()
 
 
 def _looks_like_bvh(head: bytes) -> bool:
@@ -97,15 +98,15 @@ READERS = (
         (".pkl", ".npy"),
         looks_like_pickle,
         read_pickled,
-        asks=True,
+        asks=(".pkl",),
     ),
     Reader("TRC keypoints", (".trc",), looks_like_trc, as_clip(trc_points)),
     Reader("C3D markers", (".c3d",), looks_like_c3d, as_clip(c3d_points)),
-    Reader("OpenPose", (), looks_like_openpose, refuse_openpose, asks=True),
+    Reader("OpenPose", (), looks_like_openpose, refuse_openpose),
     Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
     Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
     Reader("CSV keypoints", (".csv",), looks_like_points_csv, as_clip(csv_points)),
-    Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
+    Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=(".csv", ".h5")),
 )
 #: Readers that only say what to give instead.
 _REFUSERS = ("ASF", "robot", "OpenPose")
