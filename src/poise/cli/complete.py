@@ -14,10 +14,10 @@ from poise.cli.answer import LOST, Answer
 from poise.cli.console import print_card, say, table
 from poise.cli.inbetween import frames_of
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed, places
+from poise.cli.output import places
 from poise.cli.progress import staged, working
 from poise.errors import PoiseError
-from poise.jobs.keep import may_deliver, may_write
+from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.complete import Completed

@@ -14,10 +14,10 @@ from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.console import print_card, say, tell
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed, places
+from poise.cli.output import places
 from poise.cli.progress import clock, showing, staged, working
 from poise.errors import PoiseError
-from poise.jobs.keep import may_deliver, may_write
+from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress
