@@ -158,7 +158,8 @@ def test_results_are_refused_where_no_folder_can_be(tmp_path: Path, monkeypatch)
     with pytest.raises(PoiseError, match="nothing to write"):
         _Made(fails=True).save(tmp_path / "new/deep")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["keep", "keep.txt"]
-    assert set(_Made().save(tmp_path / "new/deep")) == {"simulated"}
+    for name in ("new/deep", "run_v1.0"):
+        assert set(_Made().save(tmp_path / name)) == {"simulated"}
 
     def denied(*given: Any, **named: Any) -> NoReturn:
         raise PermissionError(errno.EACCES, "Permission denied")

@@ -10,7 +10,7 @@ from poise.eval import ScoreCard
 from poise.eval import table as rows_of
 from poise.jobs.keep import claimed, may_deliver, may_write, refusing
 from poise.motion import Clip, read_clip
-from poise.motion.io import check_writable, write_clip
+from poise.motion.io import check_writable, names_file, write_clip
 from poise.view.notebook import result_html
 
 
@@ -50,7 +50,7 @@ class Result(ABC):
         """
         path = Path(path)
         with refusing(path):
-            to_file = bool(path.suffix) and not path.is_dir()
+            to_file = names_file(path) and not path.is_dir()
             if to_file:
                 check_writable(path)
                 may_write(path, force, flag="force=True")

@@ -6,6 +6,7 @@ from poise.motion.io.formats import (
     WRITERS,
     check_writable,
     home_suffix,
+    names_file,
     read_clip,
     write_clip,
 )
@@ -16,6 +17,7 @@ __all__ = [
     "WRITERS",
     "check_writable",
     "home_suffix",
+    "names_file",
     "read_clip",
     "write_bvh",
     "write_clip",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -232,6 +233,14 @@ def home_suffix(clip: Clip) -> str:
     ".glb" for glTF, ".usda" for USD, ".npz" for AMASS, ".bvh" for all others.
     """
     return _HOME.get(clip.skeleton.source.format, ".bvh")
+
+
+def names_file(path: Path) -> bool:
+    """Whether a path is that of a file: its suffix is one of a motion format, or one to five letters as
+    files have them. `run_v1.0` and `take.2` are folders."""
+    suffix = path.suffix.lower()
+    known = {*WRITERS, *(s for r in READERS for s in r.suffixes)}
+    return suffix in known or re.fullmatch(r"\.([a-z]{1,5}|[a-z]{2,4}\d)", suffix) is not None
 
 
 def check_writable(path: Path) -> None:
