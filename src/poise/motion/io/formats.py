@@ -211,10 +211,11 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh` and the like.
+    """Writes a clip in the format of the file's suffix, in place of a file that is there.
 
-    `.npz`: a clip that came from the SMPL family is written with the keys of AMASS, any other as
-    Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the one or the other.
+    See `write_bvh` and the like. `.npz`: a clip that came from the SMPL family is written with the keys
+    of AMASS, any other as Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the
+    one or the other.
 
     Raises:
         PoiseError: an unknown suffix (the known ones are listed) or a folder that cannot be written.
