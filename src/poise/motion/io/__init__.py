@@ -8,6 +8,7 @@ from poise.motion.io.formats import (
     home_suffix,
     names_file,
     read_clip,
+    read_skeleton,
     write_clip,
 )
 from poise.motion.io.gltf.write import write_gltf
@@ -19,6 +20,7 @@ __all__ = [
     "home_suffix",
     "names_file",
     "read_clip",
+    "read_skeleton",
     "write_bvh",
     "write_clip",
     "write_gltf",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from poise.errors import PoiseError, brief
 from poise.motion.clip import Clip
-from poise.motion.io.acclaim.amc import read_amc
+from poise.motion.io.acclaim.amc import read_amc, read_asf
 from poise.motion.io.angles.deepmimic import read_deepmimic
 from poise.motion.io.angles.opensim import looks_like_mot, read_mot
 from poise.motion.io.bvh.read import read_bvh
@@ -168,6 +168,24 @@ def read_clip(
         raise brief(error, path) from None
     except MemoryError:
         raise PoiseError("the file needs more memory than there is", path, "Cut it shorter") from None
+
+
+def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
+    """A clip that shows a skeleton and how it stands: that of a motion file, or the rest pose of an ASF.
+
+    Args:
+        skeleton: the ASF file of an AMC, see `read_clip`.
+
+    Raises:
+        PoiseError: see `read_clip`.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".asf" or path.is_dir():
+        return read_clip(path, skeleton=skeleton)
+    try:
+        return read_asf(path)
+    except PoiseError as error:
+        raise brief(error, path) from None
 
 
 def _reader_of(path: Path) -> Reader:
