@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from tiny_clips import bvh, put
 
-from poise.cli.doctor_motion import worsened
+from poise.cli.doctor_motion import _hidden_rate, worsened
 from poise.cli.info import _guess
 from poise.cli.main import main
-from poise.kin import Examination
+from poise.kin import Examination, Fault
 from poise.motion import read_clip, shifted, write_clip
 
 WALK = Path(str(files("poise") / "data/walk.bvh"))
@@ -73,6 +73,30 @@ def test_fix_writes_the_clip_without_its_faults(broken: Path, tmp_path: Path, ca
     mended, original = read_clip(target), read_clip(WALK)
     assert mended.skeleton.names == original.skeleton.names and mended.fps == original.fps
     assert np.linalg.norm(mended.positions() - original.positions(), axis=-1).max() < 0.03
+
+
+def test_after_is_what_doctor_says_of_the_written_file(tmp_path: Path, capsys) -> None:
+    """A T-pose before the motion is left out when it is read, so that the written file has none."""
+    clip = read_clip(WALK)
+    root, rot = (np.concatenate((x[:1], x)) for x in (clip.root_pos, clip.rot))
+    rot[:1] = [1.0, 0.0, 0.0, 0.0]
+    source, target = tmp_path / "rest.bvh", tmp_path / "mended.bvh"
+    write_clip(clip.replaced(root_pos=root, rot=rot), source)
+    facts = json.loads(said(capsys, "doctor", source, "--fix", "-o", target, "--json"))["result"]
+    assert "rest frame" in {f["kind"] for f in facts["faults"]}
+    again = json.loads(said(capsys, "doctor", target, "--json"))["result"]
+    assert {k: facts["fixed"][k] for k in ("faults", "figures", "frames")} == {
+        k: again[k] for k in ("faults", "figures", "frames")
+    }
+    assert again["faults"] == []
+
+
+def test_a_rate_that_is_no_longer_told_is_not_mended() -> None:
+    rate = Fault("frame rate", "", 0, 9, 60.0)
+    with_it, without = Examination((rate,), {}, True), Examination((), {}, True)
+    assert "was not changed" in _hidden_rate(with_it, without)
+    assert "--fps 60." in _hidden_rate(with_it, without)
+    assert _hidden_rate(with_it, with_it) == _hidden_rate(without, without) == ""
 
 
 def test_fix_shows_before_and_after(broken: Path, tmp_path: Path, capsys) -> None:

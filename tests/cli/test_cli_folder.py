@@ -5,15 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tiny_clips import deepmimic, put
 
 from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.folder import each
 from poise.cli.main import main
+from poise.jobs.library.files import motion_files_of
+from poise.jobs.library.folder import library_of
 from poise.motion import read_clip, trim, write_clip
 from poise.motion.io.refused import LOOKED_AT, refuse_flat_folder
 from toy_policy import WALK, toy_run
+
+#: The walk's joints in the order of SMPL's.
+SMPL = (
+    *("Hips", "LeftUpLeg", "RightUpLeg", "Spine", "LeftLeg", "RightLeg", "Spine1", "LeftFoot"),
+    *("RightFoot", "Spine2", "LeftToe", "RightToe", "Neck", "LeftShoulder", "RightShoulder", "Head"),
+    *("LeftArm", "RightArm", "LeftForeArm", "RightForeArm", "LeftHand", "RightHand"),
+)
 
 
 @pytest.fixture
@@ -26,6 +36,13 @@ def folder(tmp_path: Path) -> Path:
     put(root, "notes.md", "no motion")
     put(root, "broken.bvh", "HIERARCHY\n")
     return root
+
+
+def smpl_joints() -> np.ndarray:
+    """`(30, 22, 3)` the places of SMPL's joints in a walk."""
+    clip = trim(read_clip(WALK), 0, 30)
+    at = [clip.skeleton.names.index(name) for name in SMPL]
+    return clip.positions()[:, at]
 
 
 def states(found: dict) -> dict[str, int]:
@@ -47,6 +64,17 @@ def test_info_convert_and_doctor(folder: Path, tmp_path: Path, answered, capsys)
     assert main(["convert", str(folder), str(out), "--to", "glb"]) == 2
     said = capsys.readouterr()
     assert "refused" in said.out and "--force" in said.out and "2 of 2  walk" in said.err
+
+
+def test_arrays_are_read_like_other_files(tmp_path: Path, answered) -> None:
+    for name, array in {
+        "x": smpl_joints(), "features": np.zeros((20, 263)), "Mean": np.zeros(263), "n": np.array(3),
+    }.items():  # fmt: skip
+        np.save(tmp_path / f"{name}.npy", array)
+    assert states(answered("info", tmp_path, code=2)) == {"x": 0, "features": 2}
+    assert [f.path.stem for f in motion_files_of(tmp_path)] == ["features", "x"]
+    library, report = library_of(tmp_path, fps=20.0)
+    assert len(library.clips) == 1 and "features of HumanML3D" in " ".join(report.sentences())
 
 
 def test_track_says_which_were_lost(folder: Path, tmp_path: Path, answered, capsys) -> None:

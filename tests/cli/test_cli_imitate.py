@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 
 from poise.cli.main import main
-from poise.cli.output import claimed
 from poise.cli.progress import clock
 from poise.cli.training import command_line
 from poise.errors import PoiseError
 from poise.eval import TRACKING
+from poise.jobs.keep import claimed
 from poise.learn import CloneConfig
 
 MINIATURE = ["--envs", "16", "--threads", "1"]

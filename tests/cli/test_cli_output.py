@@ -15,12 +15,16 @@ from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 
 
-def test_names_with_dots() -> None:
+def test_names_with_dots(tmp_path: Path) -> None:
+    (tmp_path / "there.xyz").mkdir()
     assert places(Path("run_v1.0")) == (Path("run_v1.0"), None)
     assert places(Path("a.b/result")) == (Path("a.b/result"), None)
     assert places(Path("out.v2.bvh")) == (Path("out.v2"), Path("out.v2.bvh"))
     assert places(Path("out.GLB")) == (Path("out"), Path("out.GLB"))
-    for name in ("out.amc", "out.trc", "out.fbx"):
+    assert places(Path("take.2")) == (Path("take.2"), None)
+    assert places(Path("take.v2")) == (Path("take.v2"), None)
+    assert places(tmp_path / "there.xyz") == (tmp_path / "there.xyz", None)
+    for name in ("out.amc", "out.trc", "out.fbx", "out.xyz", "out.BVHX", "out.mp4", "out.h5"):
         with pytest.raises(PoiseError, match="cannot be written"):
             places(Path(name))
 

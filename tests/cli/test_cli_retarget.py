@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from tiny_clips import bvh, put
 
+from poise.body import BodyConfig
 from poise.cli.main import main
 from poise.cli.retarget import pairs
 from poise.errors import PoiseError
+from poise.jobs.library.clips import target_of
 from poise.motion import Clip, Skeleton, read_clip, write_clip
 from toy_human import human, swing
 
@@ -50,6 +52,22 @@ def test_a_clip_goes_onto_the_skeleton_of_another_file(files, tmp_path: Path, ca
         ]
         units = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in lines]
         assert np.degrees(np.arccos(np.clip((units[0] * units[1]).sum(-1), -1, 1))).max() < 3.0
+
+
+def test_a_clip_goes_onto_an_asf_skeleton(files, tmp_path: Path, data_dir: Path, capsys) -> None:
+    rig, made = data_dir / "cmu_amc/02/02.asf", []
+    for k, onto in enumerate((rig, rig.with_name("02_01.amc"))):
+        out = tmp_path / f"{k}.bvh"
+        assert main(["retarget", str(files[0]), "--onto", str(onto), "-o", str(out)]) == 0
+        made.append(read_clip(out))
+    assert "lfemur" in made[0].skeleton.names and made[0].skeleton.names == made[1].skeleton.names
+    np.testing.assert_allclose(made[0].positions(), made[1].positions(), atol=1e-4)
+    target = target_of(rig, [], BodyConfig())
+    assert target.skeleton.names == made[0].skeleton.names and target.example is not None
+    broken = put(tmp_path, "broken.asf", ":version 1.10\n")
+    capsys.readouterr()
+    argv = ["retarget", str(files[0]), "--onto", str(broken), "-o", str(tmp_path / "x.bvh")]
+    assert main(argv) == 2 and str(broken) in capsys.readouterr().err
 
 
 def test_the_report_can_be_json_alone(files, tmp_path: Path, capsys) -> None:

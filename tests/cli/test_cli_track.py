@@ -85,6 +85,7 @@ def test_a_motion_that_is_lost_is_learned(
     said = capsys.readouterr()
     assert "loses the motion at" in said.err and "minutes at most" in said.err
     assert "it gets to" in said.err and "Learned 0:0" in said.err
+    assert f"{tmp_path / 'made/learned'}\n" in said.out
     assert out.exists() and (tmp_path / "made/learned/policy.safetensors").exists()
     assert file.read_bytes() == before
     score = json.loads((tmp_path / "made/score.json").read_text())

@@ -113,6 +113,28 @@ def test_words_of_a_director(tracker: Tracker) -> None:
         rows_of(table, "hadns")
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((("tail=3",), (), ()), "there is no part 'tail'"),
+        ((("head=2:900-950",), (), ()), "head counts from frame 900 on, and the clip has 0 to 30"),
+        (((), ("left_foot:20-40",), ()), "frames 20 to 40, and the clip has 0 to 30"),
+        (((), (), ("right_hand:900:0,0,1",)), "frames 900 to 900, and the clip has 0 to 30"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_before_gaps_are_filled(
+    tracker: Tracker, words: tuple, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def filled(*given: object, **named: object) -> None:
+        raise AssertionError("gaps were filled")
+
+    monkeypatch.setattr(completing, "inbetween", filled)
+    with pytest.raises(PoiseError, match=message):
+        complete(swing(1.0), (0, 15, 30), tracker, direction=direction_of(*words))
+    with pytest.raises(PoiseError, match=message):
+        track(swing(1.0), tracker, direction=direction_of(*words))
+
+
 def test_weights_and_pins_in_a_simulation(tracker: Tracker) -> None:
     clip = swing(1.5, speed=0.3)
     plain = track(clip, tracker, controller="lookahead", lookahead=FEW, supports="none", threads=1)

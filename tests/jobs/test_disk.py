@@ -15,6 +15,7 @@ import pytest
 import poise
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
+from poise.jobs.result import Result, Shown
 from poise.jobs.runs import train
 from poise.learn import Until
 from poise.motion import Clip, read_clip, trim, write_clip
@@ -126,3 +127,46 @@ def test_run_files_that_are_cut_are_refused_and_left_as_they_are(tmp_path: Path,
             train(open_run(folder).task, folder, Until(iterations=9), threads=1, tensorboard=False)
         assert "\n" not in str(error.value)
         assert {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()} == before
+
+
+class _Made(Result):
+    """A result that writes one file, or fails."""
+
+    def __init__(self, fails: bool = False) -> None:
+        self.fails = fails
+
+    def _shown(self) -> Shown:
+        clip = trim(read_clip(WALK), 0, 3)
+        return Shown(clip, clip, None, ())
+
+    def _save_all(self, folder: Path) -> dict[str, Path]:
+        if self.fails:
+            raise PoiseError("nothing to write")
+        write_clip(self._shown().clip, folder / "simulated.bvh")
+        return {"simulated": folder / "simulated.bvh"}
+
+
+def test_results_are_refused_where_no_folder_can_be(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "keep.txt").write_text("kept")
+    (tmp_path / "keep").write_text("kept")
+    for name in ("keep.txt/x", "keep.txt/x/y", "keep"):
+        with pytest.raises(PoiseError, match=r"cannot be made, since .*keep.* is a file. Choose"):
+            _Made().save(tmp_path / name)
+    for name in ("keep.txt/x.bvh", "keep.txt/x.glb", "a\0b", "n" * 300):
+        with pytest.raises(PoiseError, match="cannot be written"):
+            _Made().save(tmp_path / name)
+    with pytest.raises(PoiseError, match="nothing to write"):
+        _Made(fails=True).save(tmp_path / "new/deep")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["keep", "keep.txt"]
+    for name in ("new/deep", "run_v1.0"):
+        assert set(_Made().save(tmp_path / name)) == {"simulated"}
+
+    def denied(*given: Any, **named: Any) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", denied)
+    with pytest.raises(PoiseError, match=r"other: cannot be written \(permission denied\)"):
+        _Made().save(tmp_path / "other")
+    monkeypatch.setattr(Path, "exists", denied)
+    with pytest.raises(PoiseError, match=r"other.bvh: cannot be written \(permission denied\)"):
+        _Made().save(tmp_path / "other.bvh")

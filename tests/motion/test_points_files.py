@@ -283,8 +283,27 @@ def test_joints_with_their_rate_are_read_as_joints_alone(tmp_path: Path) -> None
     stated = read_clip(tmp_path / "a.npy", fps=30.0, unit_m=1.0)
     assert dict(stated.skeleton.source.evidence)["unit"] == "Stated with --unit"
     bad = save_npz(tmp_path / "b.npz", {"joints": points[:, :9], "fps": np.array(30.0)})
-    with pytest.raises(PoiseError, match="others need positions, names and fps"):
+    with pytest.raises(PoiseError, match="others need names"):
         read_clip(bad)
+
+
+def test_joints_go_by_their_names_where_they_have_some(tmp_path: Path) -> None:
+    points = read_clip(save_npz(tmp_path / "smpl.npz", amass(66))).positions()
+    names, turned = np.array(HUMANML3D), np.random.default_rng(0).permutation(22)
+    sound = read_clip(save_npz(tmp_path / "a.npz", {"joints": points, "fps": np.array(30.0)}))
+    for key in ("names", "joint_names"):
+        data = {"joints": points[:, turned], "fps": np.array(30.0), key: names[turned]}
+        clip = read_clip(save_npz(tmp_path / f"{key}.npz", data))
+        assert clip.skeleton.source.format == "joints"
+        heads = (c.positions()[:, c.skeleton.index("Head")] for c in (clip, sound))
+        assert np.abs(next(heads) - next(heads)).max() < 0.02
+    for wrong, said in (
+        (names[:21], "it has 21 names and 22 keypoints"),
+        (np.array([f"j{k}" for k in range(22)]), "no keypoint is the left hip"),
+    ):
+        data = {"joints": points, "fps": np.array(30.0), "names": wrong}
+        with pytest.raises(PoiseError, match=said):
+            read_clip(save_npz(tmp_path / "b.npz", data))
 
 
 def write_c3d(path: Path, positions: np.ndarray, names: tuple[str, ...], unit: str = "mm") -> None:

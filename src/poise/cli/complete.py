@@ -14,10 +14,10 @@ from poise.cli.answer import LOST, Answer
 from poise.cli.console import print_card, say, table, tell
 from poise.cli.inbetween import frames_of
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed, places
+from poise.cli.output import places
 from poise.cli.progress import staged, working
 from poise.errors import PoiseError
-from poise.jobs.keep import may_deliver, may_write
+from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.complete import Completed
@@ -165,11 +165,11 @@ def _kinematic(o: Options, keys: tuple[int, ...]) -> Answer:
     if o.partial or o.weight or o.pin or o.touch or o.retime or o.span or o.earlier:
         raise PoiseError("--kinematic has no body to direct or to wait for", hint="Leave it out")
     from poise.jobs.inbetween.fill import inbetween
-    from poise.motion.io import check_writable, write_clip
+    from poise.motion.io import check_writable, names_file, write_clip
     from poise.synth.gaps import check_keyframes
     from poise.synth.sparse import timed, times_of
 
-    path = o.out if o.out.suffix else o.out / f"filled{o.clip.suffix}"
+    path = o.out if names_file(o.out) and not o.out.is_dir() else o.out / f"filled{o.clip.suffix}"
     check_writable(path)
     may_write(path, o.force, o.clip)
     clip = o.reading.read(o.clip)

@@ -13,9 +13,8 @@ from poise.cli.answer import Answer
 from poise.cli.console import say
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading
-from poise.cli.output import claimed
 from poise.errors import PoiseError
-from poise.jobs.keep import may_write
+from poise.jobs.keep import claimed, may_write
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from poise.cli.answer import Answer
 from poise.cli.console import out, say
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading
-from poise.cli.output import claimed
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 from poise.machine import cores
 
 State = Literal["ok", "missing", "optional"]

@@ -36,7 +36,7 @@ def run_on(path: Path, options: Options) -> Answer:
     """Examines, mends and writes where asked to; exit code 0 whatever was found."""
     fix, rest, target = options.fix, options.rest_pose, options.out
     from poise.kin import examine, heal
-    from poise.motion.io import check_writable, write_clip
+    from poise.motion.io import check_writable, read_clip, write_clip
 
     if (fix or rest) != (target is not None):
         asked = "--fix" if fix or not rest else "--rest-pose"
@@ -62,9 +62,11 @@ def run_on(path: Path, options: Options) -> Answer:
         frames = f"joints' frames turned by {turned:.0f} degrees"
         said = f"The rest pose is a T-pose now ({found_from}); {frames}."
     write_clip(written, target)
-    left = examine(healed)
+    # What `poise doctor` says of the file that was written: reading may leave frames out, for example.
+    again = read_clip(target)
+    left = examine(again)
     moved = _root_moved(clip, healed)
-    facts["fixed"] = {"clip": str(target), "frames": healed.frames, **left.to_dict()}
+    facts["fixed"] = {"clip": str(target), "frames": again.frames, **left.to_dict()}
     facts["fixed"]["root_moved"] = moved
     facts["fixed"]["worse"] = worsened(found, left) if fix else []
     if rest:
@@ -80,6 +82,8 @@ def run_on(path: Path, options: Options) -> Answer:
             f"The root moved by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and ends "
             f"{moved['end_mm']:.0f} mm from where it ended."
         )
+    if rate := _hidden_rate(found, left):
+        say(rate)
     _written(clip, healed, found, left)
     return Answer(facts, {"clip": target}, outcome=f"{outcome}, {len(left.faults)} after")
 
@@ -142,6 +146,17 @@ def worsened(found: Examination, left: Examination) -> list[str]:
         if after > max(WORSE * before, before + LEAST[unit]):
             out.append(f"{title} ({before:,.{digits}f} to {after:,.{digits}f} {unit})")
     return out
+
+
+def _hidden_rate(found: Examination, left: Examination) -> str:
+    """That the frame rate is what it was, where the mended motion no longer speaks against it."""
+    rates = [next((f.size for f in e.faults if f.kind == "frame rate"), None) for e in (found, left)]
+    if rates[0] is None or rates[1] is not None:
+        return ""
+    return (
+        "The frame rate was not changed; the mended motion no longer tells that it is wrong. If it is, "
+        f"mend the clip with --fps {rates[0]:g}."
+    )
 
 
 def _root_moved(clip: Clip, healed: Clip) -> dict[str, Any] | None:

@@ -13,10 +13,10 @@ from tyro.conf import OmitArgPrefixes, arg
 from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.console import say, table
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed, places
+from poise.cli.output import places
 from poise.cli.progress import staged, working
 from poise.errors import PoiseError
-from poise.jobs.keep import may_deliver, may_write
+from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.endless.dreamt import Dreamt

@@ -14,10 +14,10 @@ from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import say, table, tell
 from poise.cli.folder import clips_in
 from poise.cli.options import Flag
-from poise.cli.output import claimed
 from poise.cli.parse import parse
 from poise.cli.progress import clock
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 from poise.machine import cores
 
 if TYPE_CHECKING:

@@ -13,10 +13,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import Answer
 from poise.cli.console import say, table
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed
 from poise.cli.progress import working
 from poise.errors import PoiseError, did_you_mean
-from poise.jobs.keep import may_write
+from poise.jobs.keep import claimed, may_write
 
 if TYPE_CHECKING:
     from poise.control import Compliance, Stiffness

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from poise.cli.answer import Answer
 from poise.cli.console import notes, print_card, say, tell
-from poise.cli.output import claimed
 from poise.cli.progress import clock, left, showing, working
 from poise.cli.track import follow, outcome
 from poise.cli.training import Job, held_already, stopped
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress

@@ -13,10 +13,10 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from poise.cli.answer import LOST, Answer
 from poise.cli.console import print_card, say
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed, places
+from poise.cli.output import places
 from poise.cli.progress import staged, working
 from poise.errors import PoiseError
-from poise.jobs.keep import may_deliver
+from poise.jobs.keep import claimed, may_deliver
 
 if TYPE_CHECKING:
     from poise.jobs.track.pushed import PushConfig

@@ -27,7 +27,7 @@ class Options:
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
     onto: Annotated[Path, arg(metavar="FILE")]
-    """Any motion file with the skeleton that shall move."""
+    """Any motion file with the skeleton that shall move, or an ASF skeleton alone."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
     """The motion file to write; its suffix names the format (.bvh)."""
     map: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="JOINT=JOINT")] = ()
@@ -47,13 +47,13 @@ class Options:
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads both files, moves the motion over, writes, says what was matched and measured."""
     from poise.kin import RetargetConfig, retarget
-    from poise.motion.io import read_clip, write_clip
+    from poise.motion.io import read_skeleton, write_clip
 
     out = options.out
     may_write(out, options.force, options.clip, options.onto)
     mapping = pairs(options.map)
     clip = options.reading.read(options.clip)
-    onto = read_clip(options.onto, skeleton=options.onto_skeleton)
+    onto = read_skeleton(options.onto, options.onto_skeleton)
     config = RetargetConfig(contacts=options.contacts, clear=options.contacts)
     made, report = retarget(clip, onto, mapping, config)
     write_clip(made, out)

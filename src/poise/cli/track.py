@@ -14,10 +14,10 @@ from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.console import print_card, say, tell
 from poise.cli.folder import each
 from poise.cli.options import Flag, Reading, check_range
-from poise.cli.output import claimed, places
+from poise.cli.output import places
 from poise.cli.progress import clock, showing, staged, working
 from poise.errors import PoiseError
-from poise.jobs.keep import may_deliver, may_write
+from poise.jobs.keep import claimed, may_deliver, may_write
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress
@@ -191,7 +191,8 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         tracked = follow(tracker, given, plain, said_early)
         if o.learn and tracked.failures:
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
-                return Answer(exit_code=INTERRUPTED, outcome="interrupted")
+                kept = {"learned": out / "learned"}
+                return Answer(outputs=kept, exit_code=INTERRUPTED, outcome="interrupted")
             tracker = learned
             tracked = follow(tracker, given, config, said_early)
         with working("writing"):
@@ -219,6 +220,8 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         "score": done.card.to_dict(),
     }
     saved = {"policy": o.save_policy} if o.save_policy else {}
+    if o.learn and (out / "learned" / RUN_FILE).exists():
+        saved["learned"] = out / "learned"
     # What reading says of keypoints that jitter, which an option mends.
     jitter = dict(tracked.placed.source.skeleton.source.evidence).get("jitter")
     told = (*((f"{jitter}.",) if jitter else ()), *tracked.notes, *done.notes)

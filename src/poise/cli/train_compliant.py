@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from poise.cli.answer import Answer
-from poise.cli.output import claimed
 from poise.cli.progress import training as progress
 from poise.cli.progress import working
 from poise.cli.training import finished, refuse_held
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.cli.options import Training

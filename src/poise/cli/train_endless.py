@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from poise.cli.answer import Answer
 from poise.cli.console import say, tell
 from poise.cli.library_options import Library
-from poise.cli.output import claimed
 from poise.cli.progress import showing
 from poise.cli.train_inbetween import times
 from poise.cli.training import finished, refuse_held
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 from poise.machine import cores
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from tyro.conf import arg
 from poise.cli.answer import Answer
 from poise.cli.console import say, tell
 from poise.cli.library_options import Library
-from poise.cli.output import claimed
 from poise.cli.progress import clock, showing
 from poise.cli.settings import derived
 from poise.cli.training import finished, refuse_held
 from poise.cli.training import stopped as interrupted
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 from poise.machine import cores
 
 if TYPE_CHECKING:

@@ -16,12 +16,12 @@ from poise.cli.answer import Answer
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.library_options import Library
 from poise.cli.options import Body, Flag, Training
-from poise.cli.output import claimed
 from poise.cli.perpetual_report import report, shown
 from poise.cli.progress import clock
 from poise.cli.settings import derived, given
 from poise.cli.training import beginning, held_already, stopped
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.cli.train import Options

@@ -18,9 +18,9 @@ from poise.cli import progress
 from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import launched, notes, say, tell
 from poise.cli.options import Reading, Training
-from poise.cli.output import claimed
 from poise.cli.progress import clock, left
 from poise.errors import PoiseError
+from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.eval import ScoreCard

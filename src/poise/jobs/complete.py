@@ -17,6 +17,7 @@ from poise.errors import PoiseError
 from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery
 from poise.jobs.inbetween.fill import Inbetweened, inbetween
+from poise.jobs.open import open_run
 from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.stages import Stage, key_errors, stage_of
 from poise.jobs.track import TrackConfig, Tracked, track, write
@@ -161,6 +162,9 @@ def complete(
             what = f"a keyframe of parts must lie between keyframes, got frame {sparse.frame}"
             raise PoiseError(what, source.name)
     given, asked = source, keys
+    tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
+    config.direction.check(given, tracker.humanoid.table)
+    led = tuple(touch for p in partial for touch in p.touches(given))
     if times is not None:
         source, keys = timed(source, keys, times)
     more: dict[str, Any] = {} if adapt is None else {"adapt": adapt}
@@ -171,14 +175,13 @@ def complete(
         told = None if progress is None else _telling(progress, "filling")
         filled = inbetween(stretched, at, model, on_gap=told, **more)
         weights = tuple(Weight("all", KEY_WEIGHT, k, k) for k in at)
-        led = tuple(touch for p in partial for touch in p.touches(given))
         asked_for = replace(config.direction, touches=(*config.direction.touches, *led))
         # Its frames are those of the clip that came in.
         direction = asked_for.moved(lambda frame, at=at: moved_to(frame, asked, at))
         direction = replace(direction, weights=(*direction.weights, *weights))
         # A retimed motion is searched at last, when its times are settled.
         how = config if round_ + 1 == ROUNDS or not retime else replace(config, controller="lookahead")
-        tracked = track(filled.clip, policy, replace(how, direction=direction), progress=progress)
+        tracked = track(filled.clip, tracker, replace(how, direction=direction), progress=progress)
         done = _completed(source, keys, filled, tracked, at, factors)
         done = replace(done, keyframes=asked)
         score = float(np.mean(done.met_mm)) + 1e6 * bool(tracked.failures)

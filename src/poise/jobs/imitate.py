@@ -129,7 +129,7 @@ def imitate(
 
     Args:
         clip: a clip or a file; or several on one skeleton, which one policy learns.
-        minutes: of training; with `iterations` whichever ends first.
+        minutes: of training, above 0; with `iterations` whichever ends first, and 0 sets no time.
         config: the recipe's settings; `settings` are those that differ, such as help_limit=50.0 or
             num_envs=64.
         policy: which begins, see `track`; by default the one that comes with Poise.
@@ -142,8 +142,9 @@ def imitate(
 
     Raises:
         PoiseError: a motion that cannot be read or has no human body, an unknown setting, a folder that
-            holds another run, or a policy beside settings of the recipe.
+            holds another run, a policy beside settings of the recipe, or no time to learn in.
     """
+    until = _limit(minutes, iterations)
     several = [clip] if isinstance(clip, Clip | str | Path) else list(clip)
     stated = config is not None or set(settings) - {"seed"} or callbacks is not None
     if policy is not None and (stated or len(several) > 1):
@@ -151,7 +152,6 @@ def imitate(
         raise PoiseError(f"{what} learned from nothing, and a policy was given", hint="Leave one out")
     config = changed(config or ResidualForce(), settings)
     library = ClipLibrary.of([clip_of(c) for c in several])
-    until = Until(minutes=minutes, iterations=iterations)
     run = Path(tempfile.mkdtemp(prefix="poise-")) if folder is None else Path(folder) / RUN
     try:
         tracker = None if stated or len(several) > 1 else _tracker(policy, library.clips[0])
@@ -167,6 +167,15 @@ def imitate(
         if folder is None:
             shutil.rmtree(run, ignore_errors=True)
         raise
+
+
+def _limit(minutes: float, iterations: int | None) -> Until:
+    """When the training ends, at the latest."""
+    if iterations is not None and iterations < 1:
+        raise PoiseError(f"iterations must be at least 1, got {iterations}")
+    if iterations is None and not minutes > 0:
+        raise PoiseError(f"minutes must be above 0, got {minutes:g}", hint="Or give iterations")
+    return Until(minutes=minutes if minutes > 0 else None, iterations=iterations)
 
 
 def _tracker(policy: Tracker | Run | str | Path | None, clip: Clip) -> Tracker | None:

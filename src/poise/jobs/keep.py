@@ -1,7 +1,10 @@
-"""What is written, and what is there already: nothing is lost unless it is said so."""
+"""What is written: nothing that is there is lost unless it is said so, and folders are tried first."""
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from poise.errors import PoiseError
@@ -45,3 +48,50 @@ def may_deliver(
     held = sorted(p for name in _RESULTS for p in folder.glob(name))
     for path in (*([motion] if motion else ()), *held):
         may_write(path, force, *read, flag=flag)
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Makes `folder` and proves that files can be written in it.
+
+    If the body of the `with` fails, the folders that were made here are removed again.
+
+    Raises:
+        PoiseError: the folder cannot be made or written.
+    """
+    made: list[Path] = []
+    try:
+        _make(folder, made)
+        with refusing(folder), tempfile.NamedTemporaryFile(dir=folder, prefix=".poise-") as probe:
+            probe.write(b"0")
+        yield
+    except BaseException:
+        for path in reversed(made):
+            # Whatever someone else has put there in the meantime stays.
+            with contextlib.suppress(OSError):
+                path.rmdir()
+        raise
+
+
+def _make(folder: Path, made: list[Path]) -> None:
+    with refusing(folder):
+        missing = []
+        path = folder.absolute()
+        while not path.exists() and path != path.parent:
+            missing.append(path)
+            path = path.parent
+        if not path.is_dir():
+            raise PoiseError(f"cannot be made, since {path} is a file", folder, "Choose another folder")
+        for path in reversed(missing):
+            path.mkdir()
+            made.append(path)
+
+
+@contextlib.contextmanager
+def refusing(path: Path) -> Iterator[None]:
+    """What the system says against a path, in a sentence."""
+    try:
+        yield
+    except (OSError, ValueError) as problem:
+        reason = (getattr(problem, "strerror", None) or str(problem)).lower()
+        raise PoiseError(f"cannot be written ({reason})", path, "Choose another folder") from None

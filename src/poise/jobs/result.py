@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from poise.eval import ScoreCard
 from poise.eval import table as rows_of
-from poise.jobs.keep import may_deliver, may_write
+from poise.jobs.keep import claimed, may_deliver, may_write, refusing
 from poise.motion import Clip, read_clip
-from poise.motion.io import check_writable, write_clip
+from poise.motion.io import check_writable, names_file, write_clip
 from poise.view.notebook import result_html
 
 
@@ -49,14 +49,18 @@ class Result(ABC):
                 written there.
         """
         path = Path(path)
-        if path.suffix and not path.is_dir():
-            check_writable(path)
-            may_write(path, force, flag="force=True")
+        with refusing(path):
+            to_file = names_file(path) and not path.is_dir()
+            if to_file:
+                check_writable(path)
+                may_write(path, force, flag="force=True")
+            else:
+                may_deliver(path, None, force, flag="force=True")
+        if to_file:
             write_clip(self._shown().clip, path)
             return {"motion": path}
-        may_deliver(path, None, force, flag="force=True")
-        path.mkdir(parents=True, exist_ok=True)
-        return self._save_all(path)
+        with claimed(path):
+            return self._save_all(path)
 
     def __repr__(self) -> str:
         _, source, card, _, _ = self._shown()

@@ -84,6 +84,29 @@ def ease(frames: int, first: int, last: int, fps: float, seconds: float = EASE_S
     return left * left * (3.0 - 2.0 * left)
 
 
+def check_asked(clip: Clip, asked: Sequence[Pin | TouchPoint]) -> None:
+    """Refuses what a clip cannot be led to.
+
+    Raises:
+        PoiseError: frames that the clip does not have, or limbs that the skeleton does not have.
+    """
+    for what in asked:
+        first, last = _span(what)
+        if not 0 <= first <= last < clip.frames:
+            raise PoiseError(
+                f"{what.limb} is wanted in frames {first} to {last}, and the clip has 0 to "
+                f"{clip.frames - 1}",
+                clip.name,
+            )
+        if isinstance(what, Pin) or what.limb != PELVIS:
+            end_of(clip.skeleton, what.limb)
+
+
+def _span(what: Pin | TouchPoint) -> tuple[int, int]:
+    """The first and last frame in which a limb is held."""
+    return (what.first, what.last) if isinstance(what, Pin) else (what.frame, what.frame)
+
+
 def directed(
     clip: Clip, pins: Sequence[Pin] = (), touches: Sequence[TouchPoint] = ()
 ) -> tuple[Clip, tuple[str, ...]]:
@@ -99,17 +122,12 @@ def directed(
     """
     if not pins and not touches:
         return clip, ()
+    check_asked(clip, (*pins, *touches))
     notes: list[str] = []
     root, rot = clip.tensors()
     # Limbs reach from where the pelvis is led.
     for what in (*sorted(touches, key=lambda t: t.limb != PELVIS), *pins):
-        span = (what.first, what.last) if isinstance(what, Pin) else (what.frame, what.frame)
-        if not 0 <= span[0] <= span[1] < clip.frames:
-            raise PoiseError(
-                f"{what.limb} is wanted in frames {span[0]} to {span[1]}, and the clip has 0 to "
-                f"{clip.frames - 1}",
-                clip.name,
-            )
+        span = _span(what)
         if isinstance(what, TouchPoint) and what.limb == PELVIS:
             root, rot = _pelvis_led(clip, root, rot, what)
             continue

@@ -19,6 +19,7 @@ from poise.kin.doctor.clean import clean_clip
 from poise.kin.flight import rate_sentence
 from poise.kin.place import OnBody
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
+from poise.motion.io import read_skeleton
 
 _T = TypeVar("_T")
 #: Words in a file's name or folder that tell what no floor bears.
@@ -43,7 +44,7 @@ class LibraryConfig:
         leave_out: of clips that are not taken.
         skeletons: (pattern, ASF file) pairs for AMC files without one of their own.
         rates: (pattern, frames per second) pairs for files that state none or a wrong one.
-        allow_pickle: pickled files that are given by name are read too.
+        allow_pickle: pickled files are read too, `.pkl` where they are given by name.
         level: feet are turned to stand flat on the humanoid's soles, see `level_feet`, which motion that
             is not simulated has no need of.
         mirror: each clip is taken in a mirror, too.
@@ -187,7 +188,7 @@ def target_of(
         if path.suffix.lower() == ".xml":
             own = read_mjcf(path, body.damping)
             return Target(own.skeleton, None, own.table, f"the body of {path.name}")
-        onto = read_clip(path)
+        onto = read_skeleton(path)
     if onto is None:
         return _most_common(clips, body)
     skeleton, example = (onto, None) if isinstance(onto, Skeleton) else (onto.skeleton, onto)

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from poise.errors import PoiseError
 from poise.motion.io.formats import READERS
+from poise.motion.io.numpy.arrays import is_statistics
 from poise.motion.io.refused import refuse_flat_folder
 from poise.motion.io.text import read_head
 
@@ -44,7 +45,7 @@ class MotionFile:
 def motion_files_of(sources: Path | str | Sequence[Path | str]) -> list[MotionFile]:
     """Every motion file of folders and files, in order of its name.
 
-    Formats that are read only when they are asked for (pickles, robots) count only where the file
+    Formats that are read only when they are asked for (`.pkl`, robots) count only where the file
     itself is given.
 
     Raises:
@@ -85,9 +86,12 @@ def refuse_without_motion(given: Sequence[Path | str]) -> NoReturn:
 def is_motion(path: Path) -> bool:
     """Whether a file found in a folder is a motion; what many files could be is told by its content."""
     suffix = path.suffix.lower()
-    readers = [r for r in READERS if suffix in r.suffixes and r.name != "ASF" and not r.asks]
+    known = [r for r in READERS if suffix in r.suffixes and r.name != "ASF"]
+    readers = [r for r in known if suffix not in r.asks]
     if not readers or not path.is_file():
         return False
+    if suffix == ".npy":
+        return not is_statistics(path)
     if suffix not in _COMMON:
         return True
     head = read_head(path).removeprefix(b"\xef\xbb\xbf").lstrip()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from poise.body import BodyTable
 from poise.errors import PoiseError, did_you_mean
-from poise.kin.directed import LIMBS, PELVIS, Pin, TouchPoint, directed, ease
+from poise.kin.directed import LIMBS, PELVIS, Pin, TouchPoint, check_asked, directed, ease
 from poise.motion import Clip
 
 #: Cost per metre of distance in a control step of a part that counts twice, and of limbs that are
@@ -75,6 +75,19 @@ class Direction:
             tuple(replace(p, first=to(p.first), last=to(p.last)) for p in self.pins),
             tuple(replace(t, frame=to(t.frame)) for t in self.touches),
         )
+
+    def check(self, clip: Clip, table: BodyTable) -> None:
+        """Refuses what a clip or a body does not have, before anything is made.
+
+        Raises:
+            PoiseError: a frame, a limb or a part that is not there.
+        """
+        check_asked(clip, (*self.pins, *self.touches))
+        for weight in self.weights:
+            rows_of(table, weight.part)
+            if weight.first is not None and weight.first >= clip.frames:
+                what = f"{weight.part} counts from frame {weight.first} on, and the clip has 0 to"
+                raise PoiseError(f"{what} {clip.frames - 1}", clip.name)
 
     def applied(self, clip: Clip) -> tuple[Clip, tuple[str, ...]]:
         """The clip with its pins and touches, and sentences on them."""

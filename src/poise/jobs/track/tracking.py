@@ -95,6 +95,7 @@ def track(
     motions = [read_motion(m) for m in motions]
     motion = motions[0]
     given, points = _input(motion, config)
+    config.direction.check(given, tracker.humanoid.table)
     undirected, (given, directions) = given, config.direction.applied(given)
     several = len(motions) > 1
     if config.recover or several:

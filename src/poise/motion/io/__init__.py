@@ -6,7 +6,9 @@ from poise.motion.io.formats import (
     WRITERS,
     check_writable,
     home_suffix,
+    names_file,
     read_clip,
+    read_skeleton,
     write_clip,
 )
 from poise.motion.io.gltf.write import write_gltf
@@ -16,7 +18,9 @@ __all__ = [
     "WRITERS",
     "check_writable",
     "home_suffix",
+    "names_file",
     "read_clip",
+    "read_skeleton",
     "write_bvh",
     "write_clip",
     "write_gltf",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from poise.errors import PoiseError, brief
 from poise.motion.clip import Clip
-from poise.motion.io.acclaim.amc import read_amc
+from poise.motion.io.acclaim.amc import read_amc, read_asf
 from poise.motion.io.angles.deepmimic import read_deepmimic
 from poise.motion.io.angles.opensim import looks_like_mot, read_mot
 from poise.motion.io.bvh.read import read_bvh
@@ -48,14 +49,15 @@ from poise.motion.io.usd.write import write_usd
 class Reader:
     """A format: its name, its suffixes, whether a file's first bytes look like it, its reader.
 
-    asks: the file is read only when it is named (and a flag allows it), never found in a folder.
+    asks: suffixes of files that are read only when they are named (and a flag allows it), never found
+    in a folder.
     """
 
     name: str
     suffixes: tuple[str, ...]
     looks_like: Callable[[bytes], bool]
     read: Callable[[Path, ReadOptions], Clip]
-    asks: bool = False
+    asks: tuple[str, ...] = ()
 
 
 def _looks_like_bvh(head: bytes) -> bool:
@@ -97,15 +99,15 @@ READERS = (
         (".pkl", ".npy"),
         looks_like_pickle,
         read_pickled,
-        asks=True,
+        asks=(".pkl",),
     ),
     Reader("TRC keypoints", (".trc",), looks_like_trc, as_clip(trc_points)),
     Reader("C3D markers", (".c3d",), looks_like_c3d, as_clip(c3d_points)),
-    Reader("OpenPose", (), looks_like_openpose, refuse_openpose, asks=True),
+    Reader("OpenPose", (), looks_like_openpose, refuse_openpose),
     Reader("OpenSim", (".mot",), looks_like_mot, read_mot),
     Reader("CSV of Poise", (".csv",), looks_like_csv, read_csv),
     Reader("CSV keypoints", (".csv",), looks_like_points_csv, as_clip(csv_points)),
-    Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=True),
+    Reader("robot", (".csv", ".h5"), looks_like_robot, refuse_robot, asks=(".csv", ".h5")),
 )
 #: Readers that only say what to give instead.
 _REFUSERS = ("ASF", "robot", "OpenPose")
@@ -168,6 +170,24 @@ def read_clip(
         raise PoiseError("the file needs more memory than there is", path, "Cut it shorter") from None
 
 
+def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
+    """A clip that shows a skeleton and how it stands: that of a motion file, or the rest pose of an ASF.
+
+    Args:
+        skeleton: the ASF file of an AMC, see `read_clip`.
+
+    Raises:
+        PoiseError: see `read_clip`.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".asf" or path.is_dir():
+        return read_clip(path, skeleton=skeleton)
+    try:
+        return read_asf(path)
+    except PoiseError as error:
+        raise brief(error, path) from None
+
+
 def _reader_of(path: Path) -> Reader:
     with suppress(OSError):
         # A name that is too long, say; reading tells why.
@@ -209,10 +229,11 @@ WRITERS: dict[str, Callable[[Clip, Path], None]] = {
 
 
 def write_clip(clip: Clip, path: str | Path) -> None:
-    """Writes a clip in the format of the file's suffix; see `write_bvh` and the like.
+    """Writes a clip in the format of the file's suffix, in place of a file that is there.
 
-    `.npz`: a clip that came from the SMPL family is written with the keys of AMASS, any other as
-    Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the one or the other.
+    See `write_bvh` and the like. `.npz`: a clip that came from the SMPL family is written with the keys
+    of AMASS, any other as Poise's own npz, which loses nothing; `.amass.npz` and `.poise.npz` force the
+    one or the other.
 
     Raises:
         PoiseError: an unknown suffix (the known ones are listed) or a folder that cannot be written.
@@ -231,6 +252,14 @@ def home_suffix(clip: Clip) -> str:
     ".glb" for glTF, ".usda" for USD, ".npz" for AMASS, ".bvh" for all others.
     """
     return _HOME.get(clip.skeleton.source.format, ".bvh")
+
+
+def names_file(path: Path) -> bool:
+    """Whether a path is that of a file: its suffix is one of a motion format, or one to five letters as
+    files have them. `run_v1.0` and `take.2` are folders."""
+    suffix = path.suffix.lower()
+    known = {*WRITERS, *(s for r in READERS for s in r.suffixes)}
+    return suffix in known or re.fullmatch(r"\.([a-z]{1,5}|[a-z]{2,4}\d)", suffix) is not None
 
 
 def check_writable(path: Path) -> None:

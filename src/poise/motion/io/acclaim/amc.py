@@ -11,7 +11,7 @@ import torch
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
 from poise.motion.io.acclaim.asf import ROTATIONS, TRAVEL, AsfFile, fixed_axes_quat, parse_asf
-from poise.motion.io.raw import RawMotion, ReadOptions, assemble
+from poise.motion.io.raw import UNSTATED, RawMotion, ReadOptions, assemble
 from poise.motion.io.tables import append_numbers, first_bad
 from poise.motion.io.text import CUT_OFF, at_line, decode, listed, read_bytes, shown
 from poise.motion.skeleton import Channel, triple
@@ -77,6 +77,16 @@ def read_amc(path: Path, options: ReadOptions) -> Clip:
     if options.fps is None:
         notes.append(f"AMC files state no frame rate: {DEFAULT_FPS:g} frames per second taken")
     return assemble(_raw(asf, path, names, root_pos, rot, notes), options)
+
+
+def read_asf(path: Path) -> Clip:
+    """The rest pose of an ASF skeleton, as a clip that stands still; see `read_amc`."""
+    asf = parse_asf(path)
+    names = asf.joints()
+    rot = np.zeros((2, len(names), 4))
+    rot[..., 0] = 1.0
+    root_pos = np.tile(np.array(asf.position), (2, 1))
+    return assemble(_raw(asf, path, names, root_pos, rot, []), UNSTATED)
 
 
 def _local(asf: AsfFile, name: str, angles: np.ndarray, order: str) -> torch.Tensor:

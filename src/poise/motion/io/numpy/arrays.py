@@ -71,6 +71,17 @@ def npy_header(file: IO[bytes], where: str | Path) -> Header:
     return Header(shape, dtype, fortran)
 
 
+def is_statistics(path: Path) -> bool:
+    """Whether a `.npy` holds a number or one row of numbers, as `Mean.npy` and `Std.npy` of HumanML3D
+    do: no motion, and nothing that anyone would miss."""
+    try:
+        with path.open("rb") as file:
+            header = npy_header(file, path)
+    except (OSError, PoiseError):
+        return False
+    return len(header.shape) < 2 and not header.dtype.hasobject
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """The archive; whatever is wrong with it becomes one sentence."""

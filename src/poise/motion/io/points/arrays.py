@@ -24,6 +24,8 @@ HUMANML3D = (
 )
 """The 22 joints of HumanML3D (Guo et al. 2022), in the order of its arrays."""
 _HUMANML3D_FPS = 20.0
+#: What joints' names are called in files.
+_NAMES = ("names", "joint_names")
 _HANDS = ("left_hand", "right_hand")
 
 
@@ -55,23 +57,28 @@ def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED)
 
 
 def is_named_joints(data: Mapping[str, Any]) -> bool:
-    """Whether named arrays are the places of SMPL's joints with their rate."""
+    """Whether named arrays are the places of joints with their rate."""
     return "joints" in data and "fps" in data
 
 
 def named_joint_points(
     data: Mapping[str, Any], path: Path, options: ReadOptions = UNSTATED
 ) -> RawPoints:
-    """`joints (T, 22, 3)` or `(T, 24, 3)` and `fps`, read as one array of joints is.
+    """`joints (T, 22, 3)` or `(T, 24, 3)` and `fps`, read as one array of joints is; with `names (J)` or
+    `joint_names`, any `joints (T, J, 3)`, each of which is what its name says.
 
     Raises:
-        PoiseError: another number of joints, or what `numeric` refuses.
+        PoiseError: another number of joints, names that do not fit them, or what `numeric` refuses.
     """
+    if named := next((key for key in _NAMES if key in data), None):
+        own = {key: data[key] for key in ("fps", "confidence", "unit_m", "up_axis") if key in data}
+        as_points = {**own, "positions": data["joints"], "names": data[named]}
+        return replace(array_points(as_points, path, options), format="joints")
     joints = numeric(data, "joints", (None, None, 3), path)
     if not is_joints(joints.shape, joints.dtype):
         raise PoiseError(
             f"its array 'joints' has the shape {joints.shape}", path,
-            "Joints of SMPL are (T, 22, 3) or (T, 24, 3); others need positions, names and fps",
+            "Joints of SMPL are (T, 22, 3) or (T, 24, 3); others need names (J)",
         )  # fmt: skip
     fps = one_number(data, "fps", path) if options.fps is None else options.fps
     check_rate(fps, path)
