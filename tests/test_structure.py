@@ -45,7 +45,7 @@ EXPLAINED = {
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
         "sim/props/lift.py:Lift",
-        "env/teams.py:Teams",
+        "env/teams.py:Teams", "jobs/compliant/training.py:save_learned",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

@@ -5044,6 +5044,15 @@ Poise.replay = (data) => {
   toggle("force", "force");
   toggle("touch", "touch", () => { $("push-key").hidden = !state.touch; });
   $("touch").hidden = !data.pushes;
+  // Each click leads a second before the next moment at which the motion is lost, then to the first again.
+  const lost = data.lost || [];
+  $("loss").hidden = !lost.length;
+  let next = 0;
+  $("loss").addEventListener("click", () => {
+    seek(Math.round((lost[next % lost.length] - 1) * data.fps), false);
+    next += 1;
+    play(true);
+  });
   $("force").disabled = !data.force;
   $("play").addEventListener("click", () => play(!state.playing));
   $("speed").addEventListener("input", (e) => {
@@ -5064,6 +5073,7 @@ Poise.replay = (data) => {
     else if (step && (Number.isFinite(step) || on !== "BODY")) seek(Math.round(state.at) + step * (e.shiftKey ? 10 : 1), true);
     else if (e.key === "o") overlay(!state.overlay);
     else if (e.key === "f") $("follow").click();
+    else if (e.key === "l" && lost.length) $("loss").click();
     else return;
     e.preventDefault();
   });
@@ -5107,6 +5117,10 @@ Poise.strip = (host, data, seek) => {
     for (const side of [0, 1])
       for (let t = 0; t < data.frames; t++)
         if (data.contacts[2 * t + side]) lanes.push(`<rect class="lane-foot" x="${t - 0.5}" width="1.02" y="${93 + 4 * side}" height="3"/>`);
+  for (const t of data.lost || []) {
+    const x = (t * data.fps).toFixed(2);
+    lanes.push(`<path class="lane-lost" d="M${x} 0V100"/>`);
+  }
   const span = Math.max(data.frames - 1, 1);
   document.getElementById("lanes").innerHTML =
     `<svg viewBox="0 0 ${span} 100" preserveAspectRatio="none" aria-hidden="true">${lanes.join("")}</svg>`;

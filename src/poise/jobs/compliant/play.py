@@ -93,8 +93,13 @@ class Played:
         share = 1.0 if b == 0.0 else a / b
         less = f"{abs(1.0 - share):.0%} {'less' if share < 1.0 else 'more'}"
         lost, others = (f"{f['lost']:.0f}" for f in (self.figures, self.stiff))
+        episodes = "1 episode" if self.count == 1 else f"{self.count} episodes"
+        if "stays_s" in self.figures:
+            # The forces are fictional there, so that their size tells nothing.
+            c, d = (f"{f['stays_s']:.1f} s" for f in (self.figures, self.stiff))
+            return f"{episodes}: the ball stays for {c}, {d} without; {lost} were lost, {others} without."
         return (
-            f"{self.count} episodes: the interaction force is {a:.1f} N on average, {less} than without "
+            f"{episodes}: the interaction force is {a:.1f} N on average, {less} than without "
             f"compliance ({b:.1f} N); {lost} were lost, {others} without."
         )
 
