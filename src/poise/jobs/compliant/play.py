@@ -97,7 +97,8 @@ class Played:
         if "stays_s" in self.figures:
             # The forces are fictional there, so that their size tells nothing.
             c, d = (f"{f['stays_s']:.1f} s" for f in (self.figures, self.stiff))
-            return f"{episodes}: the ball stays for {c}, {d} without; {lost} were lost, {others} without."
+            told = f"{episodes}: the ball stays for {c}, {d} without"
+            return f"{told}; {lost} were lost, {others} without."
         return (
             f"{episodes}: the interaction force is {a:.1f} N on average, {less} than without "
             f"compliance ({b:.1f} N); {lost} were lost, {others} without."
