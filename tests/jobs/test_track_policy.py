@@ -64,7 +64,7 @@ def test_matrices_are_halved_and_statistics_are_not(tracker: Tracker, file: Path
         matrix = name.startswith("policy/") and value.ndim > 1
         assert tensors[name].dtype == (torch.float16 if matrix else value.dtype)
     big = torch.full((2, 2), 1e5)
-    assert track_policy._halved("policy/w", big).dtype == torch.float32
+    assert track_policy.halved("policy/w", big).dtype == torch.float32
 
 
 def test_the_policy_that_comes_with_poise_is_sought_among_its_data() -> None:
