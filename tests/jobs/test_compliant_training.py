@@ -19,6 +19,7 @@ from poise.jobs.compliant.training import open_learned, save_learned, scene_task
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn import PPOConfig, Until
+from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.recipes.compliant import Compliant
 
 PPO = PPOConfig(
@@ -76,6 +77,11 @@ def test_a_tiny_training_goes_on_and_is_played(tracker: Tracker, tmp_path: Path)
     assert again.config == TINY and again.added == learned.added
     seen = torch.randn(3, learned.top.num_obs)
     torch.testing.assert_close(again.top.act(seen), learned.top.act(seen), atol=1e-2, rtol=1e-2)
+    tensors, meta = load_checkpoint(one)
+    for odd in ({}, {"recipe": "compliant"}, {"recipe": "compliant", "config": 3}):
+        save_checkpoint(one, tensors, {**meta, "metadata": odd})
+        with pytest.raises(PoiseError, match="nothing of the recipe compliant"):
+            open_learned(one, tracker)
     with pytest.raises(PoiseError, match="a run with other settings"):
         train(replace(TINY, seed=1), tracker, tmp_path / "a", Until(iterations=3), threads=1)
     with pytest.raises(PoiseError, match="holds no run of the recipe compliant"):

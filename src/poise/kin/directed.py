@@ -171,7 +171,7 @@ def _foot(
         return {}
     of = [joint]
     of += [j for j in range(joint + 1, len(skeleton)) if skeleton.parents[j] in of]
-    world = _turns(skeleton, root, rot)[span[0] : span[1] + 1, of]
+    world = _world(skeleton, root, rot)[1][span[0] : span[1] + 1, of]
     sides = torch.where((world * world[:1]).sum(-1, keepdim=True) < 0, -world, world)
     return dict(zip(of, normalize(sides.mean(0)), strict=True))
 
@@ -180,18 +180,13 @@ def _still(
     skeleton: Skeleton, root: Tensor, rot: Tensor, still: dict[int, Tensor], share: Tensor
 ) -> Tensor:
     """Rotations with joints turned in the world by a share `(T)` of the way to how they stay."""
-    rot, world = rot.clone(), _turns(skeleton, root, rot)
+    rot, world = rot.clone(), _world(skeleton, root, rot)[1]
     for j, turn in still.items():
         wanted = slerp(world[:, j], turn.expand_as(world[:, j]), share)
         above = world[:, skeleton.parents[j]]
         rot[:, j] = torch.where(share[:, None] > 0, quat_mul(quat_conj(above), wanted), rot[:, j])
         world[:, j] = torch.where(share[:, None] > 0, wanted, world[:, j])
     return rot
-
-
-def _turns(skeleton: Skeleton, root: Tensor, rot: Tensor) -> Tensor:
-    offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
-    return forward_kinematics(skeleton.parents, offsets, root, rot)[1]
 
 
 def _led(clip: Clip, root: Tensor, rot: Tensor, joint: int, goal: Tensor) -> tuple[Tensor, Tensor]:
@@ -231,8 +226,12 @@ def _pelvis_led(clip: Clip, root: Tensor, rot: Tensor, what: TouchPoint) -> tupl
 
 
 def _ends(skeleton: Skeleton, root: Tensor, rot: Tensor, joint: int) -> Tensor:
+    return _world(skeleton, root, rot)[0][:, joint]
+
+
+def _world(skeleton: Skeleton, root: Tensor, rot: Tensor) -> tuple[Tensor, Tensor]:
     offsets = torch.tensor(np.array(skeleton.offsets), dtype=rot.dtype)
-    return forward_kinematics(skeleton.parents, offsets, root, rot)[0][:, joint]
+    return forward_kinematics(skeleton.parents, offsets, root, rot)
 
 
 def _doubts(

@@ -35,7 +35,7 @@ from poise.learn import (
     load_policy,
     run,
 )
-from poise.learn.checkpoint import load_checkpoint, save_checkpoint
+from poise.learn.checkpoint import PolicyMeta, load_checkpoint, save_checkpoint
 from poise.learn.lock import only_writer
 from poise.learn.policy import policy_in
 from poise.machine import cores
@@ -156,9 +156,9 @@ def open_learned(folder: Path, tracker: Tracker) -> Learned:
         PoiseError: no run of the recipe, nothing trained yet, or a policy of another body.
     """
     if folder.is_file():
-        tensors, meta = load_checkpoint(folder)
+        tensors, meta = load_checkpoint(folder, PolicyMeta)
         told = meta.get("metadata", {})
-        if told.get("recipe") != "compliant":
+        if told.get("recipe") != "compliant" or not isinstance(told.get("config"), dict):
             hint = "Give the folder of poise train compliant, or a file that was saved from it"
             raise PoiseError("holds nothing of the recipe compliant", folder, hint)
         config = recipe.config_of(told["config"], folder)

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
+from poise.jobs.track.retaking import eased
 from poise.jobs.track.simulation import Simulation
 from poise.motion import Clip, read_clip
 from poise.spatial import slerp
 
-#: s over which the part takes over and gives back, within it; m by which frames of one skeleton differ.
-TAKES_S, SAME_M = 0.2, 1e-4
+#: s over which the part takes over and gives back, within it.
+TAKES_S = 0.2
 
 
 def changed_s(before: Simulation, now: Simulation) -> tuple[float, float]:
@@ -33,8 +34,7 @@ def spliced(before: Clip, now: Clip, span: tuple[float, float]) -> Clip:
     takes = max(min(TAKES_S, (last - first) / 3), 1e-9)
     # What is simulated to its end has nothing to give back to.
     ends = torch.full_like(t, torch.inf) if last >= float(t[-1]) else last - t
-    share = (torch.minimum(t - first, ends) / takes).clamp(0.0, 1.0)
-    share = share * share * (3.0 - 2.0 * share)
+    share = eased(torch.minimum(t - first, ends) / takes)
     old, new = before.tensors(), now.tensors()
     root = torch.lerp(old[0], new[0], share[:, None])
     rot = slerp(old[1], new[1], share[:, None].expand(-1, len(now.skeleton)))
@@ -53,5 +53,5 @@ def written_as(folder: Path, like: Clip) -> Clip | None:
         clip = read_clip(files[0])
     except PoiseError:
         return None
-    same = clip.skeleton.same_bones(like.skeleton, SAME_M) and clip.frames == like.frames
+    same = clip.skeleton.same_bones(like.skeleton) and clip.frames == like.frames
     return like.replaced(root_pos=np.array(clip.root_pos), rot=np.array(clip.rot)) if same else None
