@@ -1,11 +1,11 @@
 """In-betweening on a folder of clips: trains both networks, adapts them, and writes the whole table.
 
-    python benchmarks/inbetween.py --library FOLDER [--name Bandai] [--minutes M] [--seeds 0 1]
+    python benchmarks/inbetween.py --library FOLDER [--name Bandai|takes] [--minutes M] [--seeds 0 1]
         [--nets transformer rtn] [--work DIR] [--out FILE.json]
 
 Rows: zero-velocity, interpolation, RTN, RTN + TTA, transformer, transformer + TTA, at 5, 15, 30 and 45
 frames: L2P, L2Q, NPSS, FP, FQ, JQ, SM, with the recorded motion's own row. `--name Bandai` holds styles
-out as `eval.inbetween.BANDAI` says, LAFAN1 subject 5. Figures are of the final part (the default) or,
+out as `eval.inbetween.BANDAI` says, `--name takes` other takes of every style, LAFAN1 subject 5. Figures are of the final part (the default) or,
 for development, of `--part validation`. How the adaptation is set is chosen on validation alone.
 Everything is resumable: trainings go on, finished networks are read back, and runs that FILE.json holds
 figures of from the same training are not scored again (their cost is measured anew). Give it as many
@@ -30,6 +30,7 @@ from inbetween_baselines import Baseline
 from poise.errors import PoiseError
 from poise.eval.inbetween import (
     BANDAI,
+    BANDAI_TAKES,
     LAFAN1,
     Protocol,
     Row,
@@ -49,7 +50,7 @@ from poise.nets.between import BetweenConfig
 from poise.nets.transition import Filled, Known
 
 Net = Literal["transformer", "rtn"]
-PROTOCOLS = {"Bandai": BANDAI, "LAFAN1": LAFAN1}
+PROTOCOLS = {"Bandai": BANDAI, "takes": BANDAI_TAKES, "LAFAN1": LAFAN1}
 #: What is tried on validation, at one length; the iterations (0 to 7) are chosen at each.
 SETTINGS = (
     Adaptation(lr=3e-6, beta=0.01), Adaptation(lr=1e-5, beta=0.01), Adaptation(lr=3e-5, beta=0.01),

@@ -109,6 +109,29 @@ def test_what_a_door_s_knob_does_and_what_the_task_pays(task: Imitation) -> None
     torch.testing.assert_close(door.opened(Seen()), expected, atol=1e-5, rtol=0)  # type: ignore[arg-type]
 
 
+def test_a_hand_that_keeps_away_from_the_knob_ends_the_episode(task: Imitation) -> None:
+    stage = Doorway(1.0).stage(task.humanoid, task.reference)
+    (end,) = stage.dones
+    away = torch.tensor([0.0, 0.3, 0.3, 0.3])
+
+    class Seen:
+        # At the knob; away from it before it is due, while it is held, and when it is let go.
+        phase = torch.tensor([2.0, 1.5, 2.0, 4.5]) / door.LASTS_S
+        sim = SimpleNamespace(
+            pos=torch.zeros(4, len(task.humanoid.bodies), 3),
+            quat=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, len(task.humanoid.bodies), 4),
+        )
+
+        def source(self, name: str) -> Tensor:
+            knob = end.params["knob"]
+            pos = torch.stack((away, 0 * away, 0 * away), 1) - knob
+            turn = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4)
+            return {"door/quat": turn, "door/pos": pos, "door/qpos": torch.zeros(4, 1)}[name]
+
+    missed = end.fn(Seen(), **end.params)  # type: ignore[arg-type]
+    assert missed.tolist() == [False, False, True, False]
+
+
 def test_a_door_that_nobody_gets_through(task: Imitation) -> None:
     broad = door.breadth(task.humanoid, task.reference)
     assert 0.25 < broad < 0.6

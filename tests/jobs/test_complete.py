@@ -23,7 +23,7 @@ from poise.jobs.tracker import Tracker
 from poise.kin.directed import Pin, TouchPoint, directed, pinned
 from poise.motion import Clip, write_clip
 from poise.plan import LookaheadConfig
-from poise.synth.retime import retimed
+from poise.synth.retime import Retiming, retimed
 from toy_human import swing
 from toy_policy import walk
 
@@ -191,6 +191,11 @@ def test_too_little_time_is_given_more(tracker: Tracker, monkeypatch: pytest.Mon
     )  # fmt: skip
     assert done.retiming is not None and done.at[2] - done.at[1] > 6
     assert "Times were stretched" in done.retiming.sentence()
+
+
+def test_stretched_times_are_told_by_the_frames_of_the_file() -> None:
+    told = Retiming((0, 30, 53), (0, 51, 90), 60.0, (1.7, 1.7), called=(0, 60, 106)).sentence()
+    assert "frame 60 is at 0.85 s instead of 0.50 s, frame 106 is at 1.50 s" in told
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -71,6 +71,12 @@ BANDAI = Protocol(
     validation=r"dataset-1_[^_]+_(sad|chimpira)_|dataset-2_[^_]+_youthful_",
 )
 
+#: Every fifth take of each motion and style is kept for final figures, another for choices: other takes
+#: of the same are learned from, as LAFAN1's protocol has other actors of the same themes.
+BANDAI_TAKES = Protocol(
+    "Bandai, takes", final=r"_\d\d[05](\D|$)", validation=r"_\d\d[38](\D|$)"
+)
+
 
 class TestSet(NamedTuple):
     """Windows in the protocol's place: root `(N, W, 3)`, rot `(N, W, J, 4)`, global pos `(N, W, J, 3)`

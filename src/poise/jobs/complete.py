@@ -183,7 +183,8 @@ def complete(
         how = config if round_ + 1 == ROUNDS or not retime else replace(config, controller="lookahead")
         tracked = track(filled.clip, tracker, replace(how, direction=direction), progress=progress)
         done = _completed(source, keys, filled, tracked, at, factors)
-        done = replace(done, keyframes=asked)
+        said = done.retiming and replace(done.retiming, called=asked)
+        done = replace(done, keyframes=asked, retiming=said)
         score = float(np.mean(done.met_mm)) + 1e6 * bool(tracked.failures)
         if best is None or score < best[0]:
             best = score, done

@@ -22,18 +22,20 @@ class Retiming:
         at: frames at which they are now.
         fps: frames a second of both.
         factors: by which each gap is longer.
+        called: frames of the file that they are, where times were stated; otherwise `keys`.
     """
 
     keys: tuple[int, ...]
     at: tuple[int, ...]
     fps: float
     factors: tuple[float, ...]
+    called: tuple[int, ...] = ()
 
     def sentence(self) -> str:
         """The new times in words."""
         changed = [
-            f"frame {k} is at {a / self.fps:.2f} s instead of {k / self.fps:.2f} s"
-            for k, a in zip(self.keys, self.at, strict=True)
+            f"frame {name} is at {a / self.fps:.2f} s instead of {k / self.fps:.2f} s"
+            for name, k, a in zip(self.called or self.keys, self.keys, self.at, strict=True)
             if a != k
         ]
         more = f", and {len(changed) - 6} more" if len(changed) > 6 else ""

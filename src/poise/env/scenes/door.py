@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.events import Happening, InScene, ScenePart, SetDown
-from poise.env.frame import Frame, ObsTerm, RewardTerm
+from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
 from poise.env.reference import Reference
 from poise.env.scenes.stage import Stage, hand_of
 from poise.errors import PoiseError
@@ -25,6 +25,8 @@ GRIPS_S, LETS_GO_S, LASTS_S, OPENS = 1.4, 4.2, 5.0, 0.8
 WANTED, SHARPNESS = 0.7, 1.5
 #: Width of the door that the motion is made for, m; how near the hand must come, m.
 MADE_FOR, NEAR_M = 1.0, 0.25
+#: s after the hand should be at the knob, until it must be there.
+LATE_S = 0.3
 #: m, how loosely the weld holds the turn of the hand (`Link.turn_m`). Held as firmly as its place the
 #: arm is a strut between torso and door, and a policy that has not learned with it falls.
 TURN_M = 0.01
@@ -86,7 +88,8 @@ class Doorway:
         return Stage(
             (door,), (link,), (), (part,),
             (ObsTerm("task/phase", phase), ObsTerm("task/knob", knob_seen, {"row": row, "knob": knob})),
-            (RewardTerm("task/open", opened, 0.5, imitation=False),), from_start=True,
+            (RewardTerm("task/open", opened, 0.5, imitation=False),),
+            (DoneTerm("task/missed", missed, {"row": row, "knob": knob}),), from_start=True,
         )  # fmt: skip
 
 
@@ -126,6 +129,17 @@ def knob_seen(frame: Frame, row: int, knob: Tensor) -> Tensor:
     there = pos + quat_rotate(quat, knob.to(pos).expand_as(pos)) - frame.sim.pos[:, row]
     seen = quat_rotate(quat_conj(frame.sim.quat[:, row]), there)
     return torch.cat((seen, angle(frame).unsqueeze(1)), 1)
+
+
+def missed(frame: Frame, row: int, knob: Tensor) -> Tensor:
+    """The hand is not at the knob while the motion has it there `(N,)`.
+
+    A hand that is held costs balance and the door's reward is not nothing for a closed one: without this
+    end what is learned is to keep away from the knob.
+    """
+    seconds = frame.phase * LASTS_S
+    due = (seconds > GRIPS_S + LATE_S) & (seconds < LETS_GO_S)
+    return due & (knob_seen(frame, row, knob)[:, :3].norm(dim=1) > NEAR_M)
 
 
 def angle(frame: Frame) -> Tensor:
