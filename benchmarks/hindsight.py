@@ -56,7 +56,7 @@ def lesson(tracker: Tracker, clips: Sequence[Clip], worlds: int, seed: int) -> I
     assert tracker.value is not None
     critic = [v for k, v in sorted(tracker.value.state().items()) if k.endswith("weight")]
     ppo = replace(
-        task.config.ppo, horizon=16, minibatch=1024, policy_lr=5e-5, std=0.08,
+        task.config.ppo, horizon=16, minibatch=1024, policy_lr=2e-5, std=0.08,
         policy_hidden=tuple(len(w) for w in weights[:-1]),
         value_hidden=tuple(len(w) for w in critic[:-1]),
     )  # fmt: skip

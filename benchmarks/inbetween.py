@@ -1,15 +1,15 @@
 """In-betweening on a folder of clips: trains both networks, adapts them, and writes the whole table.
 
     python benchmarks/inbetween.py --library FOLDER [--name Bandai|takes] [--minutes M] [--seeds 0 1]
-        [--nets transformer rtn] [--work DIR] [--out FILE.json]
+        [--nets transformer rtn] [--no-tta] [--work DIR] [--out FILE.json]
 
 Rows: zero-velocity, interpolation, RTN, RTN + TTA, transformer, transformer + TTA, at 5, 15, 30 and 45
 frames: L2P, L2Q, NPSS, FP, FQ, JQ, SM, with the recorded motion's own row. `--name Bandai` holds styles
-out as `eval.inbetween.BANDAI` says, `--name takes` other takes of every style, LAFAN1 subject 5. Figures are of the final part (the default) or,
-for development, of `--part validation`. How the adaptation is set is chosen on validation alone.
-Everything is resumable: trainings go on, finished networks are read back, and runs that FILE.json holds
-figures of from the same training are not scored again (their cost is measured anew). Give it as many
-threads as there are cores (`--threads`).
+out as `eval.inbetween.BANDAI` says, `--name takes` other takes of every style, LAFAN1 subject 5. Figures
+are of the final part (the default) or, for development, of `--part validation`. How the adaptation is
+set is chosen on validation alone. Everything is resumable: trainings go on, finished networks are read
+back, and runs that FILE.json holds figures of from the same training are not scored again (their cost is
+measured anew). Give it as many threads as there are cores (`--threads`).
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def run_one(net: Net, seed: int, protocol: Protocol, args: argparse.Namespace, f
         done.clear()
         done["rows"] = [dataclasses.asdict(r) for r in evaluate(model.net, test)]
     done |= training | cost(model, test)
-    if task.validation is not None and "tta" not in done:
+    if task.validation is not None and "tta" not in done and not args.no_tta:
         with_tta, notes = adapted_rows(model, task.validation, test)
         done |= {"tta": [dataclasses.asdict(r) for r in with_tta], "tta_settings": notes}
 
@@ -290,6 +290,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="steps instead of minutes, for equal repeats")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--nets", nargs="+", default=["transformer", "rtn"])
+    parser.add_argument("--no-tta", action="store_true", help="no adaptation, which takes longest")
     parser.add_argument("--refine", type=int, default=0, help="layers of the refining encoder")
     parser.add_argument("--rtn-longest", type=int, default=30, help="P_max of the recurrent network")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))

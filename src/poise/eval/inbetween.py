@@ -73,9 +73,7 @@ BANDAI = Protocol(
 
 #: Every fifth take of each motion and style is kept for final figures, another for choices: other takes
 #: of the same are learned from, as LAFAN1's protocol has other actors of the same themes.
-BANDAI_TAKES = Protocol(
-    "Bandai, takes", final=r"_\d\d[05](\D|$)", validation=r"_\d\d[38](\D|$)"
-)
+BANDAI_TAKES = Protocol("Bandai, takes", final=r"_\d\d[05](\D|$)", validation=r"_\d\d[38](\D|$)")
 
 
 class TestSet(NamedTuple):
