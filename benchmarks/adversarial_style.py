@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from going_on import as_lesson, gone_on
 
 from poise.control import Compliance
 from poise.env.events import Pushes
@@ -29,11 +29,11 @@ from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.learn import LATEST, AmpConfig, IterationStats, Until, WarmStart, load_policy, run
+from poise.learn import AmpConfig, Until
 from poise.motion import Clip, read_clip
 from poise.recipes.imitation import Imitation
 
-LEVEL, STD, RATE = 0.16, 0.08, 2e-5
+LEVEL = 0.16
 FIGURES = ("succ", "mpjpe_mm", "mpjpe_global_mm", "acc_mm_per_frame2", "foot_slide_mm_per_s", "jerk")
 
 
@@ -45,34 +45,7 @@ def lesson(tracker: Tracker, clips: Sequence[Clip], worlds: int, seed: int) -> I
         task.task, plugins=(*task.task.plugins, push), compliance=Compliance(LEVEL),
         style=style_terms(task.humanoid),
     )  # fmt: skip
-    weights = [v for k, v in sorted(tracker.policy.state().items()) if k.endswith("weight")]
-    assert tracker.value is not None
-    critic = [v for k, v in sorted(tracker.value.state().items()) if k.endswith("weight")]
-    ppo = replace(
-        task.config.ppo, horizon=16, minibatch=1024, policy_lr=RATE, std=STD,
-        policy_hidden=tuple(len(w) for w in weights[:-1]),
-        value_hidden=tuple(len(w) for w in critic[:-1]),
-    )  # fmt: skip
-    return replace(task, task=own, config=replace(task.config, num_envs=worlds, seed=seed, ppo=ppo))
-
-
-def learned(
-    tracker: Tracker, task: Imitation, style: AmpConfig | None, folder: Path, samples: int
-) -> Tracker:
-    """The policy after so many control steps; goes on where a run of the folder stopped."""
-    start = tracker.policy.copy()
-    std = {k: torch.full_like(v, math.log(STD)) for k, v in start.state().items() if "log_std" in k}
-    start.load_state({**start.state(), **std})
-    assert tracker.value is not None
-    warm = WarmStart(start, tracker.value.state())
-    trainer = task.trainer(threads=1, warm_start=warm, style=style)
-
-    def tell(stats: IterationStats) -> None:
-        if stats.iteration % 20 == 1:
-            print(f"{folder.name}: {stats.seconds / 60:.1f} min, reward {stats.reward:.3f}", flush=True)
-
-    run(trainer, Until(samples=samples), folder, 10, tell, tensorboard=False)
-    return replace(tracker, policy=load_policy(folder / LATEST))
+    return as_lesson(tracker, task, own, worlds, seed)
 
 
 def figures(tracker: Tracker, clips: Sequence[Clip]) -> dict[str, float]:
@@ -104,7 +77,7 @@ def main() -> None:
     }  # fmt: skip
     ways = {"before": tracker}
     for name, style in (("without", None), ("with", AmpConfig.compliant())):
-        ways[name] = learned(tracker, task, style, args.work / name, args.samples)
+        ways[name] = gone_on(tracker, task, args.work / name, Until(samples=args.samples), style)
     for name, policy in ways.items():
         row = {"clips": figures(policy, clips), "unseen": figures(policy, unseen)}
         found["rows"][name] = row

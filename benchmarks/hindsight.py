@@ -15,13 +15,13 @@ import argparse
 import json
 import math
 import statistics
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from going_on import as_lesson, gone_on
 
 import poise
 from poise.control import Stiffness
@@ -32,7 +32,7 @@ from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of, track
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
-from poise.learn import LATEST, IterationStats, Until, WarmStart, load_policy, run
+from poise.learn import Until
 from poise.motion import Clip, read_clip
 from poise.recipes.imitation import Imitation
 
@@ -52,34 +52,7 @@ def lesson(tracker: Tracker, clips: Sequence[Clip], worlds: int, seed: int) -> I
         task.task, plugins=(*task.task.plugins, push),
         compliance=Stiffness(ASKED, hindsight=True),
     )  # fmt: skip
-    weights = [v for k, v in sorted(tracker.policy.state().items()) if k.endswith("weight")]
-    assert tracker.value is not None
-    critic = [v for k, v in sorted(tracker.value.state().items()) if k.endswith("weight")]
-    ppo = replace(
-        task.config.ppo, horizon=16, minibatch=1024, policy_lr=2e-5, std=0.08,
-        policy_hidden=tuple(len(w) for w in weights[:-1]),
-        value_hidden=tuple(len(w) for w in critic[:-1]),
-    )  # fmt: skip
-    return replace(task, task=own, config=replace(task.config, num_envs=worlds, seed=seed, ppo=ppo))
-
-
-def learned(tracker: Tracker, task: Imitation, folder: Path, minutes: float) -> Tracker:
-    """The policy after so many minutes; goes on where a run of the folder stopped."""
-    start = tracker.policy.copy()
-    std = {k: torch.full_like(v, math.log(0.08)) for k, v in start.state().items() if "log_std" in k}
-    start.load_state({**start.state(), **std})
-    assert tracker.value is not None
-    trainer = task.trainer(threads=1, warm_start=WarmStart(start, tracker.value.state()))
-    last = [0.0]
-
-    def tell(stats: IterationStats) -> None:
-        if time.monotonic() - last[0] > 30.0:
-            last[0] = time.monotonic()
-            told = f"{stats.seconds / 60:.1f} of {minutes:g} min, failures {stats.failure_rate:.0%}"
-            print(f"{told}, reward {stats.reward:.3f}", flush=True)
-
-    run(trainer, Until(minutes=minutes), folder, 10, tell, tensorboard=False)
-    return replace(tracker, policy=load_policy(folder / LATEST))
+    return as_lesson(tracker, task, own, worlds, seed)
 
 
 def figures(tracker: Tracker) -> dict[str, Any]:
@@ -110,7 +83,7 @@ def main() -> None:
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
     task = lesson(tracker, [read_clip(p) for p in args.clips], args.worlds, args.seed)
-    after = learned(tracker, task, args.work, args.minutes)
+    after = gone_on(tracker, task, args.work, Until(minutes=args.minutes))
     found = {
         "command": "python benchmarks/hindsight.py --clips CLIPS --work DIR -o FILE.json",
         "clips": [p.stem for p in args.clips], "asked_n_per_m": ASKED, "minutes": args.minutes,
