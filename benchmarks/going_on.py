@@ -19,7 +19,7 @@ STD, RATE = 0.08, 2e-5
 
 
 def as_lesson(tracker: Tracker, task: Imitation, own: TaskConfig, worlds: int, seed: int) -> Imitation:
-    """The task with settings of its own, and PPO for networks as large as the policy's and its critic's."""
+    """The task with settings of its own, and PPO for networks of the policy's and the critic's sizes."""
     assert tracker.value is not None
     widths = [
         tuple(len(v) for k, v in sorted(part.state().items()) if k.endswith("weight"))[:-1]
