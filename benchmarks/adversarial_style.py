@@ -76,7 +76,7 @@ def main() -> None:
         "unseen": [p.stem for p in args.unseen], "rows": {},
     }  # fmt: skip
     ways = {"before": tracker}
-    for name, style in (("without", None), ("with", AmpConfig.compliant())):
+    for name, style in (("without", None), ("with", AmpConfig.compliant(product=False))):
         ways[name] = gone_on(tracker, task, args.work / name, Until(samples=args.samples), style)
     for name, policy in ways.items():
         row = {"clips": figures(policy, clips), "unseen": figures(policy, unseen)}

@@ -269,6 +269,7 @@ def test_a_skeleton_without_a_head(task: Imitation) -> None:
         (lambda: Doorway(0.0), "a door is 0 to 10 m wide"),
         (lambda: Throws(mass=0.0), "must weigh above 0"),
         (lambda: Trampoline(2.0), "a bounce is 0 to 1 m high"),
+        (lambda: Trampoline(first=3.0), "begins within 3 s"),
         (lambda: Balance(length=0.0), "a rod is 0.1 to 5 m long"),
         (lambda: Balance(pushes=-1.0), "a push has at least 0 N"),
     ],

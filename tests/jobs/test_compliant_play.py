@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from poise.control import Stiffness
-from poise.env.scenes import Balance, Doorway, Hands, Pull, Throws, Trampoline
+from poise.env.scenes import Balance, Chicken, Doorway, Hands, Pull, Throws, Trampoline
 from poise.errors import PoiseError
 from poise.jobs.compliant.play import WORDS, play
 from poise.jobs.compliant.watch import footfalls
@@ -79,6 +79,20 @@ def test_on_a_trampoline(tracker: Tracker) -> None:
     # The plate goes up by about what its actuators do.
     height = made.movers[0].pos[:, 2]
     assert 0.04 < height.max() - height[0] < 0.25
+
+
+def test_lookahead_tries_in_copies_of_the_scene(tracker: Tracker) -> None:
+    scene, tight = Trampoline(0.1, first=0.2), {"count": 1, "seconds": 0.6, "threads": 1}
+    alone, ahead, again = (
+        play(scene, tracker, None, None, controller=c, **tight)  # type: ignore[arg-type]
+        for c in ("policy", "lookahead", "lookahead")
+    )
+    # The plate does as it does without, and the same is done again.
+    for a, b in zip(alone.movers, ahead.movers, strict=True):
+        assert np.abs(a.pos - b.pos).max() < 0.1
+    assert ahead.figures == again.figures != alone.figures and ahead.figures["lost"] == 0.0
+    with pytest.raises(PoiseError, match="lookahead does not act against an opponent"):
+        play(Chicken(against="rival"), tracker, controller="lookahead")
 
 
 def test_with_a_ball_on_the_head(tracker: Tracker) -> None:

@@ -68,6 +68,8 @@ class Options:
     """door: how wide (1)."""
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """trampoline: how far its actuators rise for a bounce (0.15)."""
+    first: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
+    """trampoline: when the first bounce begins (1)."""
     length: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """ball: of the rod (1)."""
     pushes: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -80,6 +82,8 @@ class Options:
     learned: Annotated[Path | None, arg(metavar="RUN|none", help_behavior_hint="")] = None
     """What was learned on top of the policy: the folder of poise train compliant SCENE. For the ball
     something comes along; none goes without."""
+    controller: Literal["policy", "lookahead"] = "policy"
+    """The policy alone, or with lookahead, which tries what it may do in copies of the scene."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores; 0 is all."""
     open: Flag = False
@@ -119,7 +123,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError("a run gives way as it has learned to", hint="Leave --level, --stiffness out")
     with claimed(o.out):
         with working("simulating"):
-            played = play(scene, tracker, clip, given, o.count, o.duration, o.threads, o.scene, learned)
+            more = (o.count, o.duration, o.threads, o.scene, learned, o.controller)
+            played = play(scene, tracker, clip, given, *more)
         with working("writing"):
             paths = played.write(o.out)
     rows = [(played.words[k], f"{v:.4g}", f"{played.stiff[k]:.4g}") for k, v in played.figures.items()]
@@ -160,8 +165,8 @@ def scene_of(options: Options) -> PlayScene:
     kind: Any = SCENES[o.scene]
     stated: dict[str, Any] = {
         "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
-        "sway": o.sway, "mass": o.mass, "width": o.width, "height": o.height, "length": o.length,
-        "pushes": o.pushes, "other": o.other, "against": o.against, "seed": o.seed,
+        "sway": o.sway, "mass": o.mass, "width": o.width, "height": o.height, "first": o.first,
+        "length": o.length, "pushes": o.pushes, "other": o.other, "against": o.against, "seed": o.seed,
     }  # fmt: skip
     stated = {k: v for k, v in stated.items() if v is not None}
     own = {f.name for f in fields(kind)}

@@ -92,6 +92,8 @@ class AmpConfig:
     """w_task."""
     style_weight: float = 0.5
     """w_style."""
+    product: bool = False
+    """r = r_task r_style in place of the weighted sum (Deep Compliant Control, Eq. 11)."""
 
     def __post_init__(self) -> None:
         validate(self)
@@ -104,16 +106,18 @@ class AmpConfig:
             raise PoiseError(f"keep must lie in [0, 1], got {self.keep}", "AmpConfig")
 
     @classmethod
-    def compliant(cls, few: bool = True) -> AmpConfig:
+    def compliant(cls, few: bool = True, product: bool = True) -> AmpConfig:
         """The settings of Deep Compliant Control (Lee et al. 2022, Eqs. 12 and 13, Sec. 5.1): pairs of
         states, as many of the clips as of the character, without replay. What it does not state, the
         weights of gradient and last layer and the number of steps, is as by default.
 
         few: whether the clips are few, so that the discriminator learns too quickly: beta 0.2, not 0.25.
+        product: r_q r_p; without, half of each, for a task that is paid for its pose, too.
         """
         return cls(
             frames=2, hidden=(256, 256, 256), loss="least_squares", shape=0.2 if few else 0.25,
             clamped=False, lr=1e-4, minibatch=16, replay=0, scale=1.0,
+            product=product,
         )  # fmt: skip
 
     @classmethod
@@ -242,8 +246,9 @@ class Amp:
         known = style[~style.isnan()]
         mean = known.mean() if len(known) else style.new_zeros(())
         self._mean_style = float(mean)
+        style = torch.where(style.isnan(), mean, style)
         # r = w_task r_task + w_style r_style
-        return config.task_weight * task + config.style_weight * torch.where(style.isnan(), mean, style)
+        return task * style if config.product else _weighted(config, task, style)
 
     def update(self) -> dict[str, float]:
         """Some gradient steps on what the rollout showed; see `Style`.
@@ -368,6 +373,10 @@ class Amp:
         """See `Style`."""
         self.load_learned(state)
         self.history.load_state(under("own/history", state))
+
+
+def _weighted(config: AmpConfig, task: Tensor, style: Tensor) -> Tensor:
+    return config.task_weight * task + config.style_weight * style
 
 
 _LOGGED: tuple[str, ...] = (

@@ -60,7 +60,8 @@ class Imitation:
     """A library with a body, ready to be learned.
 
     Attributes:
-        config: the recipe's settings; it must have `num_envs`, `seed`, `sim`, `ppo` and `residual_std`.
+        config: the recipe's settings; it must have `num_envs`, `seed`, `sim` and `ppo`, and
+            `residual_std` where there is a residual force.
         recovery_clips: those of the library, where recovery is learned by them.
         props: what else stands in every world, such as a chair or a ball, or another character, which
             `env.opponent` moves.
@@ -148,7 +149,7 @@ class Imitation:
         if not isinstance(ppo.std, float | int):
             return ppo
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
-        return replace(ppo, std=joints + (float(self.config.residual_std),) * extra)
+        return replace(ppo, std=joints + ((float(self.config.residual_std),) * extra if extra else ()))
 
     def check_memory(self, num_envs: int, device: str = "cpu") -> None:
         """Raises a PoiseError that says how many characters fit, if `num_envs` do not.

@@ -19,8 +19,8 @@ from poise.sim.props import Trampoline as Plate
 
 #: s from bounce to bounce, and from a contact on for which the character gives way.
 EVERY_S, GIVES_S = 3.0, 1.0
-#: s: the first bounce, and how long its actuators are up. N on the feet is contact.
-FIRST_S, UP_S, CONTACT_N = 1.0, 0.12, 20.0
+#: s: how long a bounce's actuators are up. N on the feet is contact.
+UP_S, CONTACT_N = 0.12, 20.0
 #: m, the floor below the plate.
 BELOW_M = -1.0
 
@@ -33,13 +33,18 @@ class Trampoline:
 
     Attributes:
         height: m, by which the actuators rise for a bounce.
+        first: s, when the first bounce begins.
     """
 
     height: float = 0.15
+    first: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.height <= 1.0:
             raise PoiseError(f"a bounce is 0 to 1 m high, got {self.height:g}", "trampoline")
+        if not 0.0 <= self.first < EVERY_S:
+            what = f"the first bounce begins within {EVERY_S:g} s, got {self.first:g}"
+            raise PoiseError(what, "trampoline")
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The plate in place of the floor, its bounces, and the feet's contacts."""
@@ -48,9 +53,10 @@ class Trampoline:
         feet = tuple(humanoid.bodies[i] for i in humanoid.feet)
         touches = touches_of("felt", plate.name, feet)
         names = tuple(t.name for t in touches)
+        bounce = Bounce(plate.name, self.height, names, self.first)
         part = InScene(
             sees=(plate.name,), felt=names, felt_part=dict.fromkeys(names, after_contact),
-            events=(SetDown(plate.name, (0.0, 0.0, 0.0)), Bounce(plate.name, self.height, names)),
+            events=(SetDown(plate.name, (0.0, 0.0, 0.0)), bounce),
         )  # fmt: skip
         return Stage((plate,), (), touches, (part,), from_start=True,
                      floor=Plane(BELOW_M), yields=stands_still)  # fmt: skip
@@ -75,11 +81,13 @@ class Bounce:
         plate: its name.
         height: m.
         touches: of the feet with it.
+        first: s, when the first bounce begins.
     """
 
     plate: str
     height: float
     touches: tuple[str, ...]
+    first: float = 1.0
 
     def __call__(self, sim: SceneSim, control_hz: float) -> Happening:
         """The event in the worlds of a scene."""
@@ -93,9 +101,11 @@ class Bouncing(Happening):
         steps: `(N,)` control steps since the episode began.
         air: `(N,)` whether the feet have left the plate since the last bounce began.
         gives: `(N,)` control steps for which the character gives way yet.
+        first_s: s, when the first bounce begins.
     """
 
     def __init__(self, event: Bounce, sim: SceneSim, control_hz: float):
+        self.first_s = event.first
         self._event, self._sim, self._hz = event, sim, control_hz
         self._controls = sim.scene.place(event.plate).controls
         here = sim.backend.device
@@ -110,8 +120,8 @@ class Bouncing(Happening):
             value[worlds] = 0
 
     def before(self) -> None:
-        since = (self.steps / self._hz - FIRST_S).remainder(EVERY_S)
-        up = (since < UP_S) & (self.steps / self._hz >= FIRST_S)
+        since = self.steps / self._hz - self._event.first
+        up = (since >= 0.0) & (since.remainder(EVERY_S) < UP_S)
         drive = self._sim.backend.drive.ctrl
         drive[:, self._controls] = self._event.height * up.to(drive).unsqueeze(1)
 

@@ -12,6 +12,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -33,12 +34,13 @@ from poise.jobs.deliver import make_report, simulated_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track import imitation_of
-from poise.jobs.track.controllers import RULE
+from poise.jobs.track.controllers import RULE, look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip
 from poise.motion.io import write_clip
 from poise.motion.io.text import write_whole
+from poise.plan import LookaheadConfig
 from poise.recipes.compliant import seen
 from poise.recipes.imitation import Imitation
 from poise.view import Mover, write_report
@@ -135,8 +137,9 @@ def play(
     threads: int = 0,
     name: str = "",
     learned: Learned | None = None,
+    controller: Literal["policy", "lookahead"] = "policy",
 ) -> Played:
-    """A scene with compliance and without, by the policy alone, from starts that differ by a hair.
+    """A scene with compliance and without, from starts that differ by a hair.
 
     Args:
         policy: see `poise.track`.
@@ -146,10 +149,15 @@ def play(
         name: of the scene, by default that of its class.
         learned: what was learned on top of the policy, for the character that gives way; it gives way as
             it has learned to.
+        controller: the policy alone, or with lookahead, which simulates the scene with all that is going
+            to happen in it; not with what was learned on top, nor against an opponent.
 
     Raises:
         PoiseError: the body cannot do the scene, or the clip cannot be read.
     """
+    if controller == "lookahead" and (learned or getattr(scene, "against", "") == "rival"):
+        what = "against an opponent" if learned is None else "with what was learned on top"
+        raise PoiseError(f"lookahead does not act {what}", name or "play", "Take controller='policy'")
     tracker = policy if isinstance(policy, Tracker) else open_run(policy).tracker
     own_motion = motion_of(scene, tracker, seconds)
     if clip is not None and own_motion is not None:
@@ -173,7 +181,8 @@ def play(
         top = None if compliance is None else learned
         if top is not None:
             own = replace(own, obs=(*own.obs, *seen(stage)))
-        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top))
+        ahead = controller == "lookahead"
+        both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
     (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
     return Played(
         name or type(scene).__name__.lower(), {**WORDS, **words_of(scene)}, imitation, evaluation,
@@ -193,25 +202,28 @@ def _episodes(
     count: int,
     threads: int,
     learned: Learned | None = None,
+    looks_ahead: bool = False,
 ) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
     zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
     topped = None if learned is None else Topped(tracker.policy, learned.top, learned.added)
+    ahead = look_ahead(tracker, task, LookaheadConfig(), threads) if looks_ahead else None
 
     def make(worlds: int) -> ImitationEnv:
         env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
         watch.begin(env)
+        if ahead is not None:
+            ahead.watch(env)
         if topped is not None:
             topped.begin(env)
         return env
 
-    rollouts, recordings = run_episodes(
-        make,
-        topped or tracker.policy,
-        zero,
-        zero,
-        cycles=1,
-        observers=[watch],
-        trial=torch.arange(count),
-    )
+    try:
+        rollouts, recordings = run_episodes(
+            make, ahead or topped or tracker.policy, zero, zero, cycles=1, observers=[watch],
+            trial=torch.arange(count),
+        )  # fmt: skip
+    finally:
+        if ahead is not None:
+            ahead.copies.close()
     card = scored(rollouts, task, tracker.about, RULE, tracker.config.method)
     return task, rollouts, watch, Evaluation(card, rollouts, recordings, False)

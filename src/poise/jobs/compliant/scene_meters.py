@@ -16,7 +16,7 @@ from poise.env.opponent import Opposing
 from poise.env.scenes import Balance, Chicken, Doorway, PlayScene, Trampoline
 from poise.env.scenes.ball import COS_45, upright_of
 from poise.env.scenes.door import WANTED, across
-from poise.env.scenes.trampoline import FIRST_S, Bouncing
+from poise.env.scenes.trampoline import Bouncing
 from poise.jobs.compliant.meters import Meter, part_of
 from poise.jobs.compliant.stiffness import FALLEN
 from poise.jobs.compliant.throws import TOUCHES_N
@@ -100,7 +100,7 @@ class TrampolineMeter:
         energy = kinetic + env.goal.humanoid.mass * G * (com - self._com)
         self._joules += torch.where(lands, energy, 0.0)
         self._steps += lands
-        if step / env.goal.rate_hz > FIRST_S:
+        if step / env.goal.rate_hz > self._bounce.first_s:
             height = self._sim.backend.state.qpos[:, self._sim.scene.place("trampoline").qpos.start]
             self._plate = torch.maximum(self._plate, torch.stack((height, -height)).double())
 
