@@ -6,9 +6,11 @@ python benchmarks/compliance.py throws --json benchmarks/compliance.json
 python benchmarks/compliance.py hands --json benchmarks/compliance.json
 python benchmarks/compliance.py door --json benchmarks/compliance.json
 python benchmarks/compliance.py scenes --json benchmarks/compliance.json
+python benchmarks/compliance.py flips --clip humanoid3d_backflip.txt --json benchmarks/compliance.json
 python benchmarks/compliance.py cost --json benchmarks/compliance.json
 
-All by the policy that comes with Poise, alone and without help; no training. Each part writes its
+All by the policy that comes with Poise, alone (the flips with lookahead, too) and without help; no
+training. Each part writes its
 section of the same file.
 """
 
@@ -45,6 +47,8 @@ from poise.view import line_plot
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 
 COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
+#: s, when the backflip's feet begin to push off.
+PUSH_OFF_S = 0.5
 LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
 #: Characters, control steps and repetitions of the cost.
 ROWS, STEPS, REPEATS = 512, 12, 9
@@ -198,19 +202,20 @@ def hands(tracker: Tracker, threads: int) -> dict[str, Any]:
 
 
 def doors(tracker: Tracker, threads: int) -> dict[str, Any]:
-    """Doors of three widths, by level and by stiffness, beside the twin that does not give way."""
+    """Doors of three widths, by level and by stiffness, beside the twin that does not give way, with a
+    motion made for the door, and with one made for 1 m."""
     ways = {
         "level 0.16": Compliance(0.16), "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5),
         "stiffness 200, lag 0.5 s": Stiffness(200.0, 0.5),
     }  # fmt: skip
     out: dict[str, Any] = {"episodes": 8}
-    for width in (1.0, 1.35, 1.7):
+    for scene in (Doorway(1.0), *(Doorway(w, made_for=m) for m in (None, 1.0) for w in (1.35, 1.7))):
         rows: dict[str, Any] = {}
         for way, given in ways.items():
-            made = play(Doorway(width), tracker, None, given, 8, threads=threads)
+            made = play(scene, tracker, None, given, 8, threads=threads)
             rows["without"] = dict(made.stiff)
             rows[way] = dict(made.figures)
-        out[f"{width:g} m"] = rows
+        out[f"{scene.width:g} m" + (", motion for 1 m" if scene.made_for else "")] = rows
     return out
 
 
@@ -249,12 +254,30 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
     return out
 
 
+def flips(tracker: Tracker, file: Path, threads: int) -> dict[str, Any]:
+    """A clip, such as a backflip, on a trampoline that bounces as its feet push off: alone and with
+    lookahead."""
+    clip, out = read_clip(file), dict[str, Any]()
+    for height in (0.0, 0.05, 0.1, 0.15):
+        rows = out[f"bounce of {height:g} m"] = dict[str, Any]()
+        scene = Trampoline(height, first=PUSH_OFF_S)
+        for controller in ("policy", "lookahead"):
+            made = play(scene, tracker, clip, None, 8, 8.0, threads, controller=controller)
+            rows[controller] = dict(made.figures)
+            rows[f"{controller}, without"] = dict(made.stiff)
+            print(height, controller, made.sentence(), flush=True)
+    return {"clip": file.name, "episodes": 8, "first_s": PUSH_OFF_S, "rows": out}
+
+
 def main() -> None:
     """One part of it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("stiffness", "throws", "hands", "door", "scenes", "cost"))
+    parser.add_argument(
+        "part", choices=("stiffness", "throws", "hands", "door", "scenes", "flips", "cost")
+    )
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--svg", type=Path)
+    parser.add_argument("--clip", type=Path, help="flips: humanoid3d_backflip.txt")
     parser.add_argument("--only", choices=("trampoline", "ball", "chicken"), help="of the scenes")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--throws", type=int, default=200, help="at 60 Hz; 0 leaves what is there")
@@ -278,6 +301,10 @@ def main() -> None:
         found = doors(tracker, args.threads)
     elif args.part == "scenes":
         found = scenes(tracker, args.threads, args.only)
+    elif args.part == "flips":
+        if args.clip is None:
+            parser.error("flips needs --clip")
+        found = flips(tracker, args.clip, args.threads)
     else:
         found = cost(tracker)
     keep(found)

@@ -4353,6 +4353,15 @@ const Poise = {};
     ];
   };
 
+  // Whether a tall box stands at first between the root of a motion and who looks at it from `view`.
+  const hides = ({ kind, size, pos, way }, root, view) => {
+    if (kind !== "box" || size[2] < 0.5) return false;
+    const off = Poise.rotate(way, 3, pos);
+    const [x, y] = [way[0] + off[0] - root[0], way[1] + off[1] - root[1]];
+    const ahead = x * view[0] + y * view[1];
+    return ahead > 0 && ahead < 3 && Math.abs(x * view[1] - y * view[0]) < Math.max(size[0], size[1]);
+  };
+
   // How wide, tall and in which direction the clip moves; it places the camera and the two copies.
   Poise.extent = (data) => {
     const n = data.bodies.length;
@@ -4375,8 +4384,10 @@ const Poise = {};
     const gap = Math.min(2.2, Math.max(1.15, 1.6 * reach));
     // The camera looks from the front and a little from the right; the two copies stand apart across
     // that view, so that both are equally far away and appear equally tall.
+    // From behind, where something tall, such as a door, would hide the character.
     const [a, b] = [0.85, -0.53];
-    const view = [a * forward[0] - b * forward[1], a * forward[1] + b * forward[0]];
+    let view = [a * forward[0] - b * forward[1], a * forward[1] + b * forward[0]];
+    if (data.movers.some((mover) => hides(mover, pos, view))) view = [-view[0], -view[1]];
     return { top, reach, view, apart: [-view[1], view[0]], gap };
   };
 

@@ -267,6 +267,7 @@ def test_a_skeleton_without_a_head(task: Imitation) -> None:
         (lambda: Pull(lasts_s=0.0), "lasts some time"),
         (lambda: Hands(sway=2.0), "its sway below 1 m"),
         (lambda: Doorway(0.0), "a door is 0 to 10 m wide"),
+        (lambda: Doorway(made_for=9.0), "a motion is made for 0.5 to 3 m"),
         (lambda: Throws(mass=0.0), "must weigh above 0"),
         (lambda: Trampoline(2.0), "a bounce is 0 to 1 m high"),
         (lambda: Trampoline(first=3.0), "begins within 3 s"),

@@ -70,6 +70,15 @@ def test_a_door_is_opened(tracker: Tracker, tmp_path: Path) -> None:
         play(Doorway(1.0), tracker, read_clip(WALK), count=2, threads=1)
 
 
+def test_a_wide_door_takes_a_motion_of_its_own(tracker: Tracker) -> None:
+    wide, paper = (
+        play(Doorway(1.7, made_for=m), tracker, None, Stiffness(500.0, 0.5), 2, threads=1)
+        for m in (None, 1.0)
+    )
+    assert wide.figures["opened"] == 2.0 and wide.figures["lost"] == 0.0
+    assert wide.figures["angle_rad"] > 0.7 > paper.figures["angle_rad"]
+
+
 def test_on_a_trampoline(tracker: Tracker) -> None:
     made = play(Trampoline(0.1), tracker, None, None, 2, seconds=2.2, threads=1, name="trampoline")
     assert set(made.figures) == set(made.words) and len(made.movers) == 1

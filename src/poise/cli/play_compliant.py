@@ -66,6 +66,8 @@ class Options:
     """chicken: a punching bag as heavy as the opponent (default), or the opponent itself."""
     width: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """door: how wide (1)."""
+    made_for: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
+    """door: how wide the door is for which the motion is made; by default the door's own width."""
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """trampoline: how far its actuators rise for a bounce (0.15)."""
     first: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
@@ -165,12 +167,14 @@ def scene_of(options: Options) -> PlayScene:
     kind: Any = SCENES[o.scene]
     stated: dict[str, Any] = {
         "newtons": o.newtons, "direction": direction_of(o.direction), "side": o.side, "lead": o.lead,
-        "sway": o.sway, "mass": o.mass, "width": o.width, "height": o.height, "first": o.first,
-        "length": o.length, "pushes": o.pushes, "other": o.other, "against": o.against, "seed": o.seed,
+        "sway": o.sway, "mass": o.mass, "width": o.width, "made_for": o.made_for, "height": o.height,
+        "first": o.first, "length": o.length, "pushes": o.pushes, "other": o.other,
+        "against": o.against, "seed": o.seed,
     }  # fmt: skip
     stated = {k: v for k, v in stated.items() if v is not None}
     own = {f.name for f in fields(kind)}
     for name in stated:
         if name not in own:
-            raise PoiseError(f"--{name} says nothing of the scene '{o.scene}'", hint="Leave it out")
+            option = "--" + name.replace("_", "-")
+            raise PoiseError(f"{option} says nothing of the scene '{o.scene}'", hint="Leave it out")
     return kind(**stated)

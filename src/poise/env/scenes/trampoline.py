@@ -48,7 +48,9 @@ class Trampoline:
 
     def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
         """The plate in place of the floor, its bounces, and the feet's contacts."""
-        x, y = (float(v) for v in reference.pose.pos[0, 0, :2])
+        # In the middle of what the motion crosses.
+        low, high = torch.aminmax(reference.pose.pos[:, 0, :2], dim=0)
+        x, y = (0.5 * (low + high)).tolist()
         plate = Plate(pos=(x, y, 0.0))
         feet = tuple(humanoid.bodies[i] for i in humanoid.feet)
         touches = touches_of("felt", plate.name, feet)

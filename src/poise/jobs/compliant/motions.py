@@ -27,16 +27,19 @@ def motion_of(scene: PlayScene, tracker: Tracker, seconds: float = 8.0) -> Clip 
     """The motion of a scene that has one of its own, else None; a door takes its own time."""
     if isinstance(scene, Chicken):
         return hopping(tracker, seconds, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
-    return opening(tracker) if isinstance(scene, door.Doorway) else None
+    if isinstance(scene, door.Doorway):
+        return opening(tracker, min(max(scene.made_for or scene.width, 0.5), 3.0))
+    return None
 
 
-def opening(tracker: Tracker) -> Clip:
-    """5 s: stand, take a knob with the left hand, open a door 1 m wide away from oneself, let go."""
+def opening(tracker: Tracker, width: float = 1.0) -> Clip:
+    """5 s: stand, take a knob with the left hand, open a door so many metres wide away from oneself, let
+    go."""
     rate, ease = float(tracker.config.sim.control_hz), at_ease(tracker)
     frames = round(door.LASTS_S * rate) + 1
     t = np.arange(frames) / rate
     open_by = door.OPENS * smooth_step(t, door.GRIPS_S + 0.1, door.LETS_GO_S - 0.3)
-    radius = door.MADE_FOR - door.Door().width + door.Door().knob[1]
+    radius = door.Door(width=width).knob[1]
     # From where the knob is closed: x = r sin(phi), y = -r (1 - cos(phi)).
     knob = np.stack((radius * np.sin(open_by), -radius * (1.0 - np.cos(open_by)), 0.0 * t), 1)
     qpos = ease[None].repeat(frames, 0)
