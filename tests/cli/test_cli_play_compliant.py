@@ -40,6 +40,9 @@ def test_a_scene_from_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[
         (("pull", "--mass", "2"), "--mass says nothing of the scene 'pull'"),
         (("pull", "--level", "1.2"), "level of compliance must lie in 0 to 1"),
         (("throws", "--mass", "0"), "a ball must weigh above 0"),
+        (("pull", "--made-for", "1"), "--made-for says nothing of the scene 'pull'"),
+        (("door", "--made-for", "9"), "a motion is made for 0.5 to 3 m"),
+        (("pull", "--budget", "300"), "--budget is for --controller lookahead"),
         (("hands", "--count", "0"), "--count must lie in 1 to 1024"),
     ],
 )
@@ -49,6 +52,14 @@ def test_mistakes(
     assert main(["play", "compliant", *words, "-o", str(tmp_path / "out")]) == 2
     assert what in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_with_lookahead(tmp_path: Path) -> None:
+    argv = ["play", "compliant", "pull", "--count", "1", "--duration", "0.5", "--threads", "1"]
+    argv += ["--controller", "lookahead", "--budget", "40", "-o", str(tmp_path / "out")]
+    assert main(argv) == 0
+    # What comes along for the ball is not asked for.
+    assert main(["play", "compliant", "ball", *argv[3:], "--force"]) == 0
 
 
 def test_a_run_of_that_name_is_a_run(

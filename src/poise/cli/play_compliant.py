@@ -86,6 +86,8 @@ class Options:
     something comes along; none goes without."""
     controller: Literal["policy", "lookahead"] = "policy"
     """The policy alone, or with lookahead, which tries what it may do in copies of the scene."""
+    budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
+    """Lookahead: control steps simulated for each that is made (192)."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores; 0 is all."""
     open: Flag = False
@@ -103,19 +105,26 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("count", o.count, 1, 1024)
     check_range("duration", o.duration, 0.5, 3600)
     check_range("threads", o.threads, 0)
+    check_range("budget", o.budget, 1, 1_000_000)
+    if o.budget is not None and o.controller != "lookahead":
+        what = "--budget is for --controller lookahead"
+        raise PoiseError(what, hint="Add --controller lookahead, or leave --budget out")
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
     from poise.jobs.compliant.play import play
     from poise.jobs.compliant.training import open_learned, shipped
     from poise.jobs.open import open_run
+    from poise.plan import LookaheadConfig
 
+    how = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
     scene, given = scene_of(o), given_of(o)
     clip = None if o.clip is None else o.reading.read(o.clip)
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
         stated = o.level is not None or o.stiffness is not None
         if o.learned is None:
-            learned = None if stated else shipped(o.scene, tracker)
+            alone = stated or o.controller == "lookahead"
+            learned = None if alone else shipped(o.scene, tracker)
         else:
             learned = None if str(o.learned) == "none" else open_learned(o.learned, tracker)
     if learned is not None and learned.config.scene != o.scene:
@@ -125,7 +134,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError("a run gives way as it has learned to", hint="Leave --level, --stiffness out")
     with claimed(o.out):
         with working("simulating"):
-            more = (o.count, o.duration, o.threads, o.scene, learned, o.controller)
+            more = (o.count, o.duration, o.threads, o.scene, learned, o.controller, how)
             played = play(scene, tracker, clip, given, *more)
         with working("writing"):
             paths = played.write(o.out)

@@ -138,6 +138,7 @@ def play(
     name: str = "",
     learned: Learned | None = None,
     controller: Literal["policy", "lookahead"] = "policy",
+    lookahead: LookaheadConfig | None = None,
 ) -> Played:
     """A scene with compliance and without, from starts that differ by a hair.
 
@@ -151,6 +152,7 @@ def play(
             it has learned to.
         controller: the policy alone, or with lookahead, which simulates the scene with all that is going
             to happen in it; not with what was learned on top, nor against an opponent.
+        lookahead: how it looks ahead.
 
     Raises:
         PoiseError: the body cannot do the scene, or the clip cannot be read.
@@ -181,7 +183,7 @@ def play(
         top = None if compliance is None else learned
         if top is not None:
             own = replace(own, obs=(*own.obs, *seen(stage)))
-        ahead = controller == "lookahead"
+        ahead = (lookahead or LookaheadConfig()) if controller == "lookahead" else None
         both.append(_episodes(scene, tracker, replace(task, task=own), count, threads, top, ahead))
     (imitation, rollouts, looked, evaluation), (_, others, other, _) = both
     return Played(
@@ -202,11 +204,11 @@ def _episodes(
     count: int,
     threads: int,
     learned: Learned | None = None,
-    looks_ahead: bool = False,
+    lookahead: LookaheadConfig | None = None,
 ) -> tuple[Imitation, RolloutSet, Watch, Evaluation]:
     zero, watch = torch.zeros(count, dtype=torch.long), Watch(meter_of(scene))
     topped = None if learned is None else Topped(tracker.policy, learned.top, learned.added)
-    ahead = look_ahead(tracker, task, LookaheadConfig(), threads) if looks_ahead else None
+    ahead = look_ahead(tracker, task, lookahead, threads) if lookahead else None
 
     def make(worlds: int) -> ImitationEnv:
         env = task.env(worlds, None, False, threads, help_scale=0.0, guard=False)
