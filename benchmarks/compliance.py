@@ -42,6 +42,7 @@ from poise.jobs.compliant.training import Learned, shipped
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
+from poise.plan import LookaheadConfig
 from poise.view import line_plot
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
@@ -49,6 +50,8 @@ WALK = Path(poise.__file__).parent / "data/walk.bvh"
 COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
 #: s, when the backflip's feet begin to push off.
 PUSH_OFF_S = 0.5
+#: Control steps that the farther lookahead of the flips simulates for each that is made.
+BUDGET = 640.0
 LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
 #: Characters, control steps and repetitions of the cost.
 ROWS, STEPS, REPEATS = 512, 12, 9
@@ -266,6 +269,12 @@ def flips(tracker: Tracker, file: Path, threads: int) -> dict[str, Any]:
             rows[controller] = dict(made.figures)
             rows[f"{controller}, without"] = dict(made.stiff)
             print(height, controller, made.sentence(), flush=True)
+        if height in (0.05, 0.1):
+            much, level = LookaheadConfig().with_budget(BUDGET), Compliance(0.04)
+            how: dict[str, Any] = {"controller": "lookahead", "lookahead": much}
+            made = play(scene, tracker, clip, level, 8, 8.0, threads, **how)
+            rows[f"lookahead, {BUDGET:g}, level 0.04"] = dict(made.figures)
+            rows[f"lookahead, {BUDGET:g}, without"] = dict(made.stiff)
     return {"clip": file.name, "episodes": 8, "first_s": PUSH_OFF_S, "rows": out}
 
 

@@ -47,6 +47,7 @@ def _shortened(line: str) -> list[str]:
     line = re.sub(r"--minutes \d+|--seeds \S+", "", line)
     line = re.sub(r"--learn \d+", "--learn 0.02", line)
     line = re.sub(r"(=\d+),[\d,]+", r"\1", line)
+    line = re.sub(r"--budget \d+", "--budget 40", line)
     argv = shlex.split(line, comments=True)[1:]
     if argv[0] == "track":
         # A policy that knows nothing loses its motion, is looked ahead for and searched.
