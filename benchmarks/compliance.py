@@ -10,8 +10,7 @@ python benchmarks/compliance.py flips --clip humanoid3d_backflip.txt --json benc
 python benchmarks/compliance.py cost --json benchmarks/compliance.json
 
 All by the policy that comes with Poise, alone (the flips with lookahead, too) and without help; no
-training. Each part writes its
-section of the same file.
+training. Each part writes its section of the same file.
 """
 
 from __future__ import annotations
@@ -48,11 +47,11 @@ from poise.view import line_plot
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 
 COMMANDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1000.0)
+LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
 #: s, when the backflip's feet begin to push off.
 PUSH_OFF_S = 0.5
 #: Control steps that the farther lookahead of the flips simulates for each that is made.
 BUDGET = 640.0
-LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2)
 #: Characters, control steps and repetitions of the cost.
 ROWS, STEPS, REPEATS = 512, 12, 9
 

@@ -142,6 +142,9 @@ def test_a_door_that_nobody_gets_through(task: Imitation) -> None:
 def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> None:
     stage = Trampoline(0.1).stage(task.humanoid, task.reference)
     (plate,), (part,) = stage.props, stage.plugins
+    # Under the middle of what the motion crosses.
+    way = task.reference.pose.pos[:, 0, :2]
+    assert plate.pos[:2] == pytest.approx((0.5 * (way.amin(0) + way.amax(0))).tolist(), abs=1e-5)
     assert isinstance(part, InScene) and len(stage.touches) == len(task.humanoid.feet)
     things = (Character(task.humanoid), plate)
     scene = Scene(things, (), stage.touches, stage.floor, task.config.sim)

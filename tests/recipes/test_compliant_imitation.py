@@ -70,7 +70,7 @@ def test_the_state_is_two_poses_without_what_displaces_them(made: Imitation) -> 
     moved = env._frame()
     assert not torch.allclose(moved.sim.pos, two.sim.pos, atol=1e-3)
     assert torch.allclose(compliant.posture(moved), calm, atol=1e-4)
-    assert float(compliant.displacement(moved)[0, 8]) == pytest.approx(0.3)
+    assert float(compliant.displacement(moved, "shifted/u")[0, 8]) == pytest.approx(0.3)
 
 
 def test_what_the_discriminator_sees_of_a_clip_is_what_it_sees_of_a_character_on_it(

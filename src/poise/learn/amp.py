@@ -247,8 +247,10 @@ class Amp:
         mean = known.mean() if len(known) else style.new_zeros(())
         self._mean_style = float(mean)
         style = torch.where(style.isnan(), mean, style)
+        if config.product:
+            return task * style
         # r = w_task r_task + w_style r_style
-        return task * style if config.product else _weighted(config, task, style)
+        return config.task_weight * task + config.style_weight * style
 
     def update(self) -> dict[str, float]:
         """Some gradient steps on what the rollout showed; see `Style`.
@@ -373,10 +375,6 @@ class Amp:
         """See `Style`."""
         self.load_learned(state)
         self.history.load_state(under("own/history", state))
-
-
-def _weighted(config: AmpConfig, task: Tensor, style: Tensor) -> Tensor:
-    return config.task_weight * task + config.style_weight * style
 
 
 _LOGGED: tuple[str, ...] = (

@@ -10,9 +10,9 @@
 | Sec. 4.2 state (s_dyn, u, s_task)         | `seen`: the root, u, and what the scene tells       |
 | Sec. 5.4 six fictional forces as actions  | `Compliant.forces`                                  |
 
-The paper's controller learns all of a motion from nothing by an adversarial reward, for 6 to 24 hours.
-Here the policy that tracks any motion follows the displaced goal, and what is learned on top is what
-the scene's task asks for beside that, in minutes.
+The paper's controller learns all of a motion from nothing by an adversarial reward, for 6 to 24 hours:
+see `recipes.compliant_imitation`. Here the policy that tracks any motion follows the displaced goal, and
+what is learned on top is what the scene's task asks for beside that, in minutes.
 """
 
 from __future__ import annotations
@@ -23,14 +23,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from poise.control import Compliance, Stiffness
 from poise.env import DoneTerm, ObsTerm, TaskConfig
-from poise.env.frame import Frame
 from poise.env.on_top import Added
 from poise.env.scenes import SCENES, PlayScene, Stage
-from poise.env.terms import obs
+from poise.env.terms import compliant, obs
 from poise.errors import PoiseError, did_you_mean
 from poise.learn import PPOConfig
 from poise.settings import Migration, from_data, validate
@@ -103,15 +100,10 @@ class Compliant:
 LEARNED = ("ball", "door")
 
 
-def displacement(frame: Frame) -> Tensor:
-    """u `(N, 6 + n)`, by how much the goal is displaced, m and rad."""
-    return frame.source("compliance/u").float()
-
-
 def seen(stage: Stage) -> tuple[ObsTerm, ...]:
     """What the policy on top sees."""
     own = (obs.root_height, obs.root_tilt, obs.root_velocity)
-    u = ObsTerm("displacement", displacement)
+    u = ObsTerm("displacement", compliant.displacement)
     return (*(ObsTerm(f"own/{t.__name__}", t) for t in own), u, *stage.obs)
 
 

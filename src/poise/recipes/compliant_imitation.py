@@ -99,10 +99,11 @@ class CompliantImitation:
 
 def observations(config: CompliantImitation) -> tuple[ObsTerm, ...]:
     """(s_dyn, u), and where the displaced reference's root is."""
-    seen = [compliant.two_poses, compliant.turns, compliant.displacement, obs.target_root]
-    if config.action == "additive":
-        seen.append(obs.target_joints)
-    return tuple(ObsTerm(t.__name__, t) for t in seen)
+    u = ObsTerm("displacement", compliant.displacement, {"source": "shifted/u"})
+    own = (compliant.two_poses, compliant.turns)
+    goal = (obs.target_root, *((obs.target_joints,) if config.action == "additive" else ()))
+    before, after = (tuple(ObsTerm(t.__name__, t) for t in terms) for terms in (own, goal))
+    return (*before, u, *after)
 
 
 def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:

@@ -29,9 +29,10 @@ def turns(frame: Frame) -> Tensor:
     return quat_to_sixd(local).flatten(1)
 
 
-def displacement(frame: Frame) -> Tensor:
-    """u `(N, 6 + n)`, by how much the goal is displaced, m and rad."""
-    return frame.source("shifted/u").float()
+def displacement(frame: Frame, source: str = "compliance/u") -> Tensor:
+    """u `(N, 6 + n)`, by how much the goal is displaced, m and rad. source: "shifted/u" is known where
+    nothing gives way, too."""
+    return frame.source(source).float()
 
 
 def posture(frame: Frame) -> Tensor:
