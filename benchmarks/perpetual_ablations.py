@@ -31,6 +31,7 @@ from poise.jobs.run_file import RUN_FILE
 from poise.learn import AmpConfig, Until
 from poise.motion import ClipLibrary
 from poise.recipes.perpetual import Perpetual, build
+from poise.recipes.perpetual.shapes import BodyShapes
 from poise.recipes.residual_force import ResidualForce
 
 #: Every row adds what its name says to the one before; the last three stand for themselves.
@@ -55,7 +56,21 @@ MORE = {
 }
 #: In the manner of UHC: one network, additive actions, its reward, a root force up to 100 N or none.
 UHC = ("uhc", "uhc-helped")
-ROWS = (*LADDER, *MORE, *UHC)
+#: What the tracker knows beside the paper, each by itself on the first and at last together.
+_BARE = LADDER["relaxed"] | {"heading": "twist"}
+_PRICES = {"action_rate": 3.0, "foot_slide": 0.2}
+INGREDIENTS = {
+    "bare": _BARE,
+    "heading": _BARE | {"heading": "hips"},
+    "window": _BARE | {"window": (2, 4, 8)},
+    "filter": _BARE | {"filter": 0.5},
+    "root": _BARE | {"root": 0.2},
+    "prices": _BARE | _PRICES,
+    "own-bodies": _BARE | {"shapes": BodyShapes(own=True)},
+    "as-shipped": _BARE | {"window": (2, 4, 8), "root": 0.2} | _PRICES,
+    "together": _BARE | {"heading": "hips", "window": (2, 4, 8), "filter": 0.5, "root": 0.2} | _PRICES,
+}
+ROWS = (*LADDER, *MORE, *UHC, *INGREDIENTS)
 
 
 def settings(name: str, seed: int) -> Perpetual:
@@ -67,7 +82,7 @@ def settings(name: str, seed: int) -> Perpetual:
     if name.startswith("absolute"):
         # Noise in shares of a joint's range.
         ppo = replace(ppo, std=0.02)
-    return replace(additive, ppo=ppo, **(LADDER | MORE).get(name, {}))
+    return replace(additive, ppo=ppo, **(LADDER | MORE | INGREDIENTS).get(name, {}))
 
 
 def uhc(name: str, seed: int) -> ResidualForce:
@@ -77,9 +92,9 @@ def uhc(name: str, seed: int) -> ResidualForce:
     return ResidualForce(method=method, help_limit=100.0, help_start=None, ppo=ppo, seed=seed)
 
 
-def library_at(a: argparse.Namespace) -> ClipLibrary:
-    """The clips on one skeleton."""
-    how = LibraryConfig(rates=SIXTY)
+def library_at(a: argparse.Namespace, own: bool = False) -> ClipLibrary:
+    """The clips on one skeleton. own: with the lengths of each clip's own bones."""
+    how = LibraryConfig(rates=SIXTY, own_bones=own)
     library, notes = clips_of(a.library, BodyConfig(), (), (), print, a.onto, how)
     print(*notes, sep="\n")
     return library
@@ -98,7 +113,7 @@ def one(a: argparse.Namespace, name: str, seed: int) -> None:
     if (out / RUN_FILE).exists():
         imitation = resume(out, config, source)
     else:
-        imitation = begin(out, library_at(a), config, source)
+        imitation = begin(out, library_at(a, config.shapes.own), config, source)
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         train(imitation, out, until, show, 1, beginning=beginning())
 
@@ -114,6 +129,7 @@ def main() -> None:
     parser.add_argument("--worker", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--collect", action="store_true")
+    parser.add_argument("--json", type=Path, default=Path(__file__).with_name("perpetual_rows.json"))
     a = parser.parse_args()
     jobs = [(name, seed) for seed in a.seeds for name in a.only]
     for k, (name, seed) in enumerate(jobs):
@@ -122,7 +138,7 @@ def main() -> None:
             one(a, name, seed)
     kept = a.out / "nothing.json"
     null = perpetual_rows.null_of(lambda: build(library_at(a), settings("relaxed", 0)), kept)
-    perpetual_rows.write(a.out, a.samples, null, Path(__file__).with_name("perpetual_rows.json"))
+    perpetual_rows.write(a.out, a.samples, null, a.json)
     named = " ".join(f"{n}-{s}={a.out}/{n}-{s}" for n, s in jobs if n not in UHC)
     print(f"python benchmarks/perpetual.py --runs {named} --parts table noise recovery owners curves")
 

@@ -35,6 +35,8 @@ AGAINST = {
     "no-energy": "relaxed", "style": "relaxed", "one-large-network": "relaxed",
     "means": "progressive", "primitives-1": "progressive", "primitives-3": "progressive",
     "primitives-4": "progressive", "uhc": "relaxed", "uhc-helped": "uhc",
+    "heading": "bare", "window": "bare", "filter": "bare", "root": "bare", "prices": "bare",
+    "own-bodies": "bare", "as-shipped": "bare", "together": "bare",
 }  # fmt: skip
 RULE = (
     "A difference of the share of each clip until it fails is shown where it is more than twice the "

@@ -9,6 +9,7 @@ r"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
         --acceleration 0.6 --slide 1
     python benchmarks/tracker.py ... --from SMOOTHER -o SMOOTHEST --step 3e-5 --std 0.02 \
         --acceleration 1.2 --slide 2
+    python benchmarks/tracker.py ... --from POLICY -o TOUGHER --noise 0.25 0.5
 
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
 subjects of CMU are held out. There is no help at any time: training begins with a search for motions
@@ -131,6 +132,11 @@ def main() -> None:
     parser.add_argument("--hips", action="store_true")
     parser.add_argument("--acceleration", type=float, default=0.0, help="price of rough motion")
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
+    parser.add_argument("--noise", type=float, nargs="*", default=[], help="see Perpetual.noise")
+    parser.add_argument(
+        "--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned"
+    )
+    parser.add_argument("--samples", type=int, help="control steps at most")
     parser.add_argument("--recovery", type=float, default=0.4)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--worlds", type=int, default=4096, help="characters at once")
@@ -148,19 +154,20 @@ def main() -> None:
     )
     if earlier:
         large = {"num_envs": a.worlds, "cooling": a.cooling, "evaluate_every": a.every}
+        large["noise"] = tuple(a.noise)
         settings = replace(settings, ppo=replace(settings.ppo, minibatch=a.minibatch), **large)
     source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source, a.device)
     else:
         how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
-        held = (HELD_OUT, TWINS, print, earlier.target if earlier else a.onto, how)
+        held = (a.hold_out, TWINS, print, earlier.target if earlier else a.onto, how)
         library, notes = clips_of(a.library, BodyConfig(), *held)
         print(*notes, sep="\n")
         imitation = begin(a.out, library, settings, source, a.device, earlier)
         trained = widened(earlier, imitation) if earlier else None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
-        until, first = Until(minutes=a.minutes), beginning()
+        until, first = Until(minutes=a.minutes, samples=a.samples), beginning()
         how = {"device": a.device, "beginning": first, "trained": trained}
         train(imitation, a.out, until, show, a.threads, **how)
 

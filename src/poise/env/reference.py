@@ -90,6 +90,8 @@ class Reference:
         #: Where the numbers of packed poses stand.
         self.layout = Layout(pose)
         self._packed = self.layout.pack(pose, self._place)
+        #: The same of what policies are told, where that is something else, see `told`.
+        self._told: Tensor | None = None
         # What one cycle adds: the turn and the horizontal travel from the first to the last frame.
         steps = [cycle_step(q) for q in motions]
         self.cycle_turn = torch.stack([turn for turn, _ in steps])
@@ -112,6 +114,8 @@ class Reference:
         parts, out = (self, *others), copy.copy(self)
         for name in _JOINED:
             setattr(out, name, torch.cat([getattr(p, name) for p in parts]))
+        if any(p.misleads for p in parts):
+            out._told = torch.cat([p._packed if p._told is None else p._told for p in parts])
         out.names = tuple(name for p in parts for name in p.names)
         out.start = torch.cumsum(out.length, 0) - out.length
         out.any_cyclic = any(p.any_cyclic for p in parts)
@@ -167,19 +171,49 @@ class Reference:
     def with_pose(self, pose: Pose) -> Reference:
         """The same clips with other goals: every frame's pose, of the same shapes as `pose` has."""
         other = copy.copy(self)
-        other._packed = self.layout.pack(pose, self._place)
+        other._packed, other._told = self.layout.pack(pose, self._place), None
         return other
+
+    def told(self, motions: Sequence[np.ndarray]) -> Reference:
+        """The same clips, of which policies are told something else, such as an estimator's output.
+
+        What comes next, and what actions add to, is of `motions`; where characters begin and what they
+        are judged by stays.
+
+        Args:
+            motions: `(T, 7 + n)` for each clip, of as many frames.
+
+        Raises:
+            PoiseError: not so many clips or frames.
+        """
+        if [len(q) for q in motions] != self.length.tolist():
+            raise PoiseError("what policies are told needs a frame for each of the clips' frames")
+        speed = [cycle_velocity if c else qpos_velocity for c in self.cyclic.tolist()]
+        moves = [of(q, self.rate_hz) for of, q in zip(speed, motions, strict=True)]
+        qpos, qvel = (torch.tensor(np.concatenate(x), dtype=torch.float64) for x in (motions, moves))
+        other = copy.copy(self)
+        pose = self._poses(qpos, qvel, self.body.repeat_interleave(self.length))
+        other._told, other.hinges = self.layout.pack(pose, self._place), qpos[:, 7:].contiguous()
+        return other
+
+    @property
+    def misleads(self) -> bool:
+        """Whether policies are told something else than what characters are judged by."""
+        return self._told is not None
 
     def gather(self, clip: Tensor, frame: Tensor) -> Pose:
         """The reference pose of `frame (N)` of `clip (N)`; cyclic clips are carried on."""
         return self.layout.unpacked(self.gather_packed(clip, frame))
 
-    def gather_packed(self, clip: Tensor, frame: Tensor, rows: Tensor | None = None) -> Tensor:
+    def gather_packed(
+        self, clip: Tensor, frame: Tensor, rows: Tensor | None = None, told: bool = False
+    ) -> Tensor:
         """The same poses as rows `(N, W)` of all their numbers, for `unpacked`.
 
-        rows: what `self.rows(clip, frame)` gives, where it is known already.
+        rows: what `self.rows(clip, frame)` gives, where it is known already. told: as policies are told.
         """
-        packed = self._packed.index_select(0, self.rows(clip, frame) if rows is None else rows)
+        table = self._packed if self._told is None or not told else self._told
+        packed = table.index_select(0, self.rows(clip, frame) if rows is None else rows)
         carry = self.carry(clip, frame)
         if carry is None:
             return packed
@@ -193,16 +227,17 @@ class Reference:
     def follow(
         self, rows: Tensor, clip: Tensor, frame: Tensor, held: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The row after each of `rows (N)`, and its packed pose; it is frame `frame + 1` of `clip`.
+        """The row after each of `rows (N)`, and its packed pose as policies are told it; it is frame
+        `frame + 1` of `clip`.
 
         held: `(N)` bool, where the rows stay and are frame `frame`.
         """
         after = self._after.index_select(0, rows)
         rows = after if held is None else torch.where(held, rows, after)
         if not self.any_cyclic:
-            return rows, self._packed.index_select(0, rows)
+            return rows, (self._packed if self._told is None else self._told).index_select(0, rows)
         ahead = frame + 1 if held is None else frame + 1 - held.long()
-        return rows, self.gather_packed(clip, ahead, rows)
+        return rows, self.gather_packed(clip, ahead, rows, told=True)
 
     def coordinates(self, clip: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """`qpos (N, 7 + n)` and `qvel (N, 6 + n)`, float64, of the poses that `gather` gives."""

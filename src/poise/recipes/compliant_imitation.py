@@ -25,15 +25,13 @@ import torch
 
 from poise.body import BodyConfig, Humanoid
 from poise.control import Compliance, PDTargets
-from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
+from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
 from poise.env.events import Pushes
 from poise.env.shifted import Shifted
 from poise.env.terms import compliant, done, obs
 from poise.errors import PoiseError
-from poise.kin import fit_humanoid
-from poise.kin.place import on_own_body
 from poise.learn import AmpConfig, PPOConfig
-from poise.recipes.imitation import Clips, Imitation, as_library
+from poise.recipes.imitation import Clips, Imitation, fitted
 from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
@@ -135,9 +133,7 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
 def build(clips: Clips, config: CompliantImitation | None = None) -> Imitation:
     """Body, reference and task of clips in any order; train with `.trainer(style=config.style)`."""
     config = config or CompliantImitation()
-    library, own = on_own_body(as_library(clips), config.body)
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, own)
-    reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
+    library, humanoid, reference, report = fitted(clips, config.body, config.sim.control_hz)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
 
 

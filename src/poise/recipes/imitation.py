@@ -10,11 +10,12 @@ from typing import Any, cast
 import mujoco
 from torch import Tensor
 
-from poise.body import Humanoid
+from poise.body import BodyConfig, BodyTable, Humanoid
 from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
-from poise.kin import FitReport
+from poise.kin import FitReport, fit_humanoid
+from poise.kin.place import on_own_body
 from poise.learn import Amp, AmpConfig, LessonConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
@@ -53,6 +54,18 @@ def as_library(clips: Clips) -> ClipLibrary:
         what = f"a recipe is built of a clip, a motion file or a ClipLibrary, got {type(clip).__name__}"
         raise PoiseError(what, hint="Put several clips into ClipLibrary.of([...])")
     return ClipLibrary.of(clip)
+
+
+def fitted(
+    clips: Clips, body: BodyConfig, rate_hz: float, table: BodyTable | None = None, widens: bool = True
+) -> tuple[ClipLibrary, Humanoid, Reference, FitReport]:
+    """Clips on the skeleton of their body, the body, their reference, and what fitting did.
+
+    table, widens: see `fit_humanoid`; by default a body is made, or is that of `body.mjcf`.
+    """
+    library, own = on_own_body(as_library(clips), body)
+    humanoid, motions, report = fit_humanoid(library, body, rate_hz, table or own, widens)
+    return library, humanoid, Reference(humanoid, motions, rate_hz, library.names, report.cyclic), report
 
 
 @dataclass(frozen=True, eq=False, repr=False)

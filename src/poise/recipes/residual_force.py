@@ -33,14 +33,12 @@ from poise.control import (
     Residual,
     SuccessHelp,
 )
-from poise.env import DoneTerm, ObsTerm, Reference, RewardTerm, TaskConfig
+from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
 from poise.env.frame import TermFunction
 from poise.env.terms import done, next_frames, obs, reward
-from poise.kin import fit_humanoid
-from poise.kin.place import on_own_body
 from poise.learn import PPOConfig
 from poise.motion import Clip
-from poise.recipes.imitation import Clips, Imitation, as_library
+from poise.recipes.imitation import Clips, Imitation, fitted
 from poise.settings import Migration, from_data, validate
 from poise.sim import SimConfig
 
@@ -288,9 +286,7 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
 def build(clips: Clips, config: ResidualForce | None = None) -> Imitation:
     """Body, reference and task for a clip, a motion file or a library; train with `.trainer()`."""
     config = config or ResidualForce()
-    library, own = on_own_body(as_library(clips), config.body)
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, own)
-    reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
+    library, humanoid, reference, report = fitted(clips, config.body, config.sim.control_hz)
     return Imitation(library, humanoid, reference, report, config, task(config, humanoid))
 
 

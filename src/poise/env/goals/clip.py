@@ -37,7 +37,7 @@ class ClipGoal(Goal):
         self.odds: Callable[[], Tensor] | None = None
         self.clip = torch.zeros(num_envs, dtype=torch.long, device=device)
         self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)
-        # The rows of what comes next, and its packed poses.
+        # The rows of what comes next, and its packed poses as policies are told them.
         self._rows, self._ahead = self.clip.clone(), reference.packed(self.clip)
 
     begins = True
@@ -73,11 +73,11 @@ class ClipGoal(Goal):
         ahead = self.frame + 1 if held is None else self.frame + 1 - held.long()
         if ids is None:
             self._rows = self.reference.rows(self.clip, ahead)
-            self._ahead = self.reference.gather_packed(self.clip, ahead, self._rows)
+            self._ahead = self.reference.gather_packed(self.clip, ahead, self._rows, told=True)
         else:
             clip, ahead = self.clip[ids], ahead[ids]
             self._rows[ids] = self.reference.rows(clip, ahead)
-            self._ahead[ids] = self.reference.gather_packed(clip, ahead)
+            self._ahead[ids] = self.reference.gather_packed(clip, ahead, told=True)
 
     def body(self, ids: Tensor | None) -> Tensor:
         return self.reference.body[self.clip if ids is None else self.clip[ids]]
@@ -91,7 +91,7 @@ class ClipGoal(Goal):
         if k == 1:
             return self._ahead if ids is None else self._ahead[ids]
         clip, frame = (self.clip, self.frame) if ids is None else (self.clip[ids], self.frame[ids])
-        return self.reference.gather_packed(clip, frame + k)
+        return self.reference.gather_packed(clip, frame + k, told=True)
 
     def targets(self) -> tuple[Tensor, Tensor]:
         return self.reference.hinges, self._rows
@@ -101,6 +101,8 @@ class ClipGoal(Goal):
         if waited is not None:
             self.frame.sub_(waited.long())
         now = self._ahead
+        if self.reference.misleads:
+            now = self.reference.gather_packed(self.clip, self.frame, self._rows)
         self._rows, self._ahead = self.reference.follow(self._rows, self.clip, self.frame, held)
         return now, self._ahead
 

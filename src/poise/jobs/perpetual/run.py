@@ -64,7 +64,7 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
             hint="Go on from a single network, or resume its run",
         )
     done = {"expert": False, "trajopt": None, "help_start": 0.0}
-    asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery")}
+    asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery", "noise")}
     asked["recovering"] = replace(policy.recovering, demonstrations=wanted.recovering.demonstrations)
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
     if wanted.recovery:

@@ -102,6 +102,8 @@ class Perpetual:
         action_rate, torque_rate, acceleration, foot_slide: prices of changing actions and torques, of
             bodies accelerated otherwise than the reference's and of feet that slide, see `phc_reward`;
             with several bodies the soles are those of the first.
+        noise: each clip is learned once more with so many times a video estimator's noise, such as
+            (0.25, 0.5), of which the policy is told, and is judged by the clean clip, see `noisy`.
         style: the motion prior, None for none.
         termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
             "code".
@@ -160,6 +162,7 @@ class Perpetual:
     torque_rate: float = 0.0
     acceleration: float = 0.0
     foot_slide: float = 0.0
+    noise: tuple[float, ...] = ()
     style: AmpConfig | None = field(default_factory=AmpConfig)
     termination: Literal["relaxed", "all", "code"] = "relaxed"
     first: float = 0.1
@@ -239,6 +242,10 @@ class Perpetual:
         prices = self.action_rate, self.torque_rate, self.acceleration, self.foot_slide
         if min(self.root, *prices) < 0:
             raise PoiseError("the weight of root and all prices must be at least 0", "Perpetual")
+        if any(not 0 < x < 100 for x in self.noise) or len(set(self.noise)) < len(self.noise):
+            raise PoiseError(f"noise needs different strengths above 0, got {self.noise}", "Perpetual")
+        if self.noise and self.shapes.several:
+            raise PoiseError("noise is learned on one body, and there are several shapes", "Perpetual")
         if not 0 <= self.cooling <= 1:
             raise PoiseError(f"cooling must lie in [0, 1], got {self.cooling}", "Perpetual")
         if self.cooling and self.ppo.kl_target is not None:

@@ -33,16 +33,15 @@ from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
 from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
-from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskConfig
+from poise.env import DoneTerm, ObsTerm, Recovery, RewardTerm, TaskConfig
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_reward import recovery_terms
-from poise.kin import fit_humanoid
-from poise.kin.place import on_own_body
 from poise.kin.solids import shapes_of
 from poise.metrics import foot_points
-from poise.recipes.imitation import Clips, Imitation, as_library
+from poise.recipes.imitation import Clips, Imitation, fitted
 from poise.recipes.perpetual.config import Perpetual, Recovers, RecoveryPlan
+from poise.recipes.perpetual.noisy import noisy
 from poise.recipes.perpetual.recovery import known_recovery_clips
 from poise.recipes.perpetual.shapes import shaped
 
@@ -185,11 +184,8 @@ def build(
     known: the recovery clips of that policy; by default those of the library.
     """
     config = config or Perpetual()
-    library, own = on_own_body(as_library(library), config.body)
-    widens = table is None or config.widens
-    table = table or own
-    humanoid, motions, report = fit_humanoid(library, config.body, config.sim.control_hz, table, widens)
-    reference = Reference(humanoid, motions, config.sim.control_hz, library.names, report.cyclic)
+    widens, rate = table is None or config.widens, config.sim.control_hz
+    library, humanoid, reference, report = fitted(library, config.body, rate, table, widens)
     recovery_clips = known_recovery_clips(config, reference, known)
     if recovery_clips is None:
         # Without recovery clips a point goal is practised by a primitive of its own.
@@ -197,6 +193,7 @@ def build(
     guided = recovery_clips is not None
     own = task(config, humanoid, guided)
     built = Imitation(library, humanoid, reference, report, config, own, recovery_clips)
+    built = noisy(built, config.noise, config.seed)
     return shaped(built, config.shapes, lambda body: task(config, body, guided))
 
 
