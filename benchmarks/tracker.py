@@ -133,9 +133,7 @@ def main() -> None:
     parser.add_argument("--acceleration", type=float, default=0.0, help="price of rough motion")
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
     parser.add_argument("--noise", type=float, nargs="*", default=[], help="see Perpetual.noise")
-    parser.add_argument(
-        "--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned"
-    )
+    parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")
     parser.add_argument("--samples", type=int, help="control steps at most")
     parser.add_argument("--recovery", type=float, default=0.4)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")

@@ -50,13 +50,16 @@ def test_a_run_goes_on_from_another_ones_policy(
     first, then = tmp_path / "first", tmp_path / "then"
     one = ("--no-multiplicative", "--no-recovery", "--help-start", "0")
     assert main(command(folder, first, *one)) == 0
-    go_on = command(folder, then, "--no-recovery", "--seed", "3", "--from", str(first))
+    more = ("--no-recovery", "--seed", "3", "--noise", "0.5")
+    go_on = command(folder, then, *more, "--from", str(first))
     go_on = [x for x in go_on if x not in ("--max-primitives", "2")]
     assert main(go_on) == 0
     before, after = (json.loads((x / "result.json").read_text()) for x in (first, then))
-    assert after["samples"] > 0 and before["clips"] == after["clips"]
+    assert after["samples"] > 0 and after["clips"] == 2 * before["clips"]
     config = open_run(then).task.config
-    assert config.seed == 3 and not config.multiplicative and not config.expert
+    assert (
+        config.noise == (0.5,) and config.seed == 3 and not config.multiplicative and not config.expert
+    )
     assert main([*go_on, "--resume"]) == 0
     capsys.readouterr()
     go_on[go_on.index(str(first))], go_on[go_on.index(str(then))] = "nothing", str(tmp_path / "none")

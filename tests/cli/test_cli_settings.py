@@ -84,6 +84,7 @@ def test_what_is_stated_reaches_the_settings() -> None:
         plain, single=True, help_start=0.0, trajopt=TrajOptConfig(iterations=11), style=None,
         recovering=replace(plain.recovering, demonstrations=0),
     )  # fmt: skip
+    assert trains("perpetual", "--noise", "0.25", "0.5").noise == (0.25, 0.5)
     made = trains("inbetween", "--net", "transformer", "--dropout", "0.15", "--seed", "3")
     assert made.between_training.dropout == 0.15 and made.seed == 3
 

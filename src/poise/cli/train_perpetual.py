@@ -60,6 +60,9 @@ class Primitives(_Derived):
     learns from that alone, and PPO trains the critic. With --from the policy comes to observe more.
     A POLICY, a file or a run, is imitated at first, with its settings and body but for what is stated,
     such as --goal keypoints."""
+    noise: Annotated[tuple[float, ...], arg(metavar="X [X ...]", help_behavior_hint="")] = ()
+    """perpetual: learn each clip once more with so many times a video estimator's noise, such as
+    0.25 0.5: the policy is told the noisy motion and judged by the clean one."""
     style: Flag = True
     """perpetual: reward the task alone; by default a discriminator rewards motion like the library's."""
 
@@ -112,7 +115,7 @@ def check_going_on(primitives: Primitives, body: Body, library: Library, returns
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
-    free = {"recovery", "recovery_clips", "single", "going_on", "teacher"}
+    free = {"recovery", "recovery_clips", "single", "going_on", "teacher", "noise"}
     if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.add("max_primitives")
     names = [name for name in given(primitives, body) if name not in free]
