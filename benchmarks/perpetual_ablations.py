@@ -138,7 +138,7 @@ def main() -> None:
             one(a, name, seed)
     kept = a.out / "nothing.json"
     null = perpetual_rows.null_of(lambda: build(library_at(a), settings("relaxed", 0)), kept)
-    perpetual_rows.write(a.out, a.samples, null, a.json)
+    perpetual_rows.write(a.out, a.samples, null, a.json, not set(a.only) <= set(INGREDIENTS))
     named = " ".join(f"{n}-{s}={a.out}/{n}-{s}" for n, s in jobs if n not in UHC)
     print(f"python benchmarks/perpetual.py --runs {named} --parts table noise recovery owners curves")
 

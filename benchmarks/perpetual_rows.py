@@ -227,11 +227,15 @@ def null_of(task: Callable[[], Imitation], kept: Path) -> dict[str, Any]:
     return json.loads(kept.read_text())
 
 
-def write(folder: Path, samples: int, null: dict[str, Any], out: Path) -> None:
-    """JSON and tables of all finished runs in a folder."""
+def write(folder: Path, samples: int, null: dict[str, Any], out: Path, kept: bool = True) -> None:
+    """JSON and tables of all finished runs in a folder, and of those in `perpetual_ablations.json`.
+
+    kept: False leaves the latter out.
+    """
     found = {p.name: row_of(p, samples) for p in sorted(folder.iterdir()) if (p / LATEST).exists()}
     rows = {n: r for n, r in found.items() if r is not None}
-    before = earlier(Path(__file__).with_name("perpetual_ablations.json"), null["steps"])
+    path = Path(__file__).with_name("perpetual_ablations.json")
+    before = earlier(path, null["steps"]) if kept else {}
     command = "python benchmarks/perpetual_ablations.py --library FOLDER --onto FILE -o RUNS "
     command += f"--samples {samples}"
     if rows:
