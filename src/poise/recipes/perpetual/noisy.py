@@ -11,10 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
-from torch import Tensor
 
 from poise.env import Reference
 from poise.errors import PoiseError
@@ -22,6 +20,7 @@ from poise.kin import place_on_body
 from poise.motion import Clip, ClipLibrary
 from poise.motion.noise import VIDEO, perturb_clip, scaled
 from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual.shapes import motions_of
 
 
 def noisy(imitation: Imitation, strengths: Sequence[float], seed: int = 0) -> Imitation:
@@ -38,8 +37,7 @@ def noisy(imitation: Imitation, strengths: Sequence[float], seed: int = 0) -> Im
     if not strengths:
         return imitation
     reference, own = imitation.reference, imitation.library
-    parts = cast("tuple[Tensor, ...]", reference.qpos.split(reference.length.tolist()))
-    clean, clips, weights = [q.numpy() for q in parts], list(own.clips), list(own.weights)
+    clean, clips, weights = motions_of(reference), list(own.clips), list(own.weights)
     motions, told = list(clean), list(clean)
     for strength in strengths:
         for clip, qpos, weight in zip(own.clips, clean, own.weights, strict=True):

@@ -128,7 +128,7 @@ def shaped(
     sizes = shapes.factors()
     tables = [base.table, *(scaled_table(base.table, s) for s in sizes[1:])]
     skeletons = [base.skeleton, *(scaled_skeleton(base.skeleton, base.table, s) for s in sizes[1:])]
-    clips, motions = list(imitation.library.clips), _motions(imitation.reference)
+    clips, motions = list(imitation.library.clips), motions_of(imitation.reference)
     weights, body = list(imitation.library.weights), [0] * len(clips)
     cyclic = cast("list[bool]", imitation.reference.cyclic.tolist())
     example = clips[0]
@@ -155,7 +155,7 @@ def _own_bodies(imitation: Imitation) -> tuple[
     coordinates, which clips go on in cycles, and which body each has."""
     base, clips, body = imitation.humanoid, list[Clip](), list[int]()
     tables, skeletons = [base.table], [base.skeleton]
-    motions = _motions(imitation.reference)
+    motions = motions_of(imitation.reference)
     cyclic = cast("list[bool]", imitation.reference.cyclic.tolist())
     example = imitation.library.clips[0]
     for c, clip in enumerate(imitation.library.clips):
@@ -259,7 +259,8 @@ def _leg(rows: Sequence[BodyRow]) -> float:
     return sum(float(np.linalg.norm(r.pos)) for r in rows if r.kind in ("shin", "foot"))
 
 
-def _motions(reference: Reference) -> list[np.ndarray]:
+def motions_of(reference: Reference) -> list[np.ndarray]:
+    """Coordinates of each clip `(T, 7 + n)`."""
     parts = cast("tuple[Tensor, ...]", reference.qpos.split(reference.length.tolist()))
     return [q.numpy().copy() for q in parts]
 
