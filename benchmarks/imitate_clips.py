@@ -4,9 +4,9 @@
         [--only NAME ...] [--minutes 10] [--seeds 0] [--threads 1]
 
 For each clip, on the policy's joints with the bones of the clip, from reading the file on, without any
-help: seconds until lookahead has done the whole motion (the first result), and seconds of the whole
-training, which ends where the policy alone succeeds from 32 start frames or at `--minutes`, with
-success over all start frames after it. A row that is there is measured again for another policy alone.
+help: seconds until the first result, which looks ahead and searches for what is lost so, and whether it
+is the whole motion; and seconds of the whole training, which ends where the policy alone succeeds from
+32 start frames or at `--minutes`, with success over all start frames after it. A row that is there is measured again for another policy alone.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def measured(name: str, data: Path, minutes: float, seed: int, threads: int) -> 
     began = time.perf_counter()
     of = (data / file).with_name(skeleton) if skeleton else None
     clip = read_clip(data / file, skeleton=of, fps=fps)
-    config = TrackConfig(body="own", controller="lookahead", threads=threads, seed=seed)
+    config = TrackConfig(body="own", threads=threads, seed=seed)
     first = track(clip, config=config)
     seen = time.perf_counter() - began
     with tempfile.TemporaryDirectory() as folder:

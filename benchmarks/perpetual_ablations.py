@@ -1,13 +1,16 @@
-"""The paper's ablations on a small library, each run one switch away from the one it is compared with.
+r"""The paper's ablations on a small library, each run one switch away from the one it is compared with.
 
     python benchmarks/perpetual_ablations.py --library FOLDER --onto FILE -o RUNS [--samples 2000000]
     python benchmarks/perpetual.py --runs NAME=RUNS/NAME ... --parts table noise recovery owners curves
+    python benchmarks/perpetual_ablations.py ... -o TAUGHT --only longer taught taught-ppo \
+        --from RUNS/together-1 --minutes 6 --json benchmarks/perpetual_taught.json
 
 Trains the runs of `ROWS` with the same samples, the cloning of the expert counted, without any help
 (but for "uhc-helped") and without a motion prior (but for "style"), writes `perpetual_rows.json` and
 `.md` of all that are done (see `perpetual_rows.py`) and prints the second command. A run that was
 stopped is gone on with, finished ones stay. `--worker K --workers N` takes every Nth run, for several
-processes at once; `--collect` trains nothing.
+processes at once; `--collect` trains nothing. The rows of `TAUGHT` go on from a finished run, for equal
+times in place of equal samples.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import argparse
 import contextlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import perpetual_rows
 from tracker import SIXTY
@@ -25,11 +29,14 @@ from poise.cli.perpetual_report import shown
 from poise.cli.training import beginning
 from poise.jobs import runs
 from poise.jobs.library.clips import LibraryConfig
+from poise.jobs.open import open_run
 from poise.jobs.perpetual.result import RESULT
 from poise.jobs.perpetual.run import begin, clips_of, resume, train
 from poise.jobs.run_file import RUN_FILE
-from poise.learn import AmpConfig, Until
+from poise.jobs.warm_start import widened
+from poise.learn import AmpConfig, LessonConfig, Until
 from poise.motion import ClipLibrary
+from poise.plan import TeacherConfig
 from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.shapes import BodyShapes
 from poise.recipes.residual_force import ResidualForce
@@ -70,7 +77,14 @@ INGREDIENTS = {
     "as-shipped": _BARE | {"window": (2, 4, 8), "root": 0.2} | _PRICES,
     "together": _BARE | {"heading": "hips", "window": (2, 4, 8), "filter": 0.5, "root": 0.2} | _PRICES,
 }
-ROWS = (*LADDER, *MORE, *UHC, *INGREDIENTS)
+#: From a run that is done: PPO alone, a teacher that looks ahead alone, both.
+_FEW = {"num_envs": 128, "teacher": TeacherConfig()}
+TAUGHT: dict[str, dict[str, Any]] = {
+    "longer": {},
+    "taught": _FEW,
+    "taught-ppo": _FEW | {"lessons": LessonConfig(reinforce=True)},
+}
+ROWS = (*LADDER, *MORE, *UHC, *INGREDIENTS, *TAUGHT)
 
 
 def settings(name: str, seed: int) -> Perpetual:
@@ -109,6 +123,9 @@ def one(a: argparse.Namespace, name: str, seed: int) -> None:
         task = runs.begin(out, library_at(a), uhc(name, seed))
         runs.train(task, out, until, threads=1, tensorboard=False)
         return
+    if name in TAUGHT:
+        taught(a, name, seed)
+        return
     config, source = settings(name, seed), str(a.library)
     if (out / RUN_FILE).exists():
         imitation = resume(out, config, source)
@@ -118,12 +135,29 @@ def one(a: argparse.Namespace, name: str, seed: int) -> None:
         train(imitation, out, until, show, 1, beginning=beginning())
 
 
+def taught(a: argparse.Namespace, name: str, seed: int) -> None:
+    """Goes on from `--from` for `--minutes`."""
+    earlier = open_run(a.earlier).tracker
+    config = replace(earlier.config, expert=False, trajopt=None, seed=seed, **TAUGHT[name])
+    out, source = a.out / f"{name}-{seed}", str(a.library)
+    if (out / RUN_FILE).exists():
+        imitation, trained = resume(out, config, source), None
+    else:
+        imitation = begin(out, library_at(a), config, source, earlier=earlier)
+        trained = widened(earlier, imitation)
+    with contextlib.suppress(KeyboardInterrupt), shown() as show:
+        until = Until(minutes=a.minutes)
+        train(imitation, out, until, show, 1, beginning=beginning(), trained=trained)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--onto", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--samples", type=int, default=2_000_000)
+    parser.add_argument("--from", type=Path, dest="earlier", help="where the rows of TAUGHT go on")
+    parser.add_argument("--minutes", type=float, default=6.0, help="of those rows")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--only", nargs="+", choices=ROWS, default=list(LADDER))
     parser.add_argument("--worker", type=int, default=0)
@@ -138,7 +172,9 @@ def main() -> None:
             one(a, name, seed)
     kept = a.out / "nothing.json"
     null = perpetual_rows.null_of(lambda: build(library_at(a), settings("relaxed", 0)), kept)
-    perpetual_rows.write(a.out, a.samples, null, a.json, not set(a.only) <= set(INGREDIENTS))
+    small = set(a.only) <= {*INGREDIENTS, *TAUGHT}
+    minutes = a.minutes if set(a.only) <= set(TAUGHT) else None
+    perpetual_rows.write(a.out, a.samples, null, a.json, not small, minutes)
     named = " ".join(f"{n}-{s}={a.out}/{n}-{s}" for n, s in jobs if n not in UHC)
     print(f"python benchmarks/perpetual.py --runs {named} --parts table noise recovery owners curves")
 

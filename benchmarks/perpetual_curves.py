@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from field.sources import by_source
+
 from poise.errors import PoiseError
 from poise.view.svg import line_plot
 
@@ -25,8 +27,9 @@ HIGH, WIDE = 300, 560
 def read_curve(folder: Path) -> dict[str, Any]:
     """The evaluations in `log.csv`, one row each, and where each stage begins.
 
-    Rows: samples, seconds, stage, clips, succeeded, error_mm, help_n. "recoveries": samples, stage's
-    name, trials, recovered. "stages": name, samples before it.
+    Rows: samples, seconds, stage, clips, succeeded, error_mm, help_n, and by source of the clips how
+    many succeeded of how many. "recoveries": samples, stage's name, trials, recovered. "stages": name,
+    samples before it.
 
     Raises:
         PoiseError: no log, or one without an evaluation.
@@ -36,7 +39,7 @@ def read_curve(folder: Path) -> dict[str, Any]:
         raise PoiseError("there is no log of the training", path)
     with path.open(newline="", encoding="utf-8") as file:
         lines = [r for r in csv.DictReader(file) if None not in r.values()]
-    named, rows, back = _stage_names(folder), [], []
+    named, sources, rows, back = _stage_names(folder), _sources(folder), [], []
     stages, before = [], 0
     for line in lines:
         number = int(float(line["stage"]))
@@ -55,6 +58,7 @@ def read_curve(folder: Path) -> dict[str, Any]:
             "succeeded": int(float(line["eval/succeeded"])),
             "error_mm": round(float(line["eval/mpjpe_global_mm"]), 2),
             "help_n": round(float(line.get("env/help/limit_n") or 0.0), 2),
+            "sources": sources.get(int(float(line["iteration"])), {}),
         })  # fmt: skip
     # A stage that learns recovery alone evaluates no clips.
     names = {r["stage"]: "recovery" for r in back}
@@ -65,18 +69,36 @@ def read_curve(folder: Path) -> dict[str, Any]:
     return {"evaluations": rows, "recoveries": back, "stages": told, "samples": before}
 
 
-def _stage_names(folder: Path) -> dict[int, str]:
-    """The stage's name at each iteration with an evaluation, by `success.csv`."""
+def _evaluated(folder: Path) -> list[dict[str, str]]:
+    """The rows of `success.csv`, without those of the finished policy."""
     path = folder / "success.csv"
     if not path.exists():
-        return {}
+        return []
     with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))[1:]
-    return {int(r[0]): r[1] for r in rows if len(r) > 1 and r[0].isdigit() and r[1] != "final"}
+        rows = list(csv.DictReader(file))
+    return [r for r in rows if r["iteration"].isdigit() and r.get("stage") not in (None, "final")]
+
+
+def _stage_names(folder: Path) -> dict[int, str]:
+    """The stage's name at each iteration with an evaluation."""
+    return {int(r["iteration"]): r["stage"] for r in _evaluated(folder)}
+
+
+def _sources(folder: Path) -> dict[int, dict[str, tuple[int, int]]]:
+    """At each iteration with an evaluation, by source: clips that succeed, clips."""
+    found: dict[int, list[tuple[str, bool]]] = {}
+    for r in _evaluated(folder):
+        if r.get("succeeded"):
+            found.setdefault(int(r["iteration"]), []).append((r["clip"], r["succeeded"] == "1"))
+    return {
+        at: {source: (sum(done), len(done)) for source, done in by_source(rows).items()}
+        for at, rows in found.items()
+    }
 
 
 def draw(name: str, curve: Mapping[str, Any], path: Path) -> None:
-    """One image of three panels, one colour per stage, a bar where each begins."""
+    """One image of three panels, one colour per stage, a bar where each begins; where there are several
+    sources of clips, a panel of success with one colour per source."""
     plots = []
     for key, title, unit in PANELS:
         series, top = [], 0.0
@@ -95,7 +117,23 @@ def draw(name: str, curve: Mapping[str, Any], path: Path) -> None:
             shares = [100.0 * r["recovered"] / r["trials"] for r in curve["recoveries"]]
             series.append(("back from falls", [r["samples"] for r in curve["recoveries"]], shares))
         plots.append(line_plot(series, f"{name}: {title}", "samples", unit, zero=True))
+    sources = list(dict.fromkeys(s for r in curve["evaluations"] for s in r.get("sources", ())))
+    if len(sources) > 1:
+        title = f"{name}: success by source of the clips"
+        plots.append(line_plot(_by_source(curve, sources), title, "samples", "% of clips", zero=True))
     _stack(plots, path)
+
+
+def _by_source(
+    curve: Mapping[str, Any], sources: Sequence[str]
+) -> list[tuple[str, list[float], list[float]]]:
+    """A curve of success in % for each source, over the evaluations that hold clips of it."""
+    series = []
+    for source in sources:
+        own = [r for r in curve["evaluations"] if source in r.get("sources", ())]
+        shares = [100.0 * r["sources"][source][0] / r["sources"][source][1] for r in own]
+        series.append((source, [float(r["samples"]) for r in own], shares))
+    return series
 
 
 def draw_runs(curves: Mapping[str, Mapping[str, Any]], path: Path) -> None:

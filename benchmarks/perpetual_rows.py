@@ -37,6 +37,7 @@ AGAINST = {
     "primitives-4": "progressive", "uhc": "relaxed", "uhc-helped": "uhc",
     "heading": "bare", "window": "bare", "filter": "bare", "root": "bare", "prices": "bare",
     "own-bodies": "bare", "as-shipped": "bare", "together": "bare",
+    "taught": "longer", "taught-ppo": "longer",
 }  # fmt: skip
 RULE = (
     "A difference of the share of each clip until it fails is shown where it is more than twice the "
@@ -191,14 +192,23 @@ def _table(rows: dict[str, dict[str, Any]], null: dict[str, Any]) -> list[str]:
     return [*lines, _row("nothing", len(null["done"]), _percent([null["until"]]), *shown, "", "")]
 
 
-def markdown(command: str, rows: dict[str, Any], before: dict[str, Any], null: dict[str, Any]) -> str:
-    """All tables. rows: of runs at hand. before: of those that are kept in the other file."""
+def markdown(
+    command: str,
+    rows: dict[str, Any],
+    before: dict[str, Any],
+    null: dict[str, Any],
+    minutes: float | None = None,
+) -> str:
+    """All tables. rows: of runs at hand. before: of those that are kept in the other file. minutes: of
+    rows that are equal in time."""
     lines = ["# What the parts of the controller are worth", "", f"`{command}`", "", RULE, LEFT_OUT]
     lines += [f"{len(null['steps'])} clips, seeds by commas; percent and points of the clip."]
     for title, table in (("Runs", rows), ("Runs of `perpetual_ablations.json`", before)):
         if table:
-            samples = next(iter(table.values()))["samples"]
-            lines += ["", f"## {title}, {samples:,} control steps each", "", *_table(table, null)]
+            equal = f"{next(iter(table.values()))['samples']:,} control steps"
+            if minutes is not None:
+                equal = f"{minutes:g} minutes of a core"
+            lines += ["", f"## {title}, {equal} each", "", *_table(table, null)]
     stages = {n: r["first_stage"] for n, r in rows.items() if "first_stage" in r}
     if stages:
         lines += ["", "Of the clips that the first primitive did, how many each primitive does when its"]
@@ -227,17 +237,24 @@ def null_of(task: Callable[[], Imitation], kept: Path) -> dict[str, Any]:
     return json.loads(kept.read_text())
 
 
-def write(folder: Path, samples: int, null: dict[str, Any], out: Path, kept: bool = True) -> None:
+def write(
+    folder: Path,
+    samples: int,
+    null: dict[str, Any],
+    out: Path,
+    kept: bool = True,
+    minutes: float | None = None,
+) -> None:
     """JSON and tables of all finished runs in a folder, and of those in `perpetual_ablations.json`.
 
-    kept: False leaves the latter out.
+    kept: False leaves the latter out. minutes: that each run took, in place of samples.
     """
     found = {p.name: row_of(p, samples) for p in sorted(folder.iterdir()) if (p / LATEST).exists()}
     rows = {n: r for n, r in found.items() if r is not None}
     path = Path(__file__).with_name("perpetual_ablations.json")
     before = earlier(path, null["steps"]) if kept else {}
     command = "python benchmarks/perpetual_ablations.py --library FOLDER --onto FILE -o RUNS "
-    command += f"--samples {samples}"
+    command += f"--samples {samples}" if minutes is None else f"--from RUN --minutes {minutes:g}"
     if rows:
         command += f" --only {' '.join(dict.fromkeys(n.rpartition('-')[0] for n in rows))}"
     data = {
@@ -247,4 +264,4 @@ def write(folder: Path, samples: int, null: dict[str, Any], out: Path, kept: boo
         "noise": {s: judged(until) for s, until in noisy(before).items()},
     }  # fmt: skip
     out.write_text(json.dumps(data, indent=1) + "\n")
-    out.with_suffix(".md").write_text(markdown(command, rows, before, null))
+    out.with_suffix(".md").write_text(markdown(command, rows, before, null, minutes))

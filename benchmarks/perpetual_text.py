@@ -236,7 +236,23 @@ def _curves(part: Mapping[str, Any]) -> list[str]:
         back = tuple(str(tried[-1][k]) for k in ("trials", "recovered")) if tried else ("-", "-")
         made = str(max(len(own), len(tried)))
         rows.append((stage["stage"], f"{stage['from_samples']:,}", made, *figures, *back))
-    return ["### Learning", "", f"![Learning curves]({part['image']})", "", _lines(rows)]
+    out = ["### Learning", "", f"![Learning curves]({part['image']})", "", _lines(rows)]
+    return out + _along(part["evaluations"])
+
+
+def _along(evaluations: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Success by source at up to eight evaluations from the first to the last."""
+    told = [r for r in evaluations if len(r.get("sources", ())) > 1]
+    if not told:
+        return []
+    last = len(told) - 1
+    picked = [told[k] for k in sorted({round(last * i / 7) for i in range(8)})]
+    sources = list(dict.fromkeys(s for r in picked for s in r["sources"]))
+    rows: list[Sequence[str]] = [("samples", *sources)]
+    for r in picked:
+        cells = (" of ".join(map(str, r["sources"].get(s, ("-",)))) for s in sources)
+        rows.append((f"{r['samples']:,}", *cells))
+    return ["", "Clips that succeed, by source:", "", _lines(rows)]
 
 
 def _skipped(part: str, parts: Mapping[str, Any]) -> str:

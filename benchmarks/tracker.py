@@ -47,10 +47,11 @@ BACKWARDS = ("expmaps.*walking", "02_0[12]", "131_0[12]")
 SIXTY = (("(^|-)90_(?!05)", 60.0), ("salsa", 60.0))
 
 
-def config(seed: int) -> Perpetual:
+def config(seed: int, paths: bool) -> Perpetual:
     """A single network without help, motion prior and recovery, that adds to the reference's angles.
 
-    In the end the steps become smaller: large ones learn hard moments, and lose some of them again.
+    It observes and pays for what the policy that comes with Poise does, its first update on. In the end
+    the steps become smaller: large ones learn hard moments, and lose some of them again.
     """
     plain = Perpetual.additive()
     return replace(
@@ -60,7 +61,11 @@ def config(seed: int) -> Perpetual:
         recovery=False,
         help_start=0.0,
         cooling=0.4,
-        trajopt=TrajOptConfig(),
+        trajopt=TrajOptConfig() if paths else None,
+        window=(2, 4, 8),
+        root=0.2,
+        action_rate=3.0,
+        foot_slide=0.2,
         convergence=ConvergenceConfig(patience=1000),
         ppo=replace(plain.ppo, std=0.04, kl_target=None),
         seed=seed,
@@ -126,6 +131,7 @@ def main() -> None:
     parser = parser_of(__doc__, minutes=60.0)
     parser.add_argument("--onto", type=Path, help="a clip on the skeleton of the body that is made")
     parser.add_argument("--from", type=Path, dest="earlier", help="the policy that goes on")
+    parser.add_argument("--paths", action="store_true", help="searches for motions that need no help")
     parser.add_argument("--step", type=float, default=1e-4)
     parser.add_argument("--std", type=float, default=0.05)
     parser.add_argument("--filter", type=float, default=0.0)
@@ -148,7 +154,7 @@ def main() -> None:
     settings = (
         finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter, a.hips, a.acceleration, a.slide)
         if earlier
-        else config(a.seed)
+        else config(a.seed, a.paths)
     )
     if earlier:
         large = {"num_envs": a.worlds, "cooling": a.cooling, "evaluate_every": a.every}

@@ -61,3 +61,13 @@ def test_tables_name_what_each_row_is_compared_with():
     assert "| relaxed | 1 | 60 | 100.0 | 5.0 | 0.0 | plain +9.0 above | +30.0 above |" in text
     assert "| plain | 0, 0 | 50, 52 | 100.0, 100.0 | 5.0, 5.0 | 0.0, 0.0 |  | +21.0 above |" in text
     assert "| relaxed | 60 | plain +9.0 above |" in text and "| nothing | 0 | 30 |" in text
+    assert "## Runs, 5 control steps each" in text
+
+
+def test_rows_with_a_teacher_take_equal_times_not_samples():
+    null = {"steps": {"a": 10}, "done": [], "until": 0.3, "g_mpjpe": 100.0, "acc": 5.0, "force_n": 0.0}
+    rows = {"longer-0": null | {"samples": 900, "until": 0.6}}
+    rows["taught-0"] = null | {"samples": 30, "until": 0.65}
+    text = markdown("command", rows, {}, null, minutes=6)
+    assert "## Runs, 6 minutes of a core each" in text
+    assert "| taught | 0 | 65 | 100.0 | 5.0 | 0.0 | longer +5.0 not shown | +35.0 not shown |" in text

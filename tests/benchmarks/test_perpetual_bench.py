@@ -273,6 +273,21 @@ def test_curves_by_stage(logged: Path) -> None:
         curves.read_curve(logged / "nowhere")
 
 
+def test_curves_by_source(logged: Path) -> None:
+    rows = ["iteration,stage,help_n,clip,succeeded"]
+    rows += [f"{i},one,0,{c},{int(i > n)}" for i in (2, 4, 5) for n, c in enumerate(
+        ("humanoid3d_kick", "salsa-03", "humanoid3d_walk", "bandai_bvh-bow"), 1)]  # fmt: skip
+    (logged / "success.csv").write_text("\n".join([*rows, "5,final,0,salsa-03,0"]) + "\n")
+    curve = curves.read_curve(logged)
+    first, _, last = (r["sources"] for r in curve["evaluations"])
+    assert first == {"DeepMimic": (1, 2), "Bandai": (0, 1), "CMU, dances": (0, 1)}
+    assert last == {"DeepMimic": (2, 2), "Bandai": (1, 1), "CMU, dances": (1, 1)}
+    curves.draw("toy", curve, logged / "curve.svg")
+    assert "success by source" in (logged / "curve.svg").read_text()
+    said = "\n".join(text._curves(curve | {"image": "x.svg"}))
+    assert "| 200 | 1 of 2 | 0 of 1 | 0 of 1 |" in said and "| 500 | 2 of 2 | 1 of 1 | 1 of 1 |" in said
+
+
 def test_a_stage_of_recovery_has_trials_in_place_of_clips(logged: Path) -> None:
     text_ = LOG.replace("mpjpe_global_mm\n", "mpjpe_global_mm,eval/trials,eval/recovered\n")
     lines = [x + ",," if k else x for k, x in enumerate(text_.splitlines())]
