@@ -6,7 +6,8 @@
 For each clip, on the policy's joints with the bones of the clip, from reading the file on, without any
 help: seconds until the first result, which looks ahead and searches for what is lost so, and whether it
 is the whole motion; and seconds of the whole training, which ends where the policy alone succeeds from
-32 start frames or at `--minutes`, with success over all start frames after it. A row that is there is measured again for another policy alone.
+32 start frames or at `--minutes`, with success over all start frames after it. A row that is there is
+measured again for another policy alone.
 """
 
 from __future__ import annotations

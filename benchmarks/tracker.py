@@ -12,10 +12,10 @@ r"""Trains the policy that is to come with Poise, on clips of CMU and DeepMimic.
     python benchmarks/tracker.py ... --from POLICY -o TOUGHER --noise 0.25 0.5
 
 FOLDER holds CMU clips as AMC and BVH and those of DeepMimic (`tracker/README.md` says which). Whole
-subjects of CMU are held out. There is no help at any time: training begins with a search for motions
-that need none, or goes on from a policy, which then observes more and pays for what slides. Ctrl-C and
---resume as in `poise train perpetual`; the policy is written with `poise.jobs.tracker.save_tracker` and
-measured by `perpetual.py`.
+subjects of CMU are held out. There is no help at any time: training begins with the clone of an expert
+(with `--paths` of one that follows motions which need no help; looking for those is long where the
+library is large), or goes on from a policy. Ctrl-C and --resume as in `poise train perpetual`; the
+policy is written with `poise.jobs.tracker.save_tracker` and measured by `perpetual.py`.
 """
 
 from __future__ import annotations
