@@ -97,7 +97,7 @@ def finer(
         hips: whether headings are those of the hips from now on, which changes all that is observed.
     """
     kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
-    recovering = replace(kept.recovering, demonstration_share=recovery, demonstrations=512)
+    recovering = replace(kept.recovering, demonstration_share=recovery, demonstrations=768, quick=True)
     return replace(
         kept,
         heading="hips" if hips else kept.heading,

@@ -4909,11 +4909,13 @@ Poise.replay = (data) => {
   const blank = () => ({ pos: new Float32Array(n * 3), quat: new Float32Array(n * 4) });
   const poses = { reference: blank(), simulated: blank(), others: data.others.map(blank) };
   const scale = Poise.arrowScale(data.forceNorm);
-  // A push is drawn as long as an arm; contacts by the body's weight.
-  let hardest = 0;
+  // A push is drawn as long as an arm; contacts by the body's weight. Of twenty arrows one may be cut off at
+  // 1 m: a blow of a few frames would leave nothing to see of the others.
+  const sizes = [];
   for (let k = 0; data.pushed && data.pushes && k < data.pushes.rows.length; k += 6)
-    hardest = Math.max(hardest, Math.hypot(...data.pushes.rows.subarray(k + 3, k + 6)));
-  const pushScale = Math.max(1, hardest ? Math.round(hardest / 0.7) : Math.round((data.weight || 700) / 100) * 100);
+    sizes.push(Math.hypot(...data.pushes.rows.subarray(k + 3, k + 6)));
+  const hard = sizes.sort((a, b) => a - b)[Math.floor(0.95 * (sizes.length - 1))] || 0;
+  const pushScale = Math.max(1, hard ? Math.round(hard / 0.7) : Math.round((data.weight || 700) / 100) * 100);
   const target = [0, 0, 0];
   let fresh = true;
 
@@ -4957,10 +4959,12 @@ Poise.replay = (data) => {
       if (!arrow.every(Number.isFinite)) arrow = null;
     }
     // Of each contact or residual force its point and its force, in metres of an arrow.
-    const rows = ({ rows, first }, scale) =>
-      Array.from({ length: first[t + 1] - first[t] }, (_, j) => 6 * (first[t] + j)).map((k) =>
-        Array.from(rows.subarray(k, k + 6), (v, i) => (i < 3 ? v : v / scale)));
-    const pushes = data.pushes && state.touch ? rows(data.pushes, pushScale) : [];
+    const rows = ({ rows, first }, scale, most = Infinity) =>
+      Array.from({ length: first[t + 1] - first[t] }, (_, j) => 6 * (first[t] + j)).map((k) => {
+        const by = Math.max(scale, Math.hypot(...rows.subarray(k + 3, k + 6)) / most);
+        return Array.from(rows.subarray(k, k + 6), (v, i) => (i < 3 ? v : v / by));
+      });
+    const pushes = data.pushes && state.touch ? rows(data.pushes, pushScale, data.pushed ? 1 : Infinity) : [];
     const helps = data.helps && state.force ? rows(data.helps, scale) : [];
     const movers = data.movers.map(({ way }) => way.subarray(7 * t, 7 * t + 7));
     const lit = [0, 1].map((k) => Boolean(data.contacts && data.contacts[2 * t + k]));

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from poise.env.recovery.clips import CALM, QUICK
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.demonstrations import demonstrations, odds, practised
@@ -207,6 +208,18 @@ def test_a_policy_that_fails_nothing_is_done(
     done = train(own, tmp_path, Until(iterations=8), None, 1, False, trained=tracker.policy)
     assert done.solved and done.last is None and done.recovery is not None
     assert open_run(tmp_path).tracker.recovery_clips is not None
+
+
+def test_a_policy_that_goes_on_learns_to_be_quick(tracker: Tracker) -> None:
+    able = build(lively(), tiny(recovery=True, **PLAIN)).recovery_clips
+    assert able is not None and able.pace == CALM
+    wanted = replace(tiny(recovery=True), single=True)
+    wanted = replace(wanted, recovering=replace(wanted.recovering, quick=True))
+    config = going_on(tracker.config, wanted)
+    hurried = build(lively(), config, known=able).recovery_clips
+    assert hurried is not None and hurried.pace == QUICK and hurried.walks is able.walks
+    # What goes on from that does not forget it.
+    assert going_on(config, replace(tiny(recovery=True), single=True)).recovering.quick
 
 
 def test_a_motion_that_is_lost_goes_on_where_it_waits(tracker: Tracker, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from poise.env import Reference
-from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
+from poise.env.recovery.clips import CALM, QUICK, RecoveryClips, find_recovery_clips
 from poise.env.recovery.entry import STOPS, way_to_stand
 from poise.env.recovery.get_up import LIFT, GetUpPlanner
 from poise.env.recovery.planner import plan_recovery, recovery_motions, walk_of
@@ -239,6 +239,29 @@ def test_who_lies_takes_the_nearest_clip_that_gets_up(built: Built) -> None:
     assert torch.equal(again.walks[0], recovery_clips.walks[0]) and torch.equal(
         again.ease, recovery_clips.ease
     )
+
+
+def test_a_quick_pace_is_up_and_back_sooner_and_is_kept(built: Built) -> None:
+    reference, calm = built
+    clips = replace(calm.recovery_clips, pace=QUICK)
+    quick = GetUpPlanner(clips, reference.humanoid.table, reference.rate_hz)
+    start = facing(clips.ups[0][0], 2.0)
+    start[0] = 3.0
+    place = facing(clips.ease, 0.5)
+    slow, fast = (plan_recovery(g, start, place) for g in (calm, quick))
+    assert len(slow) - len(fast) > 0.5 * reference.rate_hz
+    assert (fast[-1, :2] - slow[-1, :2]).norm() < 0.1
+    # To half a metre away it walks as ever.
+    near = facing(clips.ease, 0.5)
+    near[0] = 0.5
+    steps = [(w[1:, :2] - w[:-1, :2]).norm(dim=-1).max() for g in (calm, quick)
+             for w in (plan_recovery(g, near, place),)]  # fmt: skip
+    assert steps[1] < 1.2 * steps[0]
+    # Of a file of single precision; one from before has none.
+    state = {k: v.float() for k, v in clips.state().items()}
+    assert RecoveryClips.of(state).pace == QUICK
+    del state["pace"]
+    assert RecoveryClips.of(state).pace == CALM
 
 
 def test_settings_refuse_what_makes_no_sense() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +25,23 @@ CYCLE_S, TRAVEL, STRAIGHT = (0.8, 1.5), (0.7, 1.4), 0.35
 SPEED_COUNTS, CLOSES = 0.1, 0.02
 
 
+class Pace(NamedTuple):
+    """How quickly recovery clips are played, and what is done with them.
+
+    up: times their own speed at which clips get up. walk: times a walk's own speed at which it goes to a
+    place that is more than a step away. turn: rad/s. gain: of a walk's speed, what is gained in a step.
+    """
+
+    up: float = 1.25
+    walk: float = 1.0
+    turn: float = 2.0
+    gain: float = 0.06
+
+
+#: At which every policy can come back, and, half a second sooner, one that learns it so.
+CALM, QUICK = Pace(), Pace(1.5, 1.3, 3.0, 0.09)
+
+
 @dataclass(frozen=True, eq=False)
 class RecoveryClips:
     """The recovery clips of a library, coordinates `(F, 7 + n)` float64.
@@ -32,16 +50,19 @@ class RecoveryClips:
         ease: `(7 + n)`, a body that stands.
         walks: each a closed cycle along +X.
         ups: from lying to standing.
+        pace: at which a policy learned to come back by them.
     """
 
     ease: Tensor
     walks: tuple[Tensor, ...]
     ups: tuple[Tensor, ...]
+    pace: Pace = CALM
 
     def state(self) -> dict[str, Tensor]:
         """All of it by name, for `of`."""
         named = {f"walk {k:03}": q for k, q in enumerate(self.walks)}
-        return {"ease": self.ease, **named, **{f"up {k:03}": q for k, q in enumerate(self.ups)}}
+        named |= {f"up {k:03}": q for k, q in enumerate(self.ups)}
+        return {"ease": self.ease, "pace": torch.tensor(self.pace, dtype=torch.float64), **named}
 
     @classmethod
     def of(cls, state: Mapping[str, Tensor]) -> RecoveryClips:
@@ -49,7 +70,9 @@ class RecoveryClips:
         walks, ups = (
             tuple(state[k] for k in sorted(state) if k.startswith(kind)) for kind in ("walk ", "up ")
         )
-        return cls(state["ease"], walks, ups)
+        # Half and single precision know no 0.06.
+        told = [round(x, 4) for x in state["pace"].tolist()] if "pace" in state else ()
+        return cls(state["ease"], walks, ups, Pace(*told))
 
 
 def find_recovery_clips(

@@ -15,8 +15,6 @@ from poise.spatial.directions import turned, yaw_quat
 
 #: s that a blend takes, and m of the distance between poses that are blended in a second more.
 BLEND_S, BLEND_SPEED = 0.4, 1.5
-#: Factor by which the get-up clips are sped up.
-QUICK = 1.25
 #: m: poses that are no farther apart are the same.
 SAME = 0.01
 #: m: a blend is lifted no higher than this for a limb that would reach into the floor.
@@ -38,7 +36,7 @@ class GetUpPlanner:
 
     def __init__(self, recovery_clips: RecoveryClips, table: BodyTable, rate_hz: float):
         self.recovery_clips, self.table, self.rate_hz = recovery_clips, table, rate_hz
-        self.ups = [_sooner(clip, QUICK) for clip in recovery_clips.ups]
+        self.ups = [_sooner(clip, recovery_clips.pace.up) for clip in recovery_clips.ups]
         self.kinematics = Kinematics(table)
         self._ups = [self.poses(clip) for clip in self.ups]
         # A clip is entered while its root lies: what comes later needs what came before.

@@ -10,7 +10,7 @@ track such motions (`jobs.perpetual.demonstrations`) finds what physics allows.
 
 A body that moves at the start walks on.
 
-Turning follows a unicycle: the heading turns toward the place at no more than `TURN` rad/s, and the
+Turning follows a unicycle: the heading turns toward the place at no more than `Pace.turn` rad/s, and the
 walk's stride shortens by the cosine of what is left to turn. To a place that is near and behind, the
 walk is played from its end to its start.
 """
@@ -27,11 +27,13 @@ from poise.env.recovery.get_up import GetUpPlanner, mixed, smooth
 from poise.spatial import quat_mul
 from poise.spatial.directions import facing, heading_angle, yaw_quat
 
-#: rad/s, m and rad: how fast is turned, and how near has come back.
-TURN, HERE, FACING = 2.0, 0.08, 0.1
-#: Of a walk's pace: what is gained and lost in a step, and where all of the walk is seen; steps on the
-#: spot while turning.
-FASTER, SLOWER, WHOLE, ON_SPOT = 0.06, 0.08, 0.5, 0.6
+#: m and rad: how near has come back.
+HERE, FACING = 0.08, 0.1
+#: Of a walk's pace: what is lost in a step, and where all of the walk is seen; steps on the spot while
+#: turning.
+SLOWER, WHOLE, ON_SPOT = 0.08, 0.5, 0.6
+#: m to what is more than a step away.
+STEP = 1.0
 #: m: what is no farther and behind is come to backwards. Cosine: of what is behind.
 NEAR, BEHIND = 1.2, -0.6
 #: s: at ease at the end.
@@ -135,7 +137,7 @@ def _walk(
     get_up: GetUpPlanner, start: Tensor, place: Tensor, which: int, phase: float, pace: float = 0.0
 ) -> Tensor:
     """From standing, or walking at a `pace`, at `start` to standing at `place`, by one of the walks."""
-    cycle, speed, faces = walk_of(get_up, which)
+    (cycle, speed, faces), hurry = walk_of(get_up, which), get_up.recovery_clips.pace
     walk, count, rate_hz = cycle.numpy(), len(cycle) - 1, get_up.rate_hz
     at, goal, psi, aim = start[:2].numpy().copy(), place[:2].numpy(), heading_angle(start[3:7]), 0.0
     to, here, stayed, k, rest = phase * count, False, 0, 0, pace
@@ -151,16 +153,17 @@ def _walk(
         toward = math.atan2(way * left[1], way * left[0])
         want = heading_angle(place[3:7]) if here else toward + faces
         error = math.remainder(want - psi, 2 * math.pi)
-        most = min(TURN, CURVES / (rest * speed)) if rest else TURN
+        most = min(hurry.turn, CURVES / (rest * speed)) if rest else hurry.turn
         turn = max(-most, min(most, 4 * error))
         psi += turn / rate_hz
-        stride = 0.0 if here else max(0.0, math.cos(error)) * min(1.0, max(0.15, 2 * apart / speed))
+        top = hurry.walk if apart > STEP else 1.0
+        stride = 0.0 if here else max(0.0, math.cos(error)) * min(top, max(0.15, 2 * apart / speed))
         # What walks already slows down step by step.
         rest = max(0.0, rest - CALMER)
         stride = max(stride, rest)
         done = here and abs(error) < FACING
-        aim = 0.0 if done else max(stride, ON_SPOT * min(1.0, abs(turn) / TURN))
-        pace += max(-SLOWER, min(FASTER, aim - pace))
+        aim = 0.0 if done else max(stride, ON_SPOT * min(1.0, abs(turn) / hurry.turn))
+        pace += max(-SLOWER, min(hurry.gain, aim - pace))
         forward = _along(walk, to + way * pace) - _along(walk, to)
         forward *= stride / aim if aim else 0.0
         to += way * pace

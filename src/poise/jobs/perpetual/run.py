@@ -65,7 +65,9 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
         )
     done = {"expert": False, "trajopt": None, "help_start": 0.0}
     asked = {name: getattr(wanted, name) for name in ("seed", "num_envs", "recovery", "noise")}
-    asked["recovering"] = replace(policy.recovering, demonstrations=wanted.recovering.demonstrations)
+    quick = policy.recovering.quick or wanted.recovering.quick
+    demonstrations = wanted.recovering.demonstrations
+    asked["recovering"] = replace(policy.recovering, demonstrations=demonstrations, quick=quick)
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
     if wanted.recovery:
         # The step size that the policy ended with is too small for learning something new.

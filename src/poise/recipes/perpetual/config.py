@@ -45,6 +45,7 @@ class RecoveryPlan:
             and some walk, see `env.recovery.planner`; 0 learns to come back to a point, as the paper
             does.
         demonstration_share: of the episodes of a stage that tracks and recovers, how many are of them.
+        quick: they get up and walk back half a second sooner, see `env.recovery.clips.QUICK`.
         trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
         final_trials: with the finished policy.
         seconds: a character counts as back within each of these times; the last one decides.
@@ -56,6 +57,7 @@ class RecoveryPlan:
     falls: int = 512
     demonstrations: int = 768
     demonstration_share: float = 0.5
+    quick: bool = False
     trials: int = 32
     final_trials: int = 100
     seconds: tuple[float, ...] = (5.0, 10.0)

@@ -6,11 +6,13 @@ knows nothing else; here rules do.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from poise.env import Reference
-from poise.env.recovery.clips import RecoveryClips, find_recovery_clips
+from poise.env.recovery.clips import QUICK, RecoveryClips, find_recovery_clips
 from poise.recipes.perpetual.config import Perpetual
 
 #: Shares of the standing heights, between which the root and above which the body's top stay in a clip
@@ -78,4 +80,5 @@ def known_recovery_clips(
     """
     if not (config.recovery and config.recovering.demonstrations) or config.shapes.own:
         return None
-    return known or find_recovery_clips(reference, standing(reference), walking_clips(reference))
+    found = known or find_recovery_clips(reference, standing(reference), walking_clips(reference))
+    return replace(found, pace=QUICK) if found is not None and config.recovering.quick else found
