@@ -46,8 +46,7 @@ class RecoveryPlan:
             does.
         demonstration_share: of the episodes of a stage that tracks and recovers, how many are of them.
         quick: they get up and walk back half a second sooner, see `env.recovery.clips.QUICK`.
-        trials: of each kind of fail-state at every evaluation of a stage that learns recovery.
-        final_trials: with the finished policy.
+        trials, final_trials: of each kind of fail-state, at evaluations and with the finished policy.
         seconds: a character counts as back within each of these times; the last one decides.
         enough: share of all trials with which recovery is learned.
     """
