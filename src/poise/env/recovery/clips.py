@@ -30,16 +30,18 @@ class Pace(NamedTuple):
 
     up: times their own speed at which clips get up. walk: times a walk's own speed at which it goes to a
     place that is more than a step away. turn: rad/s. gain: of a walk's speed, what is gained in a step.
+    up_s: s that getting up lasts at most; a clip that is longer is played faster.
     """
 
     up: float = 1.25
     walk: float = 1.0
     turn: float = 2.0
     gain: float = 0.06
+    up_s: float = 10.0
 
 
 #: At which every policy can come back, and, half a second sooner, one that learns it so.
-CALM, QUICK = Pace(), Pace(1.5, 1.3, 3.0, 0.09)
+CALM, QUICK = Pace(), Pace(1.6, 1.5, 4.0, 0.12, 1.8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,11 @@ class GetUpPlanner:
 
     def __init__(self, recovery_clips: RecoveryClips, table: BodyTable, rate_hz: float):
         self.recovery_clips, self.table, self.rate_hz = recovery_clips, table, rate_hz
-        self.ups = [_sooner(clip, recovery_clips.pace.up) for clip in recovery_clips.ups]
+        pace = recovery_clips.pace
+        self.ups = [
+            _sooner(clip, max(pace.up, (len(clip) - 1) / (pace.up_s * rate_hz)))
+            for clip in recovery_clips.ups
+        ]
         self.kinematics = Kinematics(table)
         self._ups = [self.poses(clip) for clip in self.ups]
         # A clip is entered while its root lies: what comes later needs what came before.
