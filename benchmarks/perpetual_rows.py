@@ -249,7 +249,8 @@ def write(
 
     kept: False leaves the latter out. minutes: that each run took, in place of samples.
     """
-    found = {p.name: row_of(p, samples) for p in sorted(folder.iterdir()) if (p / LATEST).exists()}
+    runs = [p for p in sorted(folder.iterdir()) if (p / LATEST).exists() or (p / ROW).exists()]
+    found = {p.name: row_of(p, samples) for p in runs}
     rows = {n: r for n, r in found.items() if r is not None}
     path = Path(__file__).with_name("perpetual_ablations.json")
     before = earlier(path, null["steps"]) if kept else {}
