@@ -41,7 +41,7 @@ class Pace(NamedTuple):
 
 
 #: At which every policy can come back, and, half a second sooner, one that learns it so.
-CALM, QUICK = Pace(), Pace(1.75, 1.3, 3.0, 0.09, 1.7)
+CALM, QUICK = Pace(), Pace(1.75, 1.3, 2.5, 0.06, 1.7)
 
 
 @dataclass(frozen=True, eq=False)
