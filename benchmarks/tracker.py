@@ -47,7 +47,7 @@ BACKWARDS = ("expmaps.*walking", "02_0[12]", "131_0[12]")
 SIXTY = (("(^|-)90_(?!05)", 60.0), ("salsa", 60.0))
 
 
-def config(seed: int, paths: bool) -> Perpetual:
+def config(seed: int, paths: bool = False) -> Perpetual:
     """A single network without help, motion prior and recovery, that adds to the reference's angles.
 
     It observes and pays for what the policy that comes with Poise does, its first update on. In the end

@@ -60,7 +60,7 @@ _DATA = Path(__file__).parents[1] / "data"
 #: The policy that comes with Poise.
 SHIPPED = _DATA / "tracker.safetensors"
 #: Those that come along by a name: one that is told places of joints alone.
-POLICIES = {"keypoints": _DATA / "keypoints.safetensors"}
+POLICIES = {name: _DATA / f"{name}.safetensors" for name in ("keypoints", "quick")}
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300
 #: The largest number of half precision.
