@@ -39,7 +39,8 @@ def read_curve(folder: Path) -> dict[str, Any]:
         raise PoiseError("there is no log of the training", path)
     with path.open(newline="", encoding="utf-8") as file:
         lines = [r for r in csv.DictReader(file) if None not in r.values()]
-    named, sources, rows, back = _stage_names(folder), _sources(folder), [], []
+    told = _evaluated(folder)
+    named, sources, rows, back = _stage_names(told), _sources(told), [], []
     stages, before = [], 0
     for line in lines:
         number = int(float(line["stage"]))
@@ -63,10 +64,10 @@ def read_curve(folder: Path) -> dict[str, Any]:
     # A stage that learns recovery alone evaluates no clips.
     names = {r["stage"]: "recovery" for r in back}
     names |= {r["stage"]: r["name"] for r in rows if r["name"]}
-    told = [{"stage": names.get(n, f"stage {n}"), "from_samples": at} for n, at in stages]
+    begun = [{"stage": names.get(n, f"stage {n}"), "from_samples": at} for n, at in stages]
     for row in (*rows, *back):
         row["name"] = names.get(row["stage"], f"stage {row['stage']}")
-    return {"evaluations": rows, "recoveries": back, "stages": told, "samples": before}
+    return {"evaluations": rows, "recoveries": back, "stages": begun, "samples": before}
 
 
 def _evaluated(folder: Path) -> list[dict[str, str]]:
@@ -79,15 +80,15 @@ def _evaluated(folder: Path) -> list[dict[str, str]]:
     return [r for r in rows if r["iteration"].isdigit() and r.get("stage") not in (None, "final")]
 
 
-def _stage_names(folder: Path) -> dict[int, str]:
+def _stage_names(rows: Sequence[Mapping[str, str]]) -> dict[int, str]:
     """The stage's name at each iteration with an evaluation."""
-    return {int(r["iteration"]): r["stage"] for r in _evaluated(folder)}
+    return {int(r["iteration"]): r["stage"] for r in rows}
 
 
-def _sources(folder: Path) -> dict[int, dict[str, tuple[int, int]]]:
+def _sources(evaluated: Sequence[Mapping[str, str]]) -> dict[int, dict[str, tuple[int, int]]]:
     """At each iteration with an evaluation, by source: clips that succeed, clips."""
     found: dict[int, list[tuple[str, bool]]] = {}
-    for r in _evaluated(folder):
+    for r in evaluated:
         if r.get("succeeded"):
             found.setdefault(int(r["iteration"]), []).append((r["clip"], r["succeeded"] == "1"))
     return {

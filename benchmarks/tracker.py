@@ -82,6 +82,7 @@ def finer(
     hips: bool,
     acceleration: float = 0.0,
     slide: float = 0.2,
+    quick: bool = False,
 ) -> Perpetual:
     """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
     actions, a nearer root, prices of changing actions and of feet that slide, large batches.
@@ -94,10 +95,13 @@ def finer(
             getting up is gone at once, and an hour does not bring it back.
         acceleration, slide: prices, see `Perpetual`. Noise on the actions is rough, too: with 0.05 rad
             it doubles the acceleration, and the policy has little to gain by its own.
+        quick: see `RecoveryPlan.quick`.
         hips: whether headings are those of the hips from now on, which changes all that is observed.
     """
     kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
-    recovering = replace(kept.recovering, demonstration_share=recovery, demonstrations=768, quick=True)
+    recovering = replace(
+        kept.recovering, demonstration_share=recovery, demonstrations=768 if quick else 512, quick=quick
+    )
     return replace(
         kept,
         heading="hips" if hips else kept.heading,
@@ -138,6 +142,7 @@ def main() -> None:
     parser.add_argument("--hips", action="store_true")
     parser.add_argument("--acceleration", type=float, default=0.0, help="price of rough motion")
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
+    parser.add_argument("--quick", action="store_true", help="see RecoveryPlan.quick")
     parser.add_argument("--noise", type=float, nargs="*", default=[], help="see Perpetual.noise")
     parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")
     parser.add_argument("--samples", type=int, help="control steps at most")
@@ -152,7 +157,18 @@ def main() -> None:
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
     settings = (
-        finer(earlier, a.step, a.std, a.seed, a.recovery, a.filter, a.hips, a.acceleration, a.slide)
+        finer(
+            earlier,
+            a.step,
+            a.std,
+            a.seed,
+            a.recovery,
+            a.filter,
+            a.hips,
+            a.acceleration,
+            a.slide,
+            a.quick,
+        )
         if earlier
         else config(a.seed, a.paths)
     )

@@ -59,7 +59,7 @@ KIND, VERSION = "tracker", 1
 _DATA = Path(__file__).parents[1] / "data"
 #: The policy that comes with Poise.
 SHIPPED = _DATA / "tracker.safetensors"
-#: Those that come along by a name: one that is told places of joints alone.
+#: Those that come along by a name: one that is told places of joints alone, one that comes back sooner.
 POLICIES = {name: _DATA / f"{name}.safetensors" for name in ("keypoints", "quick")}
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300

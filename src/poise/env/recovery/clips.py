@@ -40,7 +40,7 @@ class Pace(NamedTuple):
     up_s: float = 10.0
 
 
-#: At which every policy can come back, and, half a second sooner, one that learns it so.
+#: At which every policy can come back, and, a second sooner, one that learns it so.
 CALM, QUICK = Pace(), Pace(1.75, 1.3, 2.5, 0.06, 1.7)
 
 
