@@ -46,12 +46,17 @@ BACKWARDS = ("expmaps.*walking", "02_0[12]", "131_0[12]")
 #: CMU's files state 120 Hz throughout, but some were captured at 60.
 SIXTY = (("(^|-)90_(?!05)", 60.0), ("salsa", 60.0))
 
+#: The policy's step size from nothing.
+STEP = 2e-4
 
-def config(seed: int, paths: bool = False) -> Perpetual:
+
+def config(seed: int, paths: bool = False, step: float = STEP) -> Perpetual:
     """A single network without help, motion prior and recovery, that adds to the reference's angles.
 
     It observes and pays for what the policy that comes with Poise does, its first update on. In the end
     the steps become smaller: large ones learn hard moments, and lose some of them again.
+
+    step: of the policy, until then.
     """
     plain = Perpetual.additive()
     return replace(
@@ -67,7 +72,7 @@ def config(seed: int, paths: bool = False) -> Perpetual:
         action_rate=3.0,
         foot_slide=0.2,
         convergence=ConvergenceConfig(patience=1000),
-        ppo=replace(plain.ppo, std=0.04, kl_target=None),
+        ppo=replace(plain.ppo, std=0.04, kl_target=None, policy_lr=step),
         seed=seed,
     )
 
@@ -136,7 +141,7 @@ def main() -> None:
     parser.add_argument("--onto", type=Path, help="a clip on the skeleton of the body that is made")
     parser.add_argument("--from", type=Path, dest="earlier", help="the policy that goes on")
     parser.add_argument("--paths", action="store_true", help="searches for motions that need no help")
-    parser.add_argument("--step", type=float, default=1e-4)
+    parser.add_argument("--step", type=float, help=f"{STEP:g} from nothing, else 1e-4")
     parser.add_argument("--std", type=float, default=0.05)
     parser.add_argument("--filter", type=float, default=0.0)
     parser.add_argument("--hips", action="store_true")
@@ -159,7 +164,7 @@ def main() -> None:
     settings = (
         finer(
             earlier,
-            a.step,
+            a.step or 1e-4,
             a.std,
             a.seed,
             a.recovery,
@@ -170,7 +175,7 @@ def main() -> None:
             a.quick,
         )
         if earlier
-        else config(a.seed, a.paths)
+        else config(a.seed, a.paths, a.step or STEP)
     )
     if earlier:
         large = {"num_envs": a.worlds, "cooling": a.cooling, "evaluate_every": a.every}

@@ -127,6 +127,8 @@ def test_a_policy_learns_to_come_back_and_stays_what_it_was(tracker: Tracker, tm
 
 def test_one_network_learns_both(tracker: Tracker, tmp_path: Path) -> None:
     assert going_on(tracker.config, Perpetual(recovery=False)).single
+    fast = replace(tracker.config, ppo=replace(tracker.config.ppo, policy_lr=3e-4))
+    assert going_on(fast, Perpetual(recovery=False)).ppo.policy_lr == 1e-4
     config = going_on(tracker.config, replace(tiny(recovery=True), single=True))
     assert config.single and config.recovery and config.recovering.demonstrations == 4
     run, told = tmp_path / "run", []

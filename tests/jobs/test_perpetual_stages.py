@@ -219,5 +219,9 @@ def test_steps_become_smaller_towards_the_end_of_a_stage(tmp_path: Path, scripte
     lr = [p.stats.update.policy_lr for p in shown]
     assert lr[:10] == [1e-3] * 10 and lr[-1] == pytest.approx(1e-4)
     assert lr[10:] == sorted(lr[10:], reverse=True) and lr[14] == pytest.approx(0.6e-3)
+    # So large they are after the clone of an expert, too.
+    plain["expert"] = True
+    _, shown, _ = watched(tmp_path / "cloned", tiny(ppo=fixed, **plain), 1)
+    assert shown[0].stats.update.policy_lr == 1e-3
     with pytest.raises(PoiseError, match="cooling is for steps of a fixed size"):
         replace(config, ppo=replace(fixed, kl_target=0.05))

@@ -236,6 +236,10 @@ def some_starts(imitation: Imitation, most: int = FIRST_STARTS) -> tuple[Tensor,
     return clip[picks], frame[picks]
 
 
-def finetuning(ppo: PPOConfig) -> PPOConfig:
-    """The same settings for a policy that is good already: small steps, the critic first."""
-    return replace(ppo, policy_lr=min(ppo.policy_lr, 1e-4), critic_warmup=max(ppo.critic_warmup, 2))
+def finetuning(ppo: PPOConfig, most: float = 1e-4) -> PPOConfig:
+    """The same settings for a policy that is good already: small steps, the critic first.
+
+    most: step size of the policy.
+    """
+    step = min(ppo.policy_lr, most)
+    return replace(ppo, policy_lr=step, critic_warmup=max(ppo.critic_warmup, 2))

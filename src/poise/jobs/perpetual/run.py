@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 #: Where a run file holds what its library knows of coming back.
 WAYS = "ways"
-#: Least step size where a policy that is done learns to come back.
+#: Largest step size of a policy that goes on, and least where it learns to come back.
 ANEW = 1e-4
 
 
@@ -68,7 +68,8 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
     quick = policy.recovering.quick or wanted.recovering.quick
     demonstrations = wanted.recovering.demonstrations
     asked["recovering"] = replace(policy.recovering, demonstrations=demonstrations, quick=quick)
-    ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE))
+    step = min(policy.ppo.policy_lr, ANEW)
+    ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE), policy_lr=step)
     if wanted.recovery:
         # The step size that the policy ended with is too small for learning something new.
         ppo = replace(ppo, policy_lr=max(ppo.policy_lr, ANEW))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -220,14 +221,15 @@ def make_trainer(
 ) -> Trainer:  # fmt: skip
     """The stage's trainer on fresh worlds, with draws of its own.
 
-    warm: whether `start` acts well already, so that it is changed in small steps.
+    warm: whether `start` acts already, so that the critic learns first. How large its steps are the
+        settings say, see `going_on` for those of a policy that is good.
     """
     config: Perpetual = imitation.config
     # Another stage draws other starts and noise.
     seed = (config.seed + 1_000_003 * (stage.number - 1)) % 2**31
     own = staged(practised(imitation, stage), stage)
     own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
-    ppo = finetuning(own.ppo()) if warm else own.ppo()
+    ppo = finetuning(own.ppo(), math.inf) if warm else own.ppo()
     lessons = None
     if config.teacher is not None:
         lessons = own.teacher(config.teacher, threads), config.lessons
