@@ -115,38 +115,25 @@ def library_at(a: argparse.Namespace, own: bool = False) -> ClipLibrary:
 
 
 def one(a: argparse.Namespace, name: str, seed: int) -> None:
-    """Trains one run, or goes on with it."""
-    out, until = a.out / f"{name}-{seed}", Until(samples=a.samples)
+    """Trains one run, or goes on with it; those of `TAUGHT` go on from `--from` for `--minutes`."""
+    out, source, until = a.out / f"{name}-{seed}", str(a.library), Until(samples=a.samples)
     if (out / RESULT).exists() or (out / perpetual_rows.ROW).exists():
         return
     if name in UHC:
         task = runs.begin(out, library_at(a), uhc(name, seed))
         runs.train(task, out, until, threads=1, tensorboard=False)
         return
+    config, earlier, trained = settings(name, seed), None, None
     if name in TAUGHT:
-        taught(a, name, seed)
-        return
-    config, source = settings(name, seed), str(a.library)
+        earlier, until = open_run(a.earlier).tracker, Until(minutes=a.minutes)
+        config = replace(earlier.config, expert=False, trajopt=None, seed=seed, **TAUGHT[name])
     if (out / RUN_FILE).exists():
         imitation = resume(out, config, source)
     else:
-        imitation = begin(out, library_at(a, config.shapes.own), config, source)
+        library = library_at(a, config.shapes.own)
+        imitation = begin(out, library, config, source, earlier=earlier)
+        trained = widened(earlier, imitation) if earlier else None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
-        train(imitation, out, until, show, 1, beginning=beginning())
-
-
-def taught(a: argparse.Namespace, name: str, seed: int) -> None:
-    """Goes on from `--from` for `--minutes`."""
-    earlier = open_run(a.earlier).tracker
-    config = replace(earlier.config, expert=False, trajopt=None, seed=seed, **TAUGHT[name])
-    out, source = a.out / f"{name}-{seed}", str(a.library)
-    if (out / RUN_FILE).exists():
-        imitation, trained = resume(out, config, source), None
-    else:
-        imitation = begin(out, library_at(a), config, source, earlier=earlier)
-        trained = widened(earlier, imitation)
-    with contextlib.suppress(KeyboardInterrupt), shown() as show:
-        until = Until(minutes=a.minutes)
         train(imitation, out, until, show, 1, beginning=beginning(), trained=trained)
 
 
