@@ -43,10 +43,9 @@ def test_a_motion_that_sits_is_tracked_on_its_seat(tracker: Tracker, tmp_path: P
     assert len(touched) == len(done.evaluation.recordings[0].qpos)
     borne = float(np.mean([rows[:, 5].sum() for rows in touched]))
     assert borne == pytest.approx(weight, rel=0.1)
-    # While it sits, more than a third of it stands on the seat.
-    seated = touched[100]
-    on_seat = seated[np.abs(seated[:, 2] - seat.top) < 0.05]
-    assert on_seat[:, 5].sum() > weight / 3
+    # While it sits, more than a third of it stands on the seat, but for moments.
+    on_seat = [rows[np.abs(rows[:, 2] - seat.top) < 0.05][:, 5].sum() for rows in touched[80:130]]
+    assert np.mean(np.array(on_seat) > weight / 3) > 0.8 and np.median(on_seat) > weight / 2
     paths = write(done, tmp_path).paths
     assert read_supports(paths["supports"]) == done.supports
     assert "seat1" in paths["scene"].read_bytes().decode("latin-1")

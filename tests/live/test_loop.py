@@ -59,17 +59,21 @@ def test_a_character_follows_is_knocked_over_and_gets_up(tracker: Tracker, walk:
     character = played.live.world.characters[0]
     played.run(2.0)
     assert character.doing == TRACKS and played.live.world.body(0).off_m < 0.3
-    before = played.live.world.rows.state.qpos[0, :3].clone()
-    played.live.commands.append({"type": "knock", "character": 0})
-    played.run(1.0)
-    assert character.doing in (FALLS, RETURNS) and character.lost == 1
-    for _ in range(20):
-        played.run(0.5)
-        if character.doing == TRACKS and played.live.world.body(0).off_m < 0.3:
+    # Not every blow fells it: some it comes back from on its feet.
+    for knock in range(1, 7):
+        before = played.live.world.rows.state.qpos[0, :3].clone()
+        played.live.commands.append({"type": "knock", "character": 0})
+        played.run(1.0)
+        assert character.doing in (FALLS, RETURNS) and character.lost == knock
+        for _ in range(20):
+            played.run(0.5)
+            if character.doing == TRACKS and played.live.world.body(0).off_m < 0.3:
+                break
+        assert character.doing == TRACKS and character.recovered >= knock
+        # It goes on from where it got up.
+        assert float((played.live.world.rows.state.qpos[0, :2] - before[:2]).norm()) < 6.0
+        if character.falls:
             break
-    assert character.doing == TRACKS and character.recovered >= 1
-    # It goes on from where it got up.
-    assert float((played.live.world.rows.state.qpos[0, :2] - before[:2]).norm()) < 6.0
     told = played.live.figures()
     assert told["help_n"] == 0.0 and told["characters"][0]["falls"] >= 1
     played.live.close()
