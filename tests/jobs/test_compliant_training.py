@@ -113,6 +113,17 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(wrong) == 2 and "learned the scene 'ball', not 'door'" in capsys.readouterr().err
 
 
+def test_steps_become_smaller_in_the_end(tracker: Tracker, tmp_path: Path) -> None:
+    lr: list[float] = []
+    train(
+        replace(TINY, cooling=0.5), tracker, tmp_path / "run", Until(iterations=4),
+        lambda stats: lr.append(stats.update.policy_lr), 1, False,
+    )  # fmt: skip
+    assert lr == pytest.approx([PPO.policy_lr] * 3 + [PPO.policy_lr / 2])
+    with pytest.raises(PoiseError, match="cooling must lie in 0 to 1"):
+        replace(TINY, cooling=1.5)
+
+
 @pytest.mark.parametrize(
     ("scene", "what"),
     [("pull", "the scene 'pull' has no reward"), ("dor", "Did you mean 'door'")],

@@ -48,6 +48,8 @@ class Compliant:
         forces: six fictional forces are actions, where the scene has them.
         imitation_weight: w_imit of Eq. 10.
         task_weight: w_task of Eq. 10.
+        cooling: share of the training, at its end, in which the policy's step size falls evenly to a
+            tenth, so that it ends as it does on average; 0 for steps of one size.
     """
 
     scene: str = "ball"
@@ -60,6 +62,7 @@ class Compliant:
     forces: bool = True
     imitation_weight: float = 0.5
     task_weight: float = 0.5
+    cooling: float = 0.4
     num_envs: int = 128
     seed: int = 0
     # Three layers of 256 as in the paper; its rate of 1e-5 is for days.
@@ -73,6 +76,8 @@ class Compliant:
         if self.scene not in LEARNED:
             hint = did_you_mean(self.scene, LEARNED)
             raise PoiseError(f"the scene '{self.scene}' has no reward to learn from", hint=hint)
+        if not 0 <= self.cooling <= 1:
+            raise PoiseError(f"cooling must lie in 0 to 1, got {self.cooling:g}", "compliant")
         if not 0.5 <= self.seconds <= 600.0:
             raise PoiseError(f"episodes last 0.5 to 600 s, got {self.seconds:g}", "compliant")
         if not (0.0 <= self.reach <= math.pi and (self.reach or self.added(0).forces)):

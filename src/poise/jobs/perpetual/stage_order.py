@@ -24,6 +24,8 @@ from poise.eval import ClipResults, RecoveryCard
 from poise.learn import Decision, IterationStats, Until
 from poise.recipes.perpetual.config import Perpetual, Recovers
 
+#: What is left of the policy's step size at the end of a stage that cools.
+COLD = 0.1
 #: Networks that learn all clips in one stage.
 WHOLE = ("single", "joint")
 

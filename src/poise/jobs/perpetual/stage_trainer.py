@@ -29,6 +29,7 @@ from poise.jobs.perpetual.stage_initialisation import (
     members_of,
 )
 from poise.jobs.perpetual.stage_order import (
+    COLD,
     Progress,
     Stage,
     done_of,
@@ -63,8 +64,6 @@ from poise.sim import UnstableError
 
 #: Times that writing a checkpoint takes, after which the next may be written.
 SAVES = 50.0
-#: What is left of the policy's step size at the end of a stage that cools.
-COLD = 0.1
 #: Simulations that may go bad between two evaluations.
 MOST_TROUBLES = 5
 
