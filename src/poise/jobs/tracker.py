@@ -59,8 +59,8 @@ KIND, VERSION = "tracker", 1
 _DATA = Path(__file__).parents[1] / "data"
 #: The policy that comes with Poise.
 SHIPPED = _DATA / "tracker.safetensors"
-#: Those that come along by a name: one that is told places of joints alone, one that comes back sooner.
-POLICIES = {name: _DATA / f"{name}.safetensors" for name in ("keypoints", "quick")}
+#: One that comes along by a name: it is told places of joints alone.
+POLICIES = {"keypoints": _DATA / "keypoints.safetensors"}
 #: Frames of a clip that are kept, by which the skeleton's standing is known.
 EXAMPLE_FRAMES = 300
 #: The largest number of half precision.
