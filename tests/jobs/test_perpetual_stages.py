@@ -15,7 +15,7 @@ from poise.errors import PoiseError
 from poise.jobs.perpetual import result as perpetual_result
 from poise.jobs.perpetual import stage_evaluation as perpetual_judge
 from poise.jobs.perpetual.run import PerpetualResult, begin, train
-from poise.jobs.perpetual.stage_order import Progress, done_of, share_of
+from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL
 from poise.learn import LATEST, ConvergenceConfig, IterationStats, Trainer, Until, load_policy
@@ -148,17 +148,17 @@ def test_every_evaluation_is_in_the_table(tmp_path: Path, scripted) -> None:
 
 
 def test_shares_of_limits() -> None:
-    assert share_of(Until(minutes=10, iterations=100), 50, 0, 60.0) == 0.5
-    assert share_of(Until(samples=0), 0, 0, 0.0) == 1.0
-    assert share_of(Until(minutes=1), 9, 9, 90.0) == 1.0
+    assert Until(minutes=10, iterations=100).share(50, 0, 60.0) == 0.5
+    assert Until(samples=0).share(0, 0, 0.0) == 1.0
+    assert Until(minutes=1).share(9, 9, 90.0) == 1.0
 
 
 def test_no_clock_decides_where_iterations_are_counted(tmp_path: Path) -> None:
     both = Until(minutes=10, iterations=100)
-    assert done_of(both, 5, 0, 1.0) == done_of(both, 5, 0, 500.0) == 0.05
-    assert done_of(both, 5, 0, 600.0) == 1.0
-    assert done_of(Until(minutes=10), 5, 9, 300.0) == 0.5
-    assert done_of(Until(minutes=10, samples=50), 5, 5, 300.0) == 0.1
+    assert both.done(5, 0, 1.0) == both.done(5, 0, 500.0) == 0.05
+    assert both.done(5, 0, 600.0) == 1.0
+    assert Until(minutes=10).done(5, 9, 300.0) == 0.5
+    assert Until(minutes=10, samples=50).done(5, 5, 300.0) == 0.1
     stages = StageTrainer(begin(tmp_path, library(), tiny()), tmp_path, both, 1, tensorboard=False)
     stages.trainer.seconds = 300.0
     assert stages.share == 0.0

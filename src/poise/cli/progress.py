@@ -29,9 +29,7 @@ def clock(seconds: float) -> str:
 
 def share_done(stats: IterationStats, until: Until) -> float:
     """How much of the nearest limit is used up, 0 to 1."""
-    from poise.jobs.perpetual.stage_order import share_of
-
-    return share_of(until, stats.iteration, stats.samples, stats.seconds)
+    return until.share(stats.iteration, stats.samples, stats.seconds)
 
 
 def left(seconds: float, share: float) -> str:

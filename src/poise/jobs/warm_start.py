@@ -40,6 +40,8 @@ from poise.sim import UnstableError
 if TYPE_CHECKING:
     from poise.jobs.tracker import Tracker
 
+#: Largest step size of a policy that is good already.
+SMALL_STEP = 1e-4
 #: Start frames of a first look; the final evaluation takes every one.
 FIRST_STARTS = 64
 #: The expert acts in no more worlds than these; more of them teach little more.
@@ -236,10 +238,11 @@ def some_starts(imitation: Imitation, most: int = FIRST_STARTS) -> tuple[Tensor,
     return clip[picks], frame[picks]
 
 
-def finetuning(ppo: PPOConfig, most: float = 1e-4) -> PPOConfig:
-    """The same settings for a policy that is good already: small steps, the critic first.
+def critic_first(ppo: PPOConfig) -> PPOConfig:
+    """The same settings for a policy that acts already: the critic learns alone at first."""
+    return replace(ppo, critic_warmup=max(ppo.critic_warmup, 2))
 
-    most: step size of the policy.
-    """
-    step = min(ppo.policy_lr, most)
-    return replace(ppo, policy_lr=step, critic_warmup=max(ppo.critic_warmup, 2))
+
+def finetuning(ppo: PPOConfig) -> PPOConfig:
+    """The same settings for a policy that is good already: small steps, the critic first."""
+    return critic_first(replace(ppo, policy_lr=min(ppo.policy_lr, SMALL_STEP)))

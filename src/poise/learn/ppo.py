@@ -37,6 +37,7 @@ from poise.nets import (
 
 _SUMS: tuple[str, ...] = ("policy loss", "kl", "clip fraction", "policy gradient")
 _LOGGED = (*_SUMS, "value loss")
+COLD = 0.1  # What is left of the policy's lr at the end of a training that cools.
 RETURN_WINDOW = 10  # Batches over which the scale of the returns is remembered.
 
 
@@ -300,9 +301,11 @@ class PPO:
             last.weight.mul_(std / norm.std)
             last.bias.mul_(std).add_(mean - norm.shift).div_(norm.std)
 
-    def scale_lr(self, factor: float) -> None:
-        """Sets the policy's lr to a share of the configured one, unless it adapts itself."""
+    def cool(self, left: float, cooling: float) -> None:
+        """Lets the policy's lr, unless it adapts itself, fall evenly to a share `COLD` in the last
+        share `cooling` of a training of which a share `left` is left."""
         if self.config.kl_target is None:
+            factor = min(1.0, max(left / cooling, COLD))
             self.optimizer.param_groups[0]["lr"] = self.config.policy_lr * factor
 
     def _adapt_lr(self, kl: float) -> None:

@@ -6,7 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from poise.errors import PoiseError
@@ -41,6 +41,26 @@ class Until:
             or (self.samples is not None and trainer.samples >= self.samples)
         )
 
+    def share(self, iterations: int, samples: int, seconds: float) -> float:
+        """How much of the nearest limit is used up, 0 to 1."""
+        used = (
+            (seconds / 60, self.minutes), (iterations, self.iterations), (samples, self.samples)
+        )  # fmt: skip
+        return min(1.0, max(a / b if b else 1.0 for a, b in used if b is not None))
+
+    def done(self, iterations: int, samples: int, seconds: float) -> float:
+        """How much of the training is done, 0 to 1, by which its stages and what anneals are planned.
+
+        Where iterations or samples have a limit they alone are counted, so that no clock decides what
+        is learned: the same command, killed and resumed or not, ends with the same policy. Time then
+        only ends the training.
+        """
+        if self.minutes is None or (self.iterations, self.samples) == (None, None):
+            return self.share(iterations, samples, seconds)
+        if seconds >= 60 * self.minutes:
+            return 1.0
+        return replace(self, minutes=None).share(iterations, samples, seconds)
+
 
 @dataclass(frozen=True)
 class RunResult:
@@ -60,6 +80,7 @@ def run(
     every: int = 1,
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     tensorboard: bool = True,
+    cooling: float = 0.0,
 ) -> RunResult:
     """Iterates until a limit; a killed run goes on from the last checkpoint bit for bit.
 
@@ -70,6 +91,8 @@ def run(
         every: iterations between checkpoints, so at most `every` iterations are lost by a kill.
         on_iteration: called after each iteration and its checkpoint; returning False ends the run.
         tensorboard: whether to write TensorBoard's files beside the CSV.
+        cooling: share of the training, at its end, in which the policy makes ever smaller steps, see
+            `PPO.cool`; 0 for none.
 
     Ctrl-C ends the run after the present iteration, with a checkpoint; a second one at once. After
     a `TrainingError` the policy of the last good iteration is in `last_good.safetensors`.
@@ -86,6 +109,9 @@ def run(
     try:
         with interruptible() as interrupt:
             while not any_of(trainer.comm, stop or interrupt.is_set()):
+                if cooling:
+                    done = until.done(trainer.iteration, trainer.samples, trainer.seconds)
+                    trainer.ppo.cool(1.0 - done, cooling)
                 stats = trainer.iterate()
                 stop = until.reached(trainer)
                 if keeper is not None:

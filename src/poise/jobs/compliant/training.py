@@ -21,7 +21,6 @@ from poise.env.on_top import Added, OnTop
 from poise.errors import PoiseError
 from poise.jobs.compliant.motions import motion_of
 from poise.jobs.compliant.standing import standing
-from poise.jobs.perpetual.stage_order import COLD, done_of
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker, halved
@@ -99,18 +98,6 @@ def scene_task(config: Compliant, tracker: Tracker) -> Imitation:
     )
 
 
-class _Cooling(Trainer):
-    """Makes smaller steps towards its end, see `Compliant.cooling`."""
-
-    until, cooling = Until(iterations=1), 0.0
-
-    def iterate(self) -> IterationStats:
-        done = done_of(self.until, self.iteration, self.samples, self.seconds)
-        if self.cooling:
-            self.ppo.scale_lr(min(1.0, max((1.0 - done) / self.cooling, COLD)))
-        return super().iterate()
-
-
 def train(
     config: Compliant,
     tracker: Tracker,
@@ -125,13 +112,12 @@ def train(
     env = task.env(config.num_envs, config.seed, threads=threads, help_scale=0.0, guard=False)
     added = config.added(tracker.policy.num_obs)
     with only_writer(folder):
-        trainer = _Cooling(
+        trainer = Trainer(
             cast(VecEnv, OnTop(env, tracker.policy, added)), config.ppo, config.seed,
             task.humanoid.identity, {"recipe": "compliant"}, update_threads=threads or cores(),
         )  # fmt: skip
-        trainer.until, trainer.cooling = until, config.cooling
         try:
-            return run(trainer, until, folder, 10, on_iteration, tensorboard)
+            return run(trainer, until, folder, 10, on_iteration, tensorboard, config.cooling)
         finally:
             trainer.close()
 

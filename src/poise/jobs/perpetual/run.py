@@ -25,7 +25,7 @@ from poise.jobs.perpetual.result import RESULT, PerpetualResult, finish
 from poise.jobs.perpetual.stage_order import Progress, Stage
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile, body_facts, held_run, write_run
-from poise.jobs.warm_start import TrainingCallbacks
+from poise.jobs.warm_start import SMALL_STEP, TrainingCallbacks
 from poise.learn import LATEST, PolicyBundle, Until, WarmStart, load_checkpoint
 from poise.learn.checkpoint import PolicyMeta
 from poise.learn.lock import alone
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
 #: Where a run file holds what its library knows of coming back.
 WAYS = "ways"
-#: Largest step size of a policy that goes on, and least where it learns to come back.
-ANEW = 1e-4
 
 
 def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
@@ -68,11 +66,9 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
     quick = policy.recovering.quick or wanted.recovering.quick
     demonstrations = wanted.recovering.demonstrations
     asked["recovering"] = replace(policy.recovering, demonstrations=demonstrations, quick=quick)
-    step = min(policy.ppo.policy_lr, ANEW)
+    # The step size that the policy ended with is too small for learning something new.
+    step = SMALL_STEP if wanted.recovery else min(policy.ppo.policy_lr, SMALL_STEP)
     ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE), policy_lr=step)
-    if wanted.recovery:
-        # The step size that the policy ended with is too small for learning something new.
-        ppo = replace(ppo, policy_lr=max(ppo.policy_lr, ANEW))
     if wanted.recovery and not wanted.single:
         # Primitives have the sizes of the network that becomes the first of them.
         asked |= {"single": False, "multiplicative": True, "progressive": True}

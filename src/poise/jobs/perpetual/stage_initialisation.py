@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -14,7 +13,7 @@ from poise.env import ImitationEnv
 from poise.env.recovery.clock import RecoveryClock
 from poise.jobs.perpetual.demonstrations import clone_for, find_paths, odds, practised
 from poise.jobs.perpetual.stage_order import Stage, first_recovers, first_stage, own_recovery
-from poise.jobs.warm_start import CLONE_WORLDS, TrainingCallbacks, clone_expert, finetuning
+from poise.jobs.warm_start import CLONE_WORLDS, TrainingCallbacks, clone_expert, critic_first
 from poise.learn import (
     CloneConfig,
     PolicyBundle,
@@ -229,7 +228,7 @@ def make_trainer(
     seed = (config.seed + 1_000_003 * (stage.number - 1)) % 2**31
     own = staged(practised(imitation, stage), stage)
     own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
-    ppo = finetuning(own.ppo(), math.inf) if warm else own.ppo()
+    ppo = critic_first(own.ppo()) if warm else own.ppo()
     lessons = None
     if config.teacher is not None:
         lessons = own.teacher(config.teacher, threads), config.lessons

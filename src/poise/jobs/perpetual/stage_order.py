@@ -17,15 +17,13 @@ A network with recovery is the same one as before, which goes on learning.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from poise.eval import ClipResults, RecoveryCard
-from poise.learn import Decision, IterationStats, Until
+from poise.learn import Decision, IterationStats
 from poise.recipes.perpetual.config import Perpetual, Recovers
 
-#: What is left of the policy's step size at the end of a stage that cools.
-COLD = 0.1
 #: Networks that learn all clips in one stage.
 WHOLE = ("single", "joint")
 
@@ -180,26 +178,3 @@ class Progress:
     recovery: RecoveryCard | None
     following: Stage | None
     trouble: str = ""
-
-
-def share_of(until: Until, iterations: int, samples: int, seconds: float) -> float:
-    """How much of the nearest limit is used up, 0 to 1."""
-    used = (
-        (seconds / 60, until.minutes), (iterations, until.iterations), (samples, until.samples)
-    )  # fmt: skip
-    return min(1.0, max(a / b if b else 1.0 for a, b in used if b is not None))
-
-
-def done_of(until: Until, iterations: int, samples: int, seconds: float) -> float:
-    """How much of the training is done, 0 to 1, by which its stages and what anneals are planned.
-
-    Where iterations or samples have a limit they alone are counted, so that no clock decides what is
-    learned: the same command, killed and resumed or not, ends with the same policy. Time then only ends
-    the training.
-    """
-    counts = (until.iterations, until.samples)
-    if until.minutes is None or counts == (None, None):
-        return share_of(until, iterations, samples, seconds)
-    if seconds >= 60 * until.minutes:
-        return 1.0
-    return share_of(replace(until, minutes=None), iterations, samples, seconds)

@@ -29,10 +29,8 @@ from poise.jobs.perpetual.stage_initialisation import (
     members_of,
 )
 from poise.jobs.perpetual.stage_order import (
-    COLD,
     Progress,
     Stage,
-    done_of,
     ends,
     first_recovers,
     following,
@@ -137,7 +135,7 @@ class StageTrainer:
     @property
     def share(self) -> float:
         """How much of the whole training is done, 0 to 1."""
-        return done_of(self.until, self.iteration, self.trainer.samples, self.trainer.seconds)
+        return self.until.done(self.iteration, self.trainer.samples, self.trainer.seconds)
 
     @property
     def help(self) -> float:
@@ -165,7 +163,7 @@ class StageTrainer:
     @property
     def began(self) -> float:
         """The share of the whole training at which this stage began."""
-        return done_of(self.until, self.before, *self.begun)
+        return self.until.done(self.before, *self.begun)
 
     def policy(self) -> PolicyBundle:
         """The stage's policy that did best, or the present one before any was evaluated."""
@@ -246,7 +244,7 @@ class StageTrainer:
         cooling, end = self.config.cooling, ends(self.config, self.stage, self.began)
         if cooling and end > self.began:
             left = (end - self.share) / (end - self.began)
-            self.trainer.ppo.scale_lr(min(1.0, max(left / cooling, COLD)))
+            self.trainer.ppo.cool(left, cooling)
 
     def _judge(self, over: bool) -> Judged:
         """Evaluates the present policy. over: the stage's time is."""
