@@ -33,8 +33,9 @@ from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import begin, clips_of, going_on, resume, train
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened
-from poise.learn import ConvergenceConfig, Until
+from poise.learn import LATEST, ConvergenceConfig, PolicyBundle, Until
 from poise.plan import TrajOptConfig
+from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
 
 #: Dances, a kick, boxing and exercises.
@@ -136,6 +137,11 @@ def parser_of(about: str, minutes: float) -> argparse.ArgumentParser:
     return parser
 
 
+def goes_on(earlier: Tracker | None, imitation: Imitation, out: Path) -> PolicyBundle | None:
+    """The policy that a run begins with which was stopped before its first checkpoint."""
+    return widened(earlier, imitation) if earlier and not (out / LATEST).exists() else None
+
+
 def main() -> None:
     parser = parser_of(__doc__, minutes=60.0)
     parser.add_argument("--onto", type=Path, help="a clip on the skeleton of the body that is made")
@@ -184,6 +190,7 @@ def main() -> None:
     source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source, a.device)
+        trained = goes_on(earlier, imitation, a.out)
     else:
         how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
         held = (a.hold_out, TWINS, print, earlier.target if earlier else a.onto, how)

@@ -50,6 +50,14 @@ def problem(nv: int = 8, n: int = 2, batch: int = 5) -> dict[str, torch.Tensor]:
     }
 
 
+def test_targets_and_actions_lie_where_the_reference_does():
+    """On a device that every build of torch knows, and that refuses to meet the CPU."""
+    elsewhere = torch.zeros(3, 2, device="meta")
+    pd = PDTargets("absolute", torch.ones(2), torch.zeros(2))
+    assert pd.target(elsewhere, elsewhere).device == pd.action(elsewhere, elsewhere).device
+    assert pd.action(elsewhere, elsewhere).device == elsewhere.device
+
+
 def test_stable_pd_equals_a_naive_loop():
     p, dt = problem(), 0.01
     ours = stable_pd_torque(**p, dt=dt)

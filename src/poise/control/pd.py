@@ -36,16 +36,21 @@ class PDTargets:
 
     def target(self, action: Tensor, q_ref_next: Tensor) -> Tensor:
         """The targets `(N, n)` rad of `action (N, n)`."""
-        base = q_ref_next if self.mode == "additive" else self.offset
-        scale = self.scale.to(action) if isinstance(self.scale, Tensor) else self.scale
+        base, scale = self._terms(q_ref_next)
         plain = not isinstance(scale, Tensor) and scale == 1.0
         target = action if plain else action * scale
-        return target if base is None else target + base.to(target.device)
+        return target if base is None else target + base
 
     def action(self, target: Tensor, q_ref_next: Tensor) -> Tensor:
         """The actions `(N, n)` that give the targets `target (N, n)` rad: the inverse of `target`."""
+        base, scale = self._terms(q_ref_next)
+        return (target if base is None else target - base) / scale
+
+    def _terms(self, q_ref_next: Tensor) -> tuple[Tensor | None, float | Tensor]:
+        """Base and scale, where the reference is."""
         base = q_ref_next if self.mode == "additive" else self.offset
-        return (target if base is None else target - base) / self.scale
+        scale = self.scale.to(q_ref_next) if isinstance(self.scale, Tensor) else self.scale
+        return None if base is None else base.to(q_ref_next.device), scale
 
 
 def range_scale(ranges: Tensor) -> Tensor:

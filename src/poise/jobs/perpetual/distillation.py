@@ -20,7 +20,7 @@ from poise.jobs.perpetual.demonstrations import clone_for, odds, practised
 from poise.jobs.perpetual.stage_initialisation import staged
 from poise.jobs.perpetual.stage_order import Stage
 from poise.jobs.warm_start import CLONE_WORLDS, TrainingCallbacks
-from poise.learn import VecEnv, WarmStart, clone
+from poise.learn import PolicyBundle, VecEnv, WarmStart, clone
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.task import Perpetual, stage_task
 
@@ -52,7 +52,7 @@ class PolicyTeacher:
         task = stage_task(replace(tracker.config, help_start=0.0), env.goal.humanoid, None)
         # The same worlds, seen as the policy sees them.
         task = replace(task, rewards=(), dones=(), style=(), adaptive=0.0)
-        self.env, self.policy = env, tracker.policy
+        self.env, self.policy = env, tracker.policy.copy().to(env.device)
         self._seen = ImitationEnv(env.goal, env.backend, task, env.substeps)
 
     @torch.no_grad()
@@ -90,21 +90,29 @@ def distilled(
     threads: int = 0,
     dumps: Path | None = None,
     tell: TrainingCallbacks | None = None,
+    device: str = "cpu",
+    worlds: int = CLONE_WORLDS,
+    start: PolicyBundle | None = None,
 ) -> WarmStart:
-    """A policy, and its critic, for `imitation` that does as a trained one does where it comes to."""
+    """A policy, and its critic, for `imitation` that does as a trained one does where it comes to.
+
+    start: the policy that is taught, by default a new one; device, worlds: of the characters, of which
+    there are no more than the settings name.
+    """
     config: Perpetual = imitation.config
     stage = Stage("single", 2, mixed=config.recovery)
     own = staged(practised(imitation, stage), stage)
     frames = imitation.reference.length.cpu()
-    worlds, ppo = min(config.num_envs, CLONE_WORLDS), own.ppo()
-    env = own.env(worlds, threads=threads, dumps=dumps, help_scale=0.0, guard=False)
+    worlds, ppo = min(config.num_envs, worlds), own.ppo()
+    how = {"threads": threads, "dumps": dumps, "help_scale": 0.0, "device": device, "guard": False}
+    env = own.env(worlds, **how)
     env.weights = odds(imitation, stage, (frames - 1).double(), own.reference.length)
     try:
         taught = clone(
             cast(VecEnv, env), PolicyTeacher(env, tracker),
             config.clone or clone_for(int(frames.sum()), worlds),
             replace(ppo, policy_hidden=config.single_hidden), config.seed,
-            (tell or TrainingCallbacks()).round,
+            (tell or TrainingCallbacks()).round, start,
         )  # fmt: skip
     finally:
         env.close()
