@@ -32,7 +32,7 @@ from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import begin, clips_of, going_on, resume, train
 from poise.jobs.tracker import Tracker
-from poise.jobs.warm_start import widened
+from poise.jobs.warm_start import SMALL_STEP, widened
 from poise.learn import LATEST, ConvergenceConfig, PolicyBundle, Until
 from poise.plan import TrajOptConfig
 from poise.recipes.imitation import Imitation
@@ -78,50 +78,41 @@ def config(seed: int, paths: bool = False, step: float = STEP) -> Perpetual:
     )
 
 
-def finer(
-    tracker: Tracker,
-    step: float,
-    std: float,
-    seed: int,
-    recovery: float,
-    smooth: float,
-    hips: bool,
-    acceleration: float = 0.0,
-    slide: float = 0.2,
-    quick: bool = False,
-) -> Perpetual:
+def finer(tracker: Tracker, options: argparse.Namespace) -> Perpetual:
     """The settings with which a policy goes on: the heading of the hips, later frames, a filter of its
     actions, a nearer root, prices of changing actions and of feet that slide, large batches.
 
     Args:
-        step: of the policy, fixed; it became smaller from run to run.
-        std: deviation of the noise on its actions, rad.
-        recovery: share of the episodes that begin with a fall.
-        smooth: share of the last action that actions keep. With 0.5 all that a policy without knew of
-            getting up is gone at once, and an hour does not bring it back.
-        acceleration, slide: prices, see `Perpetual`. Noise on the actions is rough, too: with 0.05 rad
-            it doubles the acceleration, and the policy has little to gain by its own.
-        quick: see `RecoveryPlan.quick`.
-        hips: whether headings are those of the hips from now on, which changes all that is observed.
+        options: those of `main`. Noise on the actions is rough: with `--std` 0.05 it doubles the
+            acceleration, and the policy has little to gain by its own. `--filter` is the share of the
+            last action that actions keep; with 0.5 all that a policy without knew of getting up is gone
+            at once, and an hour does not bring it back. `--hips` changes all that is observed.
     """
-    kept = going_on(tracker.config, Perpetual(single=True, num_envs=4096, seed=seed), True)
+    a = options
+    kept = going_on(tracker.config, Perpetual(single=True, num_envs=a.worlds, seed=a.seed), True)
     recovering = replace(
-        kept.recovering, demonstration_share=recovery, demonstrations=768 if quick else 512, quick=quick
+        kept.recovering,
+        demonstration_share=a.recovery,
+        demonstrations=768 if a.quick else 512,
+        quick=a.quick,
     )
+    # A critic that does not know the new prices yet would undo what the policy knows.
+    step = a.step or SMALL_STEP
+    ppo = replace(kept.ppo, policy_lr=step, std=a.std, minibatch=a.minibatch, critic_warmup=8)
     return replace(
         kept,
-        heading="hips" if hips else kept.heading,
-        filter=smooth,
+        heading="hips" if a.hips else kept.heading,
+        filter=a.filter,
         window=(2, 4, 8),
         root=0.2,
         action_rate=3.0,
-        acceleration=acceleration,
-        foot_slide=slide,
+        acceleration=a.acceleration,
+        foot_slide=a.slide,
         recovering=recovering,
-        evaluate_every=12,
-        cooling=0.0,
-        # A critic that does not know the new prices yet would undo what the policy knows.
-        ppo=replace(kept.ppo, policy_lr=step, std=std, critic_warmup=8),
+        evaluate_every=a.every,
+        cooling=a.cooling,
+        noise=tuple(a.noise),
+        ppo=ppo,
     )
 
 
@@ -167,26 +158,7 @@ def main() -> None:
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
-    settings = (
-        finer(
-            earlier,
-            a.step or 1e-4,
-            a.std,
-            a.seed,
-            a.recovery,
-            a.filter,
-            a.hips,
-            a.acceleration,
-            a.slide,
-            a.quick,
-        )
-        if earlier
-        else config(a.seed, a.paths, a.step or STEP)
-    )
-    if earlier:
-        large = {"num_envs": a.worlds, "cooling": a.cooling, "evaluate_every": a.every}
-        large["noise"] = tuple(a.noise)
-        settings = replace(settings, ppo=replace(settings.ppo, minibatch=a.minibatch), **large)
+    settings = finer(earlier, a) if earlier else config(a.seed, a.paths, a.step or STEP)
     source, trained = str(a.library), None
     if a.resume:
         imitation = resume(a.out, settings, source, a.device)
