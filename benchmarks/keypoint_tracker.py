@@ -42,7 +42,9 @@ def config(told: Perpetual, options: argparse.Namespace) -> Perpetual:
     told: those of a policy of keypoints that goes on, or the teacher's for places (`taught_by`).
     """
     a = options
-    ppo = replace(told.ppo, policy_lr=a.step, kl_target=0.05, lr_range=(5e-6, 1e-4), critic_warmup=8)
+    # Steps that become smaller are fixed, others keep to a divergence.
+    target = None if a.cooling else 0.05
+    ppo = replace(told.ppo, policy_lr=a.step, kl_target=target, lr_range=(5e-6, 1e-4), critic_warmup=8)
     taught = CloneConfig(steps=TAUGHT // a.worlds, rounds=a.rounds, epochs=(6, 2), most=600_000)
     return replace(
         told,
@@ -50,7 +52,7 @@ def config(told: Perpetual, options: argparse.Namespace) -> Perpetual:
         clone=taught if a.rounds else None,
         num_envs=max(4096, a.worlds),
         evaluate_every=a.every,
-        cooling=0.0,
+        cooling=a.cooling,
         seed=a.seed,
     )
 
@@ -64,6 +66,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--worlds", type=int, default=CLONE_WORLDS, help="characters that are taught")
     parser.add_argument("--minibatch", type=int, help="by default the teacher's")
+    parser.add_argument("--cooling", type=float, default=0.0, help="share with smaller steps")
     parser.add_argument("--every", type=int, default=12, help="iterations between evaluations")
     a = parser.parse_args()
     teacher = open_run(a.teacher).tracker
