@@ -73,7 +73,7 @@ def main() -> None:
     earlier = open_run(a.earlier).tracker if a.earlier else None
     a.rounds = (0 if earlier else 24) if a.rounds is None else a.rounds
     told = earlier.config if earlier else taught_by(teacher.config, goal="keypoints")
-    settings, source, trained = config(told, a), str(a.library), None
+    settings, source = config(told, a), str(a.library)
     if a.resume:
         imitation = resume(a.out, settings, source, a.device)
     else:
@@ -81,12 +81,11 @@ def main() -> None:
         library, notes = clips_of(a.library, BodyConfig(), HELD_OUT, TWINS, print, teacher.target, how)
         print(*notes, sep="\n")
         imitation = begin(a.out, library, settings, source, a.device, earlier or teacher)
-    if not (a.out / LATEST).exists():
-        trained = widened(earlier, imitation) if earlier else None
-        if a.rounds:
-            start = trained.policy if trained else None
-            where = (a.threads, a.out / "dumps", beginning(), a.device, a.worlds, start)
-            trained = distilled(teacher, imitation, *where)
+    trained = widened(earlier, imitation) if earlier else None
+    if a.rounds and not (a.out / LATEST).exists():
+        start = trained.policy if trained else None
+        where = (a.threads, a.out / "dumps", beginning(), a.device, a.worlds, start)
+        trained = distilled(teacher, imitation, *where)
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         first, until = beginning(), Until(minutes=a.minutes)
         train(imitation, a.out, until, show, a.threads, True, a.device, first, trained=trained)

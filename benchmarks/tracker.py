@@ -33,9 +33,8 @@ from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import begin, clips_of, going_on, resume, train
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import SMALL_STEP, widened
-from poise.learn import LATEST, ConvergenceConfig, PolicyBundle, Until
+from poise.learn import ConvergenceConfig, Until
 from poise.plan import TrajOptConfig
-from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual
 
 #: Dances, a kick, boxing and exercises.
@@ -128,11 +127,6 @@ def parser_of(about: str, minutes: float) -> argparse.ArgumentParser:
     return parser
 
 
-def goes_on(earlier: Tracker | None, imitation: Imitation, out: Path) -> PolicyBundle | None:
-    """The policy that a run begins with which was stopped before its first checkpoint."""
-    return widened(earlier, imitation) if earlier and not (out / LATEST).exists() else None
-
-
 def main() -> None:
     parser = parser_of(__doc__, minutes=60.0)
     parser.add_argument("--onto", type=Path, help="a clip on the skeleton of the body that is made")
@@ -159,17 +153,17 @@ def main() -> None:
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
     settings = finer(earlier, a) if earlier else config(a.seed, a.paths, a.step or STEP)
-    source, trained = str(a.library), None
+    source = str(a.library)
     if a.resume:
         imitation = resume(a.out, settings, source, a.device)
-        trained = goes_on(earlier, imitation, a.out)
     else:
         how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
         held = (a.hold_out, TWINS, print, earlier.target if earlier else a.onto, how)
         library, notes = clips_of(a.library, BodyConfig(), *held)
         print(*notes, sep="\n")
         imitation = begin(a.out, library, settings, source, a.device, earlier)
-        trained = widened(earlier, imitation) if earlier else None
+    # A run that has a checkpoint goes on from that.
+    trained = widened(earlier, imitation) if earlier else None
     with contextlib.suppress(KeyboardInterrupt), shown() as show:
         until, first = Until(minutes=a.minutes, samples=a.samples), beginning()
         how = {"device": a.device, "beginning": first, "trained": trained}
