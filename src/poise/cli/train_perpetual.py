@@ -133,7 +133,7 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         raise PoiseError("the recipe perpetual trains in one process", hint=hint)
     from poise.jobs.perpetual.run import train
     from poise.jobs.run_file import RUN_FILE
-    from poise.learn import Until
+    from poise.learn import LATEST, Until
 
     held = (out / RUN_FILE).exists()
     if held and not training.resume:
@@ -159,7 +159,8 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
     imitation = begin(library, out, config, training, held, tracker)
     until = Until(minutes=training.minutes, iterations=training.iterations)
     t, result, trained = training, None, None
-    if tracker is not None and not held:
+    # A run that was killed before its first checkpoint begins as if it had not been begun.
+    if tracker is not None and not (out / LATEST).exists():
         from poise.jobs.perpetual.distillation import distilled
         from poise.jobs.warm_start import widened
 
