@@ -140,6 +140,7 @@ def main() -> None:
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
     parser.add_argument("--quick", action="store_true", help="see RecoveryPlan.quick")
     parser.add_argument("--noise", type=float, nargs="*", default=[], help="see Perpetual.noise")
+    parser.add_argument("--damping", type=float, help="of the servos, kd / kp in s; else the policy's")
     parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")
     parser.add_argument("--samples", type=int, help="control steps at most")
     parser.add_argument("--recovery", type=float, default=0.4)
@@ -152,6 +153,8 @@ def main() -> None:
     if (a.onto is None) == (a.earlier is None):
         parser.error("give one of --onto and --from")
     earlier = open_run(a.earlier).tracker if a.earlier else None
+    if earlier and a.damping:
+        earlier = earlier.with_damping(a.damping)
     settings = finer(earlier, a) if earlier else config(a.seed, a.paths, a.step or STEP)
     source = str(a.library)
     if a.resume:

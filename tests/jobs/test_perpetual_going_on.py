@@ -139,3 +139,18 @@ def test_a_wider_observation_changes_nothing_at_first(policy: Path, tmp_path: Pa
         widened(again, wider(again, window=(2,)))
     with pytest.raises(PoiseError, match="observes 'rotation_goal'"):
         widened(tracker, wider(tracker, goal="keypoints"))
+
+
+def test_servos_of_more_damping_on_the_same_body(policy: Path, tmp_path: Path) -> None:
+    tracker = load_tracker(policy)
+    given = tracker.config.body.damping
+    damped = tracker.with_damping(2.0 * given)
+    for row, before in zip(damped.humanoid.table.rows, tracker.humanoid.table.rows, strict=True):
+        assert row == replace(before, kd=2.0 * before.kd)
+    save_tracker(damped, tmp_path / "damped.safetensors")
+    again = load_tracker(tmp_path / "damped.safetensors")
+    assert again.humanoid.table == damped.humanoid.table
+    assert again.config.body.damping == 2.0 * given
+    imitation = begin(tmp_path / "run", library(), going_on(damped.config, tiny()), earlier=damped)
+    hinges = imitation.model.dof_damping[6:]
+    assert hinges == pytest.approx(2.0 * tracker.humanoid.model.dof_damping[6:])

@@ -110,6 +110,19 @@ class Tracker:
         humanoid = make_humanoid(example.skeleton, table)
         return replace(self, humanoid=humanoid, example=example, onto=onto_own(humanoid.table))
 
+    def with_damping(self, seconds: float) -> Tracker:
+        """The policy on its body with other servos, which it does not know yet and has to learn.
+
+        seconds: their damping kd as a fraction of kp, see `BodyConfig`.
+        """
+        config = self.config
+        share = seconds / config.body.damping
+        table = self.humanoid.table
+        table = replace(table, rows=tuple(replace(r, kd=r.kd * share) for r in table.rows))
+        humanoid = make_humanoid(self.humanoid.skeleton, table)
+        config = replace(config, body=replace(config.body, damping=seconds))
+        return replace(self, humanoid=humanoid, config=config)
+
 
 def policy_of_run(file: RunFile) -> Tracker:
     """The latest policy of a run of `poise train perpetual`.
