@@ -98,6 +98,7 @@ def finer(tracker: Tracker, options: argparse.Namespace) -> Perpetual:
     # A critic that does not know the new prices yet would undo what the policy knows.
     step = a.step or SMALL_STEP
     ppo = replace(kept.ppo, policy_lr=step, std=a.std, minibatch=a.minibatch, critic_warmup=8)
+    ppo = replace(ppo, smooth_weight=a.smooth)
     return replace(
         kept,
         heading="hips" if a.hips else kept.heading,
@@ -140,6 +141,7 @@ def main() -> None:
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
     parser.add_argument("--quick", action="store_true", help="see RecoveryPlan.quick")
     parser.add_argument("--noise", type=float, nargs="*", default=[], help="see Perpetual.noise")
+    parser.add_argument("--smooth", type=float, default=0.0, help="see PPOConfig.smooth_weight")
     parser.add_argument("--damping", type=float, help="of the servos, kd / kp in s; else the policy's")
     parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")
     parser.add_argument("--samples", type=int, help="control steps at most")

@@ -30,6 +30,7 @@ EXPLAINED = {
     ),
     "figures of the benchmarks": (
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
+        "jobs/tracker.py:Tracker.with_damping",
         "jobs/compliant/throws.py:throws",
         "learn/next_frame.py:NextFrameObjective", "nets/next_frame.py:NextFrameConfig.aclstm",
         "nets/next_frame.py:NextFrameConfig.egopose", "nets/next_frame.py:NextFrameConfig.erd",

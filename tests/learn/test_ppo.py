@@ -144,6 +144,27 @@ def test_a_bound_pulls_the_mean_inside():
         assert float(ppo.actor.policy(rollout.obs[:-1]).abs().mean()) < float(rollout.mean.abs().mean())
 
 
+def test_a_smooth_policy_answers_alike_to_states_that_are_near():
+    def rough(ppo):
+        g = torch.Generator().manual_seed(7)
+        obs = torch.randn(4096, 4, generator=g)
+        near = obs + 0.4 * torch.randn(obs.shape, generator=g)
+        with torch.no_grad():
+            policy = ppo.actor.policy
+            kl = gaussian_kl(policy(obs), policy.log_std, policy(near), policy.log_std)
+            return kl.mean().item()
+
+    plain, smooth = PPO(4, 2, TOY, seed=0), PPO(4, 2, replace(TOY, smooth_weight=1.0), seed=0)
+    with torch.no_grad():
+        for ppo in (plain, smooth):
+            ppo.actor.policy.mean.last.weight.mul_(30.0)
+    before = rough(plain)
+    for k in range(10):
+        plain.update(filled(plain, seed=k))
+        smooth.update(filled(smooth, seed=k))
+    assert rough(smooth) < 0.6 * before < 0.9 * rough(plain)
+
+
 def test_a_learned_deviation_moves_and_a_fixed_one_does_not():
     for learn in (False, True):
         ppo = PPO(4, 2, replace(TOY, learn_std=learn, entropy_weight=1.0), seed=0)

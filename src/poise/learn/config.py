@@ -50,6 +50,11 @@ class PPOConfig:
     """Weight of the squared excess of the mean action over +-bound_limit."""
     bound_limit: float = 1.0
     """Mean actions inside +-bound_limit cost nothing."""
+    smooth_weight: float = 0.0
+    """Weight of KL(pi(s) || pi(s + n)), with n of `smooth_noise`: what makes the policy answer alike to
+    states that are near (Shen et al. 2020, "Deep RL with robust and smooth policy")."""
+    smooth_noise: float = 0.4
+    """Deviation of n in normalised observations."""
     kl_target: float | None = None
     """With a number, the policy's lr follows the KL per update (summed over the actions): divided
     by 1.5 above twice the target, multiplied by 1.5 below half of it. Use 0.03 to 0.1: with 38
@@ -82,6 +87,9 @@ class PPOConfig:
         for name in ("horizon", "epochs", "minibatch", "policy_lr", "value_lr", "clip"):
             if not getattr(self, name) > 0:
                 raise PoiseError(f"{name} must be above 0, got {getattr(self, name)}", "PPOConfig")
+        for name in ("smooth_weight", "smooth_noise"):
+            if not getattr(self, name) >= 0:
+                raise PoiseError(f"{name} must be at least 0, got {getattr(self, name)}", "PPOConfig")
         for name in ("gamma", "lam"):
             if not 0 <= getattr(self, name) <= 1:
                 raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "PPOConfig")

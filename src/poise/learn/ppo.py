@@ -33,11 +33,14 @@ from poise.nets import (
     GaussianPolicy,
     RunningNorm,
     bfloat16_is_fast,
+    gaussian_kl,
 )
 
 _SUMS: tuple[str, ...] = ("policy loss", "kl", "clip fraction", "policy gradient")
 _LOGGED = (*_SUMS, "value loss")
 COLD = 0.1  # What is left of the policy's lr at the end of a training that cools.
+NEAR = 1024  # Displacements of observations that an update draws for `PPOConfig.smooth_weight`.
+EVERY = 4  # Of so many samples one is looked at for it.
 RETURN_WINDOW = 10  # Batches over which the scale of the returns is remembered.
 
 
@@ -68,6 +71,7 @@ class _Batch(NamedTuple):
     target: Tensor
     old: Drawn
     context: Tensor | None
+    near: Tensor | None
 
 
 class PPO:
@@ -207,7 +211,7 @@ class PPO:
                 obs = obs.bfloat16()
         mean, std = moments(self.comm, advantage)
         target = self.return_norm(rollout.returns.view(-1, 1))
-        batch = _Batch(obs, (advantage - mean) / (std + 1e-8), target, old, context)
+        batch = _Batch(obs, (advantage - mean) / (std + 1e-8), target, old, context, self._near(obs))
         parts = max(1, round(rollout.samples * self.comm.size / config.minibatch))
         # Processes that share gradients make the same calls in the same order, so in one thread.
         parallel = parallel and self.comm.size == 1
@@ -232,6 +236,14 @@ class PPO:
                 kl = epoch["kl"]
                 train_policy = config.kl_stop is None or kl <= config.kl_stop
         return {name: sum(m[name] for m in means) / len(means) for name in means[0]}, kl
+
+    def _near(self, obs: Tensor) -> Tensor | None:
+        """`(NEAR, O)` by which states near those of the batch lie off them; None where none are seen."""
+        if not self.config.smooth_weight:
+            return None
+        size = (NEAR, obs.shape[1])
+        drawn = torch.randn(size, generator=self.shuffle, device=obs.device) * self.config.smooth_noise
+        return drawn.to(obs.dtype)
 
     def distribution(self, obs: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
         """The policy's own of normalised `obs (N, O)`, by the products of the update, so that the policy
@@ -270,12 +282,15 @@ class PPO:
         def loss_and_terms(index: Tensor) -> tuple[Tensor, Tensor]:
             obs = batch.obs.index_select(0, index)
             context = None if batch.context is None else batch.context.index_select(0, index)
-            loss, *terms = policy_loss(
-                self.config,
-                *self.actor.policy.distribution(obs, context),
-                batch.advantage.index_select(0, index),
-                batch.old.take(index),
-            )
+            mean, log_std = self.actor.policy.distribution(obs, context)
+            advantage, old = batch.advantage.index_select(0, index), batch.old.take(index)
+            loss, *terms = policy_loss(self.config, mean, log_std, advantage, old)
+            if batch.near is not None:
+                rows = slice(None, None, EVERY)
+                moved = obs[rows] + batch.near.index_select(0, index[rows] % NEAR)
+                near = self.actor.policy.distribution(moved, None if context is None else context[rows])
+                here = mean[rows], log_std[rows] if log_std.dim() > 1 else log_std
+                loss = loss + self.config.smooth_weight * gaussian_kl(*here, *near).mean()
             return loss, torch.stack(terms)
 
         for index in indices:
