@@ -52,7 +52,6 @@ def main() -> None:
     a = parser.parse_args()
     shipped = open_run(None).tracker
     placed = [p for k, f in enumerate(a.clips) for p in pieces(f, shipped, a.minutes, a.seed + k)]
-    imitation = imitation_of(shipped, placed)
     policies = {"tracker": shipped}
     for given in a.policy:
         name, _, path = given.partition("=")
@@ -60,7 +59,8 @@ def main() -> None:
     said: dict[str, Any] = json.loads(a.json.read_text()) if a.json.exists() else {}
     rows = said.setdefault("rows", {})
     for name, tracker in policies.items():
-        done = evaluate_clips(imitation, tracker.policy, threads=1)
+        # Each by the servos that it was trained with.
+        done = evaluate_clips(imitation_of(tracker, placed), tracker.policy, threads=1)
         rows[name] = {
             "samples": tracker.about.get("samples"),
             "pieces": len(placed),
