@@ -57,7 +57,7 @@ class Averaged:
         return self.policy.act(near).view(2 * PAIRS, len(obs), -1).mean(0)
 
 
-class Path3D:
+class Places:
     """Observes where the bodies are and should be."""
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ def measure(tracker: Tracker, placed: list[Placed], noise: float, seed: int) -> 
     every, first = torch.arange(len(length)), torch.zeros(len(length), dtype=torch.long)
     env = imitation.bare().env(len(length), None, False, 1, None, 0.0, guard=False)
     policy = Averaged(tracker.policy, noise, seed) if noise else tracker.policy
-    judge, path = ClipJudge(length - 1), Path3D()
+    judge, path = ClipJudge(length - 1), Places()
     try:
         simulate(env, policy, env.reset_to(every, first), int(length.max()) - 1, judge, path)
     finally:

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from tracker import HELD_OUT, SIXTY, TWINS, parser_of
+from tracker import BACKWARDS, HELD_OUT, SIXTY, TWINS, parser_of
 
 from poise.body import BodyConfig
 from poise.env import ImitationEnv
@@ -100,7 +100,7 @@ def main() -> None:
     a = parser.parse_args()
     torch.set_num_threads(a.threads or 1)
     tracker = open_run(a.earlier).tracker
-    how = LibraryConfig(rates=SIXTY, mirror=True)
+    how = LibraryConfig(rates=SIXTY, mirror=True, backwards=BACKWARDS)
     library, _ = clips_of(a.library, BodyConfig(), HELD_OUT, TWINS, print, tracker.target, how)
     task = build(library, tracker.config, tracker.target.table, tracker.recovery_clips)
     env = task.env(a.worlds, a.seed, threads=a.threads or 1, help_scale=0.0, guard=False)

@@ -46,9 +46,9 @@ WAYS = "ways"
 
 def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    the networks, the seed, and whether and how recovery is learned. Where it is, the policy stays
-    as it is, the first primitive of more, unless one network is to learn both. Observations are clipped
-    no nearer than at `WIDE` deviations.
+    the networks, the seed, what makes it smoother, and whether and how recovery is learned. Where it is,
+    the policy stays as it is, the first primitive of more, unless one network is to learn both.
+    Observations are clipped no nearer than at `WIDE` deviations.
 
     returns: the policy tracks recovery motions already, so that more primitives learn what it fails, and
         none of its own is needed for recovery.
@@ -68,7 +68,10 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
     asked["recovering"] = replace(policy.recovering, demonstrations=demonstrations, quick=quick)
     # The step size that the policy ended with is too small for learning something new.
     step = SMALL_STEP if wanted.recovery else min(policy.ppo.policy_lr, SMALL_STEP)
-    ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE), policy_lr=step)
+    smooth = wanted.ppo.smooth_weight or policy.ppo.smooth_weight
+    clip = max(policy.ppo.obs_clip, WIDE)
+    ppo = replace(policy.ppo, obs_clip=clip, policy_lr=step, smooth_weight=smooth)
+    asked["acceleration"] = wanted.acceleration or policy.acceleration
     if wanted.recovery and not wanted.single:
         # Primitives have the sizes of the network that becomes the first of them.
         asked |= {"single": False, "multiplicative": True, "progressive": True}
