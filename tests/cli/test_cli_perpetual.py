@@ -50,7 +50,8 @@ def test_a_run_goes_on_from_another_ones_policy(
     first, then = tmp_path / "first", tmp_path / "then"
     one = ("--no-multiplicative", "--no-recovery", "--help-start", "0")
     assert main(command(folder, first, *one)) == 0
-    more = ("--no-recovery", "--seed", "3", "--noise", "0.5")
+    more = ("--no-recovery", "--seed", "3", "--noise", "0.5", "--set", "acceleration=0.3")
+    more = (*more, "--ppo.smooth-weight", "0.02", "--ppo.epochs", "3")
     go_on = command(folder, then, *more, "--from", str(first))
     go_on = [x for x in go_on if x not in ("--max-primitives", "2")]
     assert main(go_on) == 0
@@ -60,6 +61,7 @@ def test_a_run_goes_on_from_another_ones_policy(
     assert (
         config.noise == (0.5,) and config.seed == 3 and not config.multiplicative and not config.expert
     )
+    assert config.acceleration == 0.3 and (config.ppo.smooth_weight, config.ppo.epochs) == (0.02, 3)
     assert main([*go_on, "--resume"]) == 0
     capsys.readouterr()
     go_on[go_on.index(str(first))], go_on[go_on.index(str(then))] = "nothing", str(tmp_path / "none")
@@ -75,6 +77,13 @@ def test_a_policy_that_goes_on_has_its_own_settings_and_body(
     own = [x for x in command(folder, tmp_path / "run", *more) if x not in ("--max-primitives", "2")]
     assert main(own) == 2
     assert "there is goal, mass" in capsys.readouterr().err
+    for name, value in (("ppo.policy_hidden", "[8]"), ("sim.rate_hz", "120"), ("lfoot.kp", "400")):
+        asked = ("--from", str(tmp_path), "--set", f"{name}={value}")
+        own = [
+            x for x in command(folder, tmp_path / "run", *asked) if x not in ("--max-primitives", "2")
+        ]
+        assert main(own) == 2
+        assert f"there is {name}" in capsys.readouterr().err
 
 
 def test_paths_and_no_expert_contradict(

@@ -154,11 +154,3 @@ def test_servos_of_more_damping_on_the_same_body(policy: Path, tmp_path: Path) -
     imitation = begin(tmp_path / "run", library(), going_on(damped.config, tiny()), earlier=damped)
     hinges = imitation.model.dof_damping[6:]
     assert hinges == pytest.approx(2.0 * tracker.humanoid.model.dof_damping[6:])
-
-
-def test_what_makes_a_policy_smoother_may_be_asked_of_one_that_goes_on() -> None:
-    plain, asked = ONE, replace(ONE, acceleration=0.3)
-    asked = replace(asked, ppo=replace(asked.ppo, smooth_weight=0.02))
-    for policy, wanted in ((plain, asked), (asked, plain)):
-        found = going_on(policy, wanted)
-        assert (found.ppo.smooth_weight, found.acceleration) == (0.02, 0.3)

@@ -18,7 +18,7 @@ from poise.cli.library_options import Library
 from poise.cli.options import Body, Flag, Training
 from poise.cli.perpetual_report import report, shown
 from poise.cli.progress import clock
-from poise.cli.settings import derived, given
+from poise.cli.settings import class_of, configured, derived, given, stated
 from poise.cli.training import beginning, held_already, stopped
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
@@ -49,9 +49,9 @@ class Primitives(_Derived):
     """perpetual: characters that recover are told a point to come back to, as in the paper; by default
     they follow the library's own clips, where some of them get up and some walk."""
     going_on: Annotated[Path | None, arg(name="from", metavar="POLICY", help_behavior_hint="")] = None
-    """perpetual: go on from a trained policy, a file or a run, with its settings, networks and body;
-    with recovery it stays as it is, beside a primitive that recovers or, where it can already, others
-    that learn what it fails (--single: one network)."""
+    """perpetual: go on from a trained policy, a file or a run, with its networks and body and, but for
+    what --set states, its settings; with recovery it stays as it is, beside a primitive that recovers
+    or, where it can already, others that learn what it fails (--single: one network)."""
     paths: Annotated[int, arg(metavar="N")] = 0
     """perpetual: learn without help, from motions near the clips that need none, found first by so
     many iterations, 11 say; 0 learns with --help-start at first."""
@@ -72,12 +72,12 @@ BY_HAND = ("recovery_clips", "going_on", "paths", "style", "teacher")
 
 
 def settings(
-    primitives: Primitives, training: Training, body: Body, stated: Mapping[str, Any]
+    primitives: Primitives, training: Training, body: Body, options: Mapping[str, Any]
 ) -> Perpetual:
-    """The recipe's settings. stated: by name, what the options state."""
+    """The recipe's settings. options: by name, what the options state."""
     from poise.recipes import perpetual
 
-    values = {name: value for name, value in stated.items() if name not in BY_HAND}
+    values = {name: value for name, value in options.items() if name not in BY_HAND}
     if not 1 <= values.get("max_primitives", 1) <= 64:
         raise PoiseError(f"--max-primitives must lie in 1 to 64, got {values['max_primitives']}")
     if primitives.paths and values.get("expert") is False:
@@ -107,26 +107,36 @@ def settings(
     return training.settings("perpetual", default, body, values)
 
 
-def check_going_on(primitives: Primitives, body: Body, library: Library, returns: bool = True) -> None:
-    """Refuses options that the policy decides from which training goes on.
+def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
+    """Refuses options that the policy decides from which training goes on; the settings in --set that it
+    does not, by dotted names.
 
     returns: the policy tracks recovery motions already, so that primitives may learn what it fails.
     """
+    from poise.jobs.perpetual.run import KEPT
+
+    library, primitives, body = o.library, o.primitives, o.body
     if library.onto is not None:
         what = "--from brings the clips onto the policy's body, and --onto onto another skeleton"
         raise PoiseError(what, hint="Leave --onto out")
     free = {"recovery", "recovery_clips", "single", "going_on", "teacher", "noise"}
     if returns and primitives.recovery and primitives.recovery_clips and not primitives.single:
         free.add("max_primitives")
-    names = [name for name in given(primitives, body) if name not in free]
+    names = [name for name in given(primitives, replace(body, set=())) if name not in free]
+    names += [name for name in ("preset", "config") if getattr(o.training, name)]
+    names += ["help_start"] if o.recipe_settings.help_start else []
+    more, of_the_body = stated(body.set, class_of("perpetual"))
+    names += [text.partition("=")[0] for text in of_the_body]
+    names += [name for name in more if KEPT & {name, name.partition(".")[0]}]
     if names:
         what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
         raise PoiseError(what, hint="Leave it out")
+    return more
 
 
 def run(o: Options, config: Perpetual, again: str) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
-    library, primitives, out, training, body = o.library, o.primitives, o.out, o.training, o.body
+    library, primitives, out, training = o.library, o.primitives, o.out, o.training
     library.folder("perpetual")
     if launched() and int(os.environ["WORLD_SIZE"]) > 1:
         hint = "Start it without torchrun; --threads and --device take all of one machine"
@@ -143,17 +153,18 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         from poise.jobs.open import open_run
         from poise.jobs.perpetual.run import going_on
 
-        check_going_on(primitives, body, library)
+        check_going_on(o)
         tracker = open_run(primitives.going_on).tracker
         # Whether --max-primitives has a say is known by the policy alone.
         returns = tracker.recovery_clips is not None
-        check_going_on(primitives, body, library, returns)
+        more = check_going_on(o, returns)
         if o.recipe_settings.num_envs is None:
             config = replace(config, num_envs=tracker.config.num_envs)
         config = going_on(tracker.config, config, returns)
         if primitives.teacher == LOOKAHEAD:
             asked = o.recipe_settings.num_envs
             config = config.taught() if asked is None else replace(config.taught(), num_envs=asked)
+        config = configured(config, more)
     elif primitives.teacher not in (None, LOOKAHEAD):
         tracker = _teacher(primitives, library)
     imitation = begin(library, out, config, training, held, tracker)

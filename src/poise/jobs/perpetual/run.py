@@ -42,13 +42,21 @@ if TYPE_CHECKING:
 
 #: Where a run file holds what its library knows of coming back.
 WAYS = "ways"
+#: What a policy that goes on keeps whatever is stated: its weights are bound to what it observes, does
+#: and is, and `going_on` decides how it starts.
+KEPT = frozenset((
+    "goal", "shape", "shapes", "heading", "window", "filter", "action", "faithful", "style", "start",
+    "lateral", "combine", "weights", "clone", "multiplicative", "progressive", "single_hidden",
+    "composer_hidden", "composer_clone", "expert", "trajopt", "help_start", "help_share", "body", "sim",
+    "ppo.policy_hidden", "ppo.value_hidden", "ppo.activation", "ppo.learn_std", "ppo.obs_clip",
+))  # fmt: skip
 
 
 def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Perpetual:
     """The settings of a run that goes on from a policy: the policy's own, and of those that are wanted
-    the networks, the seed, what makes it smoother, and whether and how recovery is learned. Where it is,
-    the policy stays as it is, the first primitive of more, unless one network is to learn both.
-    Observations are clipped no nearer than at `WIDE` deviations.
+    the networks, the seed, and whether and how recovery is learned. Where it is, the policy stays as it
+    is, the first primitive of more, unless one network is to learn both. Observations are clipped no
+    nearer than at `WIDE` deviations. Settings that are not in `KEPT` may be changed afterwards.
 
     returns: the policy tracks recovery motions already, so that more primitives learn what it fails, and
         none of its own is needed for recovery.
@@ -68,10 +76,7 @@ def going_on(policy: Perpetual, wanted: Perpetual, returns: bool = False) -> Per
     asked["recovering"] = replace(policy.recovering, demonstrations=demonstrations, quick=quick)
     # The step size that the policy ended with is too small for learning something new.
     step = SMALL_STEP if wanted.recovery else min(policy.ppo.policy_lr, SMALL_STEP)
-    smooth = wanted.ppo.smooth_weight or policy.ppo.smooth_weight
-    clip = max(policy.ppo.obs_clip, WIDE)
-    ppo = replace(policy.ppo, obs_clip=clip, policy_lr=step, smooth_weight=smooth)
-    asked["acceleration"] = wanted.acceleration or policy.acceleration
+    ppo = replace(policy.ppo, obs_clip=max(policy.ppo.obs_clip, WIDE), policy_lr=step)
     if wanted.recovery and not wanted.single:
         # Primitives have the sizes of the network that becomes the first of them.
         asked |= {"single": False, "multiplicative": True, "progressive": True}
