@@ -11,7 +11,9 @@ from tiny_clips import deepmimic, put
 
 from poise.cli.main import main
 from poise.jobs.open import open_run
-from poise.learn import CloneConfig, PPOConfig
+from poise.jobs.perpetual import run as perpetual_run
+from poise.jobs.run_file import RUN_FILE
+from poise.learn import LATEST, CloneConfig, PPOConfig
 from poise.recipes import perpetual
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
 
@@ -68,6 +70,27 @@ def test_a_run_goes_on_from_another_ones_policy(
     assert main(go_on) == 2
     assert "no such file or folder" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on_from_the_policy(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, then = tmp_path / "first", tmp_path / "then"
+    assert main(command(folder, first, "--single", "--no-recovery", "--no-expert")) == 0
+    go_on = ["train", "perpetual", "--library", str(folder), "-o", str(then), "--envs", "8"]
+    go_on += ["--threads", "1", "--iterations", "1", "--no-recovery", "--from", str(first)]
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(perpetual_run, "train", killed)
+        assert main(go_on) != 0
+    assert (then / RUN_FILE).exists() and not (then / LATEST).exists()
+    assert "--resume" in "".join(capsys.readouterr())
+    assert main([*go_on, "--resume"]) == 0
+    before, after = (open_run(x).tracker.about["samples"] for x in (first, then))
+    assert after > before
 
 
 def test_a_policy_that_goes_on_has_its_own_settings_and_body(

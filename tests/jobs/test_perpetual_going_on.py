@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from poise.body import BodyConfig
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import begin, going_on, train
@@ -154,3 +155,6 @@ def test_servos_of_more_damping_on_the_same_body(policy: Path, tmp_path: Path) -
     imitation = begin(tmp_path / "run", library(), going_on(damped.config, tiny()), earlier=damped)
     hinges = imitation.model.dof_damping[6:]
     assert hinges == pytest.approx(2.0 * tracker.humanoid.model.dof_damping[6:])
+    bare = replace(tracker, config=replace(tracker.config, body=BodyConfig(damping=0.0)))
+    with pytest.raises(PoiseError, match="no damping"):
+        bare.with_damping(0.1)

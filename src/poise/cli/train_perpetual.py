@@ -176,7 +176,7 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         from poise.jobs.warm_start import widened
 
         if primitives.going_on is None:
-            trained = distilled(tracker, imitation, t.threads, out / "dumps", beginning())
+            trained = distilled(tracker, imitation, t.threads, out / "dumps", beginning(), t.device)
         else:
             trained = widened(tracker, imitation)
     with contextlib.suppress(KeyboardInterrupt), shown() as show:

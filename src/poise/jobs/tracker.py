@@ -114,8 +114,13 @@ class Tracker:
         """The policy on its body with other servos, which it does not know yet and has to learn.
 
         seconds: their damping kd as a fraction of kp, see `BodyConfig`.
+
+        Raises:
+            PoiseError: its own servos have no damping, which is what is scaled.
         """
         config = self.config
+        if not config.body.damping:
+            raise PoiseError("the policy's body has no damping that could be scaled")
         share = seconds / config.body.damping
         table = self.humanoid.table
         table = replace(table, rows=tuple(replace(r, kd=r.kd * share) for r in table.rows))
