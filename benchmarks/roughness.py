@@ -5,7 +5,8 @@
 
 The policy does every `--every`-th clip of the folder by itself, from frame 0, once as it is and then
 without any training with servos of more damping, with its answers averaged over noise on what it
-observes (in deviations of the observation), and with both. Jerk and acceleration are means over the
+observes (in deviations of the observation), on all of it or on the goal's velocities less the
+character's alone, and with both. Jerk and acceleration are means over the
 frames of the clips that it does whole; `spectrum` is the power of the jerk by frequency, 0 to 15 Hz,
 beside the source's. Rows of policies that are not asked for stay as they are in the JSON.
 """
@@ -33,10 +34,12 @@ from poise.learn.checkpoint import write_atomic
 from poise.metrics import acceleration_error, jerk
 from poise.motion import read_clip
 
-#: Damping of the servos in s (None: the body's own) and deviation of the noise that is averaged over.
-WAYS: tuple[tuple[float | None, float], ...] = (
-    (None, 0.0), (0.03, 0.0), (0.04, 0.0), (0.06, 0.0),
-    (None, 0.2), (None, 0.4), (None, 0.8), (0.03, 0.4),
+#: Damping of the servos in s (None: the body's own), deviation of the noise that is averaged over, and
+#: whether it is on velocities alone.
+WAYS: tuple[tuple[float | None, float, bool], ...] = (
+    (None, 0.0, False), (0.03, 0.0, False), (0.04, 0.0, False), (0.06, 0.0, False),
+    (None, 0.2, False), (None, 0.4, False), (None, 0.8, False), (0.03, 0.4, False),
+    (None, 0.8, True),
 )  # fmt: skip
 #: Pairs of opposite displacements over which answers are averaged.
 PAIRS = 6
@@ -47,8 +50,12 @@ WINDOW = 30
 class Averaged:
     """A policy whose answers are means over normal noise on what it observes."""
 
-    def __init__(self, policy: PolicyBundle, noise: float, seed: int):
-        self.policy, self.noise = policy, noise * policy.norm.std
+    def __init__(
+        self, policy: PolicyBundle, noise: float, seed: int, over: tuple[int, int] | None = None
+    ):
+        self.policy, self.noise = policy, torch.zeros_like(policy.norm.std)
+        columns = slice(*over) if over else slice(None)
+        self.noise[columns] = noise * policy.norm.std[columns]
         self.rng = torch.Generator().manual_seed(seed)
 
     def act(self, obs: Tensor) -> Tensor:
@@ -78,13 +85,16 @@ def spectrum(pos: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def measure(tracker: Tracker, placed: list[Placed], noise: float, seed: int) -> dict[str, Any]:
+def measure(
+    tracker: Tracker, placed: list[Placed], noise: float, seed: int, velocities: bool = False
+) -> dict[str, Any]:
     """One way of doing all clips."""
     imitation = imitation_of(tracker, placed)
     length, fps = imitation.reference.length, imitation.reference.rate_hz
     every, first = torch.arange(len(length)), torch.zeros(len(length), dtype=torch.long)
     env = imitation.bare().env(len(length), None, False, 1, None, 0.0, guard=False)
-    policy = Averaged(tracker.policy, noise, seed) if noise else tracker.policy
+    over = imitation.task.velocities if velocities else None
+    policy = Averaged(tracker.policy, noise, seed, over) if noise else tracker.policy
     judge, path = ClipJudge(length - 1), Places()
     try:
         simulate(env, policy, env.reset_to(every, first), int(length.max()) - 1, judge, path)
@@ -131,10 +141,11 @@ def main() -> None:
                 print(file.name, problem)
         rows[name] = []
         # A policy that was given is shown as it is.
-        for damping, noise in WAYS if not a.policy else WAYS[:1]:
+        for damping, noise, velocities in WAYS if not a.policy else WAYS[:1]:
             one = tracker if damping is None else tracker.with_damping(damping)
             own = round(one.config.body.damping, 4)
-            found = {"damping_s": own, "noise": noise, **measure(one, placed, noise, a.seed)}
+            way = {"damping_s": own, "noise": noise, "velocities": velocities}
+            found = way | measure(one, placed, noise, a.seed, velocities)
             rows[name].append(found)
             print(name, *(f"{k} {v}" for k, v in found.items() if "spectrum" not in k), flush=True)
     said |= {"command": "benchmarks/roughness.py", "machine": machine(), "seed": a.seed}

@@ -1,12 +1,12 @@
-"""Teaches a policy its own answers, averaged over noise on what it observes: it moves less roughly.
+"""Teaches a policy its own answers, averaged over noise on the velocities: it moves less roughly.
 
     python benchmarks/smoother.py --library FOLDER --from POLICY -o smoother.safetensors --minutes 8
 
 The policy goes on where it leads itself, with noise on its actions, and is taught there, for a state s
-in deviations of the observation and normal noise n, by (a(s + n) + a(s - n)) / 2 of the policy that was
-given: its mean over n. Nothing is tried and rewarded, so that it is quick, and nothing is won back that
-it costs; `tracker.py --from smoother.safetensors --smooth 0.02` does that afterwards. FOLDER is that of
-`tracker.py`.
+in deviations of the observation and normal noise n on the goal's velocities less the character's, by
+(a(s + n) + a(s - n)) / 2 of the policy that was given: its mean over n. Nothing is tried and rewarded,
+so that it is quick, and nothing is won back that it costs; `tracker.py --from smoother.safetensors
+--smooth 0.02` does that afterwards. FOLDER is that of `tracker.py`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ class Lessons:
     """What a pupil sees where it leads itself, and what its teacher answers there."""
 
     def __init__(
-        self, env: ImitationEnv, pupil: PolicyBundle, teacher: PolicyBundle, noise: float, seed: int
+        self, env: ImitationEnv, pupil: PolicyBundle, teacher: PolicyBundle, noise: Tensor, seed: int
     ):
+        """noise: `(O,)`, deviations of what is added to normalised observations."""
         self.env, self.pupil, self.teacher, self.noise = env, pupil, teacher, noise
         self.rng = torch.Generator().manual_seed(seed)
         self.obs = env.reset().clone()
@@ -63,7 +64,7 @@ class Lessons:
 
 
 def smoothed(
-    tracker: Tracker, env: ImitationEnv, noise: float, minutes: float, seed: int
+    tracker: Tracker, env: ImitationEnv, noise: Tensor, minutes: float, seed: int
 ) -> PolicyBundle:
     """The policy after so many minutes of lessons by itself."""
     pupil, begun = tracker.policy.copy(), time.monotonic()
@@ -95,7 +96,7 @@ def smoothed(
 def main() -> None:
     parser = parser_of(__doc__ or "", minutes=8.0)
     parser.add_argument("--from", dest="earlier", required=True, help="the policy")
-    parser.add_argument("--noise", type=float, default=0.4, help="in deviations of the observation")
+    parser.add_argument("--noise", type=float, default=0.8, help="in deviations of the observation")
     parser.add_argument("--worlds", type=int, default=2048, help="characters at once")
     a = parser.parse_args()
     torch.set_num_threads(a.threads or 1)
@@ -104,8 +105,11 @@ def main() -> None:
     library, _ = clips_of(a.library, BodyConfig(), HELD_OUT, TWINS, print, tracker.target, how)
     task = build(library, tracker.config, tracker.target.table, tracker.recovery_clips)
     env = task.env(a.worlds, a.seed, threads=a.threads or 1, help_scale=0.0, guard=False)
+    assert task.task.velocities is not None
+    noise = torch.zeros(env.num_obs)
+    noise[slice(*task.task.velocities)] = a.noise
     try:
-        policy = smoothed(tracker, env, a.noise, a.minutes, a.seed)
+        policy = smoothed(tracker, env, noise, a.minutes, a.seed)
     finally:
         env.close()
     save_tracker(replace(tracker, policy=policy), a.out)

@@ -154,7 +154,8 @@ def test_a_smooth_policy_answers_alike_to_states_that_are_near():
             kl = gaussian_kl(policy(obs), policy.log_std, policy(near), policy.log_std)
             return kl.mean().item()
 
-    plain, smooth = PPO(4, 2, TOY, seed=0), PPO(4, 2, replace(TOY, smooth_weight=1.0), seed=0)
+    made = replace(TOY, smooth_weight=1.0, smooth_noise=0.4)
+    plain, smooth = PPO(4, 2, TOY, seed=0), PPO(4, 2, made, seed=0)
     with torch.no_grad():
         for ppo in (plain, smooth):
             ppo.actor.policy.mean.last.weight.mul_(30.0)
@@ -163,6 +164,14 @@ def test_a_smooth_policy_answers_alike_to_states_that_are_near():
         plain.update(filled(plain, seed=k))
         smooth.update(filled(smooth, seed=k))
     assert rough(smooth) < 0.6 * before < 0.9 * rough(plain)
+
+
+def test_a_policy_may_be_smooth_over_some_columns_alone():
+    ppo = PPO(4, 2, replace(TOY, smooth_weight=1.0, smooth_over=(1, 3)), seed=0)
+    near = ppo._near(torch.zeros(8, 4))
+    assert (near[:, [0, 3]] == 0).all() and near[:, 1:3].std() == pytest.approx(0.8, rel=0.1)
+    with pytest.raises(PoiseError, match="smooth_over must be"):
+        replace(TOY, smooth_over=(3, 3))
 
 
 def test_a_learned_deviation_moves_and_a_fixed_one_does_not():

@@ -11,6 +11,7 @@ from poise.env import ImitationEnv
 from poise.env.goals import StreamGoal
 from poise.env.terms.evaluate import seen_by
 from poise.errors import PoiseError
+from poise.learn import PPOConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import Perpetual, build
 from poise.recipes.perpetual.config import config_of
@@ -247,4 +248,22 @@ def test_acceleration_is_how_velocities_change_otherwise_than_the_goals() -> Non
         want = (after - before).norm(dim=-1).mean(-1)
         torch.testing.assert_close(env.terms["acceleration"], want)
         assert want.min() > 0
+    env.close()
+
+
+@pytest.mark.parametrize("goal", ["rotations", "keypoints"])
+@pytest.mark.parametrize("shape", [False, True])
+def test_what_smooth_policies_do_not_answer_to_are_the_goals_velocities(goal: str, shape: bool) -> None:
+    given = {"goal": goal, "shape": shape, "window": (2,), "action": "absolute"}
+    imitation = built(**given)
+    env = imitation.env(4, threads=1, auto_reset=False)
+    env.reset()
+    frame, (first, last) = env._frame(), imitation.task.velocities or (0, 0)
+    before = seen_by(imitation.task.obs, frame)
+    frame.ahead.linvel.add_(1.0)
+    frame.ahead.angvel.add_(1.0)
+    moved = (seen_by(imitation.task.obs, frame) != before).any(0).nonzero().flatten()
+    assert moved[0] == first and moved[-1] == last - 1 and len(moved) == last - first
+    wanted = built(**given, ppo=PPOConfig(smooth_weight=0.1)).ppo().smooth_over
+    assert wanted == (first, last) and imitation.ppo().smooth_over is None
     env.close()

@@ -75,6 +75,8 @@ class TaskConfig:
     compliance: how goals give way where something pushes the characters, see `env.yielding`: by the
         paper's law, or by a commanded stiffness; None: they do not.
     observables: more of what terms can ask a frame for, by name, see `env.observables`.
+    velocities: first column of the observations that tell how far velocities are off the goal's, and the
+        first after them: what a smooth policy shall not answer to (`PPOConfig.smooth_weight`).
     plugins: make more parts of an environment, each of its goal and backend, see `env.plugins`.
     """
 
@@ -98,6 +100,7 @@ class TaskConfig:
     recovery: Recovery | None = None
     compliance: Compliance | Stiffness | None = None
     observables: Mapping[str, Observable] = field(default_factory=dict)
+    velocities: tuple[int, int] | None = None
     plugins: tuple[Callable[[Goal, Backend], Plugin], ...] = ()
 
     def __post_init__(self) -> None:

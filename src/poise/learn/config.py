@@ -53,8 +53,11 @@ class PPOConfig:
     smooth_weight: float = 0.0
     """Weight of KL(pi(s) || pi(s + n)), with n of `smooth_noise`: what makes the policy answer alike to
     states that are near (Shen et al. 2020, "Deep RL with robust and smooth policy")."""
-    smooth_noise: float = 0.4
+    smooth_noise: float = 0.8
     """Deviation of n in normalised observations."""
+    smooth_over: tuple[int, int] | None = None
+    """First column of the observations in which n is not 0, and the first after them; None: a recipe
+    that knows better says which, else all."""
     kl_target: float | None = None
     """With a number, the policy's lr follows the KL per update (summed over the actions): divided
     by 1.5 above twice the target, multiplied by 1.5 below half of it. Use 0.03 to 0.1: with 38
@@ -90,6 +93,8 @@ class PPOConfig:
         for name in ("smooth_weight", "smooth_noise"):
             if not getattr(self, name) >= 0:
                 raise PoiseError(f"{name} must be at least 0, got {getattr(self, name)}", "PPOConfig")
+        if self.smooth_over is not None and not 0 <= self.smooth_over[0] < self.smooth_over[1]:
+            raise PoiseError(f"smooth_over must be (from, to), got {self.smooth_over}", "PPOConfig")
         for name in ("gamma", "lam"):
             if not 0 <= getattr(self, name) <= 1:
                 raise PoiseError(f"{name} must lie in [0, 1], got {getattr(self, name)}", "PPOConfig")

@@ -241,9 +241,12 @@ class PPO:
         """`(NEAR, O)` by which states near those of the batch lie off them; None where none are seen."""
         if not self.config.smooth_weight:
             return None
-        size = (NEAR, obs.shape[1])
-        drawn = torch.randn(size, generator=self.shuffle, device=obs.device) * self.config.smooth_noise
-        return drawn.to(obs.dtype)
+        first, last = self.config.smooth_over or (0, obs.shape[1])
+        near = obs.new_zeros(NEAR, obs.shape[1])
+        size = near[:, first:last].shape
+        drawn = torch.randn(size, generator=self.shuffle, device=obs.device)
+        near[:, first:last] = drawn * self.config.smooth_noise
+        return near
 
     def distribution(self, obs: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
         """The policy's own of normalised `obs (N, O)`, by the products of the update, so that the policy

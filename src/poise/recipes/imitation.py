@@ -157,8 +157,11 @@ class Imitation:
         return replace(self, task=task if groups else replace(task, help_by="all"))
 
     def ppo(self) -> PPOConfig:
-        """The learner's settings, with one deviation of the action noise per action."""
+        """The learner's settings, with one deviation of the action noise per action, and what smooth
+        policies do not answer to."""
         ppo, extra = self.config.ppo, self.task.residual.dims if self.task.residual else 0
+        if ppo.smooth_weight and ppo.smooth_over is None:
+            ppo = replace(ppo, smooth_over=self.task.velocities)
         if not isinstance(ppo.std, float | int):
             return ppo
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
