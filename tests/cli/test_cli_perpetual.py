@@ -100,7 +100,14 @@ def test_a_policy_that_goes_on_has_its_own_settings_and_body(
     own = [x for x in command(folder, tmp_path / "run", *more) if x not in ("--max-primitives", "2")]
     assert main(own) == 2
     assert "there is goal, mass" in capsys.readouterr().err
-    for name, value in (("ppo.policy_hidden", "[8]"), ("sim.rate_hz", "120"), ("lfoot.kp", "400")):
+    bound = {
+        "ppo.policy_hidden": "[8]",
+        "ppo": "{}",
+        "sim.rate_hz": "120",
+        "single": "true",
+        "lfoot.kp": "4",
+    }
+    for name, value in bound.items():
         asked = ("--from", str(tmp_path), "--set", f"{name}={value}")
         own = [
             x for x in command(folder, tmp_path / "run", *asked) if x not in ("--max-primitives", "2")

@@ -172,6 +172,8 @@ def test_a_policy_may_be_smooth_over_some_columns_alone():
     assert (near[:, [0, 3]] == 0).all() and near[:, 1:3].std() == pytest.approx(0.8, rel=0.1)
     with pytest.raises(PoiseError, match="smooth_over must be"):
         replace(TOY, smooth_over=(3, 3))
+    with pytest.raises(PoiseError, match="ends at 5 of 4"):
+        PPO(4, 2, replace(TOY, smooth_over=(1, 5)), seed=0)
 
 
 def test_a_learned_deviation_moves_and_a_fixed_one_does_not():

@@ -127,7 +127,9 @@ def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
     names += ["help_start"] if o.recipe_settings.help_start else []
     more, of_the_body = stated(body.set, class_of("perpetual"))
     names += [text.partition("=")[0] for text in of_the_body]
-    names += [name for name in more if KEPT & {name, name.partition(".")[0]}]
+    # A part that is kept, one of its settings, or a part with a setting that is kept.
+    kept = [f"{name}." for name in KEPT]
+    names += [n for n in more if any(f"{n}.".startswith(k) or k.startswith(f"{n}.") for k in kept)]
     if names:
         what = f"--from goes on with the policy's own settings and body, and there is {', '.join(names)}"
         raise PoiseError(what, hint="Leave it out")

@@ -97,6 +97,8 @@ class PPO:
         actor: PolicyBundle | None = None,
     ):
         self.config, self.comm = config, comm
+        if config.smooth_over is not None and config.smooth_over[1] > num_obs:
+            raise PoiseError(f"smooth_over ends at {config.smooth_over[1]} of {num_obs} observations")
         init = make_generator(seed, "weights")
         if actor is None:
             sizes = (config.policy_hidden, config.activation, config.std, config.learn_std)

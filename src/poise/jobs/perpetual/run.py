@@ -46,9 +46,10 @@ WAYS = "ways"
 #: and is, and `going_on` decides how it starts.
 KEPT = frozenset((
     "goal", "shape", "shapes", "heading", "window", "filter", "action", "faithful", "style", "start",
-    "lateral", "combine", "weights", "clone", "multiplicative", "progressive", "single_hidden",
-    "composer_hidden", "composer_clone", "expert", "trajopt", "help_start", "help_share", "body", "sim",
-    "ppo.policy_hidden", "ppo.value_hidden", "ppo.activation", "ppo.learn_std", "ppo.obs_clip",
+    "single", "max_primitives", "recovery", "lateral", "combine", "weights", "clone", "multiplicative",
+    "progressive", "single_hidden", "composer_hidden", "composer_clone", "expert", "trajopt",
+    "help_start", "help_share", "body", "sim", "ppo.policy_hidden", "ppo.value_hidden", "ppo.activation",
+    "ppo.learn_std", "ppo.obs_clip",
 ))  # fmt: skip
 
 
