@@ -70,6 +70,13 @@ def keypoint_goal(frame: Frame, bodies: Tensor | None = None) -> Tensor:
     return into_heading(sim.heading, places).flatten(1)
 
 
+def velocity_columns(bodies: int, shape: bool, rotations: bool) -> tuple[int, int]:
+    """First column of v^ - v and, with rotations, w^ - w, and the first after them, where a policy
+    observes `self_state`, `shape` or not, and then `rotation_goal` or `keypoint_goal` of all bodies."""
+    first = 15 * bodies - 2 + (2 * bodies - 1 if shape else 0) + 3 * bodies
+    return first, first + (6 if rotations else 3) * bodies
+
+
 def goal_later(frame: Frame, step: int, bodies: Tensor, turns: bool = True) -> Tensor:
     """Where the reference is at one step of the task's window, in the character's heading frame.
 

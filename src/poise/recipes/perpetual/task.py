@@ -89,19 +89,11 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         adaptive=config.adaptive_sampling,
         adaptive_over=config.adaptive_over,
         style=phc_obs.style_terms(humanoid) if config.style else (),
-        velocities=_velocities(config, humanoid, len(own) > 1),
+        velocities=phc_obs.velocity_columns(
+            len(humanoid.bodies), shape=len(own) > 1, rotations=config.goal == "rotations"
+        ),
         recovery=recovery,
     )
-
-
-def _velocities(config: Perpetual, humanoid: Humanoid, shape: bool) -> tuple[int, int]:
-    """The columns v^ - v and, with rotations, w^ - w of the goal, which comes after the proprioception.
-
-    shape: whether the body's sizes are between the two.
-    """
-    bodies = len(humanoid.bodies)
-    first = 15 * bodies - 2 + (2 * bodies - 1 if shape else 0) + 3 * bodies
-    return first, first + (6 if config.goal == "rotations" else 3) * bodies
 
 
 def _more_seen(config: Perpetual, humanoid: Humanoid) -> tuple[ObsTerm, ...]:
