@@ -168,7 +168,7 @@ def main(argv: list[str] | None = None) -> None:
 
     for text in a.runs:
         name, equals, folder = text.partition("=")
-        run = Run.open(name if equals else Path(text).name, Path(folder if equals else text))
+        run = Run.open(name if equals else Path(text).name, Path(folder if equals else text), a.policy)
         parts = result["runs"].setdefault(run.name, {})
         hardware = a.hardware or parts.get("about", {}).get("hardware", "")
         about = run.about(hardware)
@@ -216,6 +216,7 @@ def arguments() -> argparse.ArgumentParser:
     """The options."""
     p = argparse.ArgumentParser(description="What runs of poise train perpetual have come to")
     p.add_argument("--runs", nargs="+", required=True, metavar="NAME=RUN")
+    p.add_argument("--policy", type=Path, help="measure this in place of the run's")
     p.add_argument("--clips", type=Path, metavar="FOLDER", help="where the held-out clips lie")
     p.add_argument("--hold-out", nargs="*", default=[], metavar="PATTERN", help="subjects, expressions")
     p.add_argument("--never", nargs="*", default=[], metavar="PATTERN", help="clips that are not read")

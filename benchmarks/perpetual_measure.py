@@ -59,8 +59,8 @@ class Run:
     owner: Tensor | None
 
     @classmethod
-    def open(cls, name: str, folder: Path) -> Run:
-        """The run in a folder, or in the folder `run` within it."""
+    def open(cls, name: str, folder: Path, policy: Path | None = None) -> Run:
+        """The run in a folder, or in the folder `run` within it; with another policy, on its clips."""
         if not (folder / RUN_FILE).exists():
             folder = folder / "run"
         if not (folder / RUN_FILE).exists():
@@ -69,7 +69,7 @@ class Run:
         owner = None
         if (folder / LATEST).exists():
             owner = load_checkpoint(folder / LATEST)[0].get("ledger/owner")
-        return cls(name, folder, run.task, run.tracker, owner)
+        return cls(name, folder, run.task, open_run(policy).tracker if policy else run.tracker, owner)
 
     @property
     def policy(self) -> PolicyBundle:
