@@ -51,8 +51,8 @@ def test_two_walks_apart_are_one_motion(tracker: Tracker, tmp_path: Path) -> Non
     assert a.ends == pytest.approx(29 / 30) and b.ends is not None and b.begins is not None
     assert b.ends - b.begins == pytest.approx(29 / 30) and 1.0 < b.begins - a.ends < 10.0
     assert b.after == pytest.approx(b.begins - a.ends)
-    # No step of the motion is longer than a fast walk's, and none of the character, which may be late and
-    # catch up, than a slow run's.
+    # No step of the motion is longer than a fast walk's, and none of the character, which may be late
+    # and catch up, than a slow run's.
     qpos, rate = tracked.evaluation.recordings[0].qpos, 30
     for rows, fastest in ((tracked.placed.qpos, 2.5), (qpos, 3.0)):
         assert np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=-1).max() < fastest / rate
