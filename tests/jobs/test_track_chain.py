@@ -51,11 +51,9 @@ def test_two_walks_apart_are_one_motion(tracker: Tracker, tmp_path: Path) -> Non
     assert a.ends == pytest.approx(29 / 30) and b.ends is not None and b.begins is not None
     assert b.ends - b.begins == pytest.approx(29 / 30) and 1.0 < b.begins - a.ends < 10.0
     assert b.after == pytest.approx(b.begins - a.ends)
-    # No step of the motion is longer than a fast walk's, and none of the character, which may be late
-    # and catch up, than a slow run's.
+    # No step is longer than a fast walk's.
     qpos, rate = tracked.evaluation.recordings[0].qpos, 30
-    for rows, fastest in ((tracked.placed.qpos, 2.5), (qpos, 3.0)):
-        assert np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=-1).max() < fastest / rate
+    assert np.linalg.norm(np.diff(qpos[:, :3], axis=0), axis=-1).max() < 2.5 / rate
     # It does the second clip where that stands.
     begin, there = round(b.begins * rate), place_all(clips, tracker)[1].qpos
     np.testing.assert_allclose(tracked.placed.qpos[begin : begin + 30], there, atol=1e-9)

@@ -12,7 +12,7 @@ from poise.sim import Backend, Drive
 
 #: N/m and N s/m of the hand that drags a body, and N that it exerts at most.
 PULL, DAMP, MOST_N = 400.0, 40.0, 500.0
-#: N s and s of a blow: one that a walking character stays on its feet of once in six times.
+#: N s and s of a blow; it fells a walking character in 10 of 12 tries.
 BLOW_NS, BLOW_S = 150.0, 0.1
 
 
