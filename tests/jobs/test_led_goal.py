@@ -11,7 +11,7 @@ from torch import Tensor
 
 from poise.env import ImitationEnv, Reference
 from poise.env.goals.led import FALLS, RETURNS, TRACKS, LedGoal
-from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.clips import QUICK, RecoveryClips
 from poise.env.recovery.entry import entry
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
@@ -162,6 +162,21 @@ def test_clips_are_done_one_after_another(made: Imitation) -> None:
     for _ in range(3):
         env.step(torch.zeros(1, env.num_actions))
     assert goal.doing.tolist() == [TRACKS] and env.clip.tolist() == [0]
+    env.close()
+
+
+def test_who_has_lost_nothing_walks_to_the_next_clip_without_hurry(made: Imitation) -> None:
+    env, zero, recovery_clips = begun(made)
+    goal = LedGoal(env.goal.clips, replace(recovery_clips, pace=QUICK), chained=True)
+    qpos, ways = env.backend.state.qpos.clone().double(), {}
+    qpos[:, 0] += 4.0
+    for doing in (TRACKS, FALLS):
+        goal.doing[:] = doing
+        goal.lead(zero, qpos)
+        first, length = int(goal._first), int(goal._length)
+        ways[doing] = goal._qpos[first : first + length, :2].diff(dim=0).norm(dim=-1)
+    # Where a clip was lost it waits: then the walk is faster, and the way the same.
+    assert len(ways[TRACKS]) > len(ways[FALLS]) and ways[TRACKS].max() < 0.9 * ways[FALLS].max()
     env.close()
 
 

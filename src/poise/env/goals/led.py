@@ -68,6 +68,8 @@ class LedGoal(Goal):
         self.layout, self.num_envs, self.device = goal.layout, goal.num_envs, goal.device
         self.rng, self.notes, self.begins = goal.rng, goal.notes, goal.begins
         self.get_up = GetUpPlanner(recovery_clips, self.humanoid.table, self.rate_hz)
+        # From the end of a clip to the next one there is no hurry.
+        self._calm = self.get_up.walks_calmly()
         self.frame, self.lost = goal.frame.clone(), list[tuple[int, int]]()
         self.doing, self._since = torch.zeros_like(goal.clip), torch.zeros_like(goal.clip)
         # How many recovery motions in a row each world has lost.
@@ -229,7 +231,8 @@ class LedGoal(Goal):
             self.frame[world] = entry(self.get_up, own, clip, int(self.frame[world]), qpos)
         place, velocity = own.coordinates(self.goal.clip[one], self.frame[one])
         there, again = (place[0].cpu(), velocity[0].cpu()), int(self._vain[world])
-        way = way_into(self.get_up, qpos, *there, moves, again)
+        get_up = self._calm if self.doing[world] == TRACKS else self.get_up
+        way = way_into(get_up, qpos, *there, moves, again)
         found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"recovery {world}"])
         return found.to(self.device)
 

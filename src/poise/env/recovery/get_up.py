@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.env.recovery.clips import RecoveryClips
+from poise.env.recovery.clips import CALM, RecoveryClips
 from poise.kin import Kinematics, lowest_height
 from poise.spatial import quat_distance, quat_mul, quat_rotate, slerp
 from poise.spatial.directions import turned, yaw_quat
@@ -47,6 +48,13 @@ class GetUpPlanner:
         for up in self._ups:
             height = up.pos[:, 0, 2]
             up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
+
+    def walks_calmly(self) -> GetUpPlanner:
+        """The same, but that it walks and turns at the pace `CALM`, for a character that lost nothing."""
+        calm, clips = copy(self), self.recovery_clips
+        pace = clips.pace._replace(walk=CALM.walk, turn=CALM.turn)
+        calm.recovery_clips = replace(clips, pace=pace)
+        return calm
 
     def lies(self, qpos: Tensor) -> Tensor:
         """`(...)` bool, which of the characters at `qpos (..., 7 + n)` must get up."""
