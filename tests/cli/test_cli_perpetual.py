@@ -16,6 +16,7 @@ from poise.jobs.run_file import RUN_FILE
 from poise.learn import LATEST, CloneConfig, PPOConfig
 from poise.recipes import perpetual
 from poise.recipes.perpetual import Perpetual, RecoveryPlan
+from poise.settings import from_toml
 
 MINIATURE = ["--envs", "8", "--threads", "1", "--iterations", "4", "--max-primitives", "2"]
 
@@ -66,6 +67,16 @@ def test_a_run_goes_on_from_another_ones_policy(
     assert config.acceleration == 0.3 and (config.ppo.smooth_weight, config.ppo.epochs) == (0.02, 3)
     assert main([*go_on, "--resume"]) == 0
     capsys.readouterr()
+    # What it says of its settings beforehand.
+    assert main([*go_on, "--print-config"]) == 0
+    said = tmp_path / "said.toml"
+    said.write_text(capsys.readouterr().out)
+    assert from_toml(Perpetual, said) == config
+    # What does not fit is refused before anything is written.
+    wide = [str(tmp_path / "wide") if x == str(then) else x for x in go_on]
+    assert main([*wide, "--ppo.smooth-over", "[1,9999]"]) == 2
+    assert "smooth_over ends at 9999 of" in capsys.readouterr().err
+    assert not (tmp_path / "wide").exists()
     go_on[go_on.index(str(first))], go_on[go_on.index(str(then))] = "nothing", str(tmp_path / "none")
     assert main(go_on) == 2
     assert "no such file or folder" in capsys.readouterr().err

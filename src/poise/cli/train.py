@@ -64,6 +64,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     o.training.check(o.recipe_settings)
     config = config_of(o)
     if o.training.print_config:
+        if o.recipe == "perpetual" and o.primitives.going_on is not None:
+            from poise.cli.train_perpetual import goes_on
+
+            config = goes_on(o, config)[1]
         return printed(config)
     again = command_line("train", argv)
     if o.recipe == "compliant":

@@ -136,6 +136,29 @@ def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
     return more
 
 
+def goes_on(o: Options, config: Perpetual) -> tuple[Tracker, Perpetual]:
+    """The policy of --from, and the settings of a run that goes on from it.
+
+    config: what the command line states without it.
+    """
+    from poise.jobs.open import open_run
+    from poise.jobs.perpetual.run import going_on
+
+    primitives, asked = o.primitives, o.recipe_settings.num_envs
+    assert primitives.going_on is not None
+    check_going_on(o)
+    tracker = open_run(primitives.going_on).tracker
+    # Whether --max-primitives has a say is known by the policy alone.
+    returns = tracker.recovery_clips is not None
+    more = check_going_on(o, returns)
+    if asked is None:
+        config = replace(config, num_envs=tracker.config.num_envs)
+    config = going_on(tracker.config, config, returns)
+    if primitives.teacher == LOOKAHEAD:
+        config = config.taught() if asked is None else replace(config.taught(), num_envs=asked)
+    return tracker, configured(config, more)
+
+
 def run(o: Options, config: Perpetual, again: str) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
     library, primitives, out, training = o.library, o.primitives, o.out, o.training
@@ -152,21 +175,7 @@ def run(o: Options, config: Perpetual, again: str) -> Answer:
         raise held_already(out)
     tracker = None
     if primitives.going_on is not None:
-        from poise.jobs.open import open_run
-        from poise.jobs.perpetual.run import going_on
-
-        check_going_on(o)
-        tracker = open_run(primitives.going_on).tracker
-        # Whether --max-primitives has a say is known by the policy alone.
-        returns = tracker.recovery_clips is not None
-        more = check_going_on(o, returns)
-        if o.recipe_settings.num_envs is None:
-            config = replace(config, num_envs=tracker.config.num_envs)
-        config = going_on(tracker.config, config, returns)
-        if primitives.teacher == LOOKAHEAD:
-            asked = o.recipe_settings.num_envs
-            config = config.taught() if asked is None else replace(config.taught(), num_envs=asked)
-        config = configured(config, more)
+        tracker, config = goes_on(o, config)
     elif primitives.teacher not in (None, LOOKAHEAD):
         tracker = _teacher(primitives, library)
     imitation = begin(library, out, config, training, held, tracker)

@@ -75,7 +75,7 @@ def begin(folder: Path, library: ClipLibrary, config: ResidualForce, device: str
     held = (folder / RUN_FILE).exists()
     file = held_run(folder, RECIPE["name"], config, config_of, library) if held else None
     imitation = build(library, config)
-    imitation.check_memory(config.num_envs, device)
+    imitation.check(config.num_envs, device)
     if file is None:
         meta = {"recipe": RECIPE["name"], "config": to_data(config)}
         write_run(folder, library, meta | body_facts(imitation.humanoid, imitation.library.names))

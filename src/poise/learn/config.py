@@ -101,6 +101,15 @@ class PPOConfig:
         if not 0 < self.lr_range[0] <= self.lr_range[1]:
             raise PoiseError(f"lr_range must be (low, high) above 0, got {self.lr_range}", "PPOConfig")
 
+    def check_columns(self, num_obs: int) -> None:
+        """Whether `smooth_over` names columns that `num_obs` observations have.
+
+        Raises:
+            PoiseError: it ends beyond them.
+        """
+        if self.smooth_over is not None and self.smooth_over[1] > num_obs:
+            raise PoiseError(f"smooth_over ends at {self.smooth_over[1]} of {num_obs} observations")
+
     @classmethod
     def paper(cls, num_envs: int = 512, faithful: Literal["paper", "code"] = "paper") -> PPOConfig:
         """The settings of Residual Force Control (Yuan & Kitani 2020, supplementary).

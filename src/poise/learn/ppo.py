@@ -97,8 +97,7 @@ class PPO:
         actor: PolicyBundle | None = None,
     ):
         self.config, self.comm = config, comm
-        if config.smooth_over is not None and config.smooth_over[1] > num_obs:
-            raise PoiseError(f"smooth_over ends at {config.smooth_over[1]} of {num_obs} observations")
+        config.check_columns(num_obs)
         init = make_generator(seed, "weights")
         if actor is None:
             sizes = (config.policy_hidden, config.activation, config.std, config.learn_std)

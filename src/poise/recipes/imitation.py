@@ -167,16 +167,24 @@ class Imitation:
         joints = (float(ppo.std),) * len(self.humanoid.hinges)
         return replace(ppo, std=joints + ((float(self.config.residual_std),) * extra if extra else ()))
 
-    def check_memory(self, num_envs: int, device: str = "cpu") -> None:
-        """Raises a PoiseError that says how many characters fit, if `num_envs` do not.
+    def check(self, num_envs: int, device: str = "cpu") -> None:
+        """Whether the settings fit the task, before anything is written.
 
         A GPU's memory is checked where its worlds are made.
+
+        Raises:
+            PoiseError: `num_envs` characters are more than memory holds, or `ppo.smooth_over` names
+                columns that the observations do not have.
         """
-        if num_envs <= FEW or device != "cpu":
+        many, over = num_envs > FEW and device == "cpu", self.config.ppo.smooth_over
+        if not many and over is None:
             return
-        few = 64
+        few = 64 if many else 1
         env = self.env(few, threads=1)
         try:
+            self.config.ppo.check_columns(env.num_obs)
+            if not many:
+                return
             fields = env.backend.state
             state = env.state()["sim"].nbytes + sum(fields[name].nbytes for name in fields.names)
             learner = learner_bytes(self.ppo().horizon, env.num_obs, env.num_actions)
@@ -220,7 +228,7 @@ class Imitation:
             threads = max(1, machine_cores() // comm.local_size)
         if env is None:
             own = share_of(self.config.num_envs, comm)
-            self.check_memory(own, device)
+            self.check(own, device)
             seed = rank_seed(self.config.seed, rank)
             env = self.env(own, seed, threads=threads, dumps=dumps, device=device)
         if isinstance(style, AmpConfig):

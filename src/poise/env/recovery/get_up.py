@@ -50,7 +50,7 @@ class GetUpPlanner:
             up.keep(height <= height.min() + ENTERS * float(recovery_clips.ease[2]))
 
     def walks_calmly(self) -> GetUpPlanner:
-        """The same, but that it walks and turns at the pace `CALM`, for a character that lost nothing."""
+        """The same, but that it walks and turns at the pace `CALM`, for one that lost nothing."""
         calm, clips = copy(self), self.recovery_clips
         pace = clips.pace._replace(walk=CALM.walk, turn=CALM.turn)
         calm.recovery_clips = replace(clips, pace=pace)

@@ -152,7 +152,7 @@ def begin(
             )
     # What a policy knows of coming back it keeps, whatever its new library holds of that.
     imitation = build(library, config, table, earlier.recovery_clips if earlier else None)
-    imitation.check_memory(config.num_envs, device)
+    imitation.check(config.num_envs, device)
     if not held:
         meta = {"recipe": RECIPE["name"], "config": to_data(config), "source": source}
         meta |= body_facts(imitation.humanoid, imitation.library.names)
@@ -171,7 +171,7 @@ def resume(folder: Path, config: Perpetual, source: str = "", device: str = "cpu
         PoiseError: other settings, another source of clips, or another recipe.
     """
     imitation = _rebuilt(held_run(folder, RECIPE["name"], config, config_of, source=source))
-    imitation.check_memory(config.num_envs, device)
+    imitation.check(config.num_envs, device)
     return imitation
 
 
