@@ -1,12 +1,13 @@
 """Averages the weights of policies that began as one: a policy between what each has learned since.
 
-    python benchmarks/averaged.py POLICY=0.5 ANOTHER=0.5 -o averaged.safetensors
+    python benchmarks/averaged.py POLICY=0.5 ANOTHER=0.5 [--critic POLICY] -o averaged.safetensors
 
-Every number of the networks, of the observations' normaliser and of the critic is the mean of the
-policies', by their shares (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models", eq. 1, and
-"Model soups"). It needs no training; it needs that all were trained on from the same weights, and are of
-one character, goal and kind. Of what else a policy's file says, its clips and settings, the first's is
-kept, but for samples and seconds: those of the one that learned longest.
+Every number of the networks that act and of the observations' normaliser is the mean of the policies',
+by their shares (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models", eq. 1, and "Model
+soups"). It needs no training; it needs that all were trained on from the same weights, and are of one
+character, goal and kind. The critic is that of one policy, the first by default: the mean of several
+serves lookahead worse. Of what else a policy's file says, its clips and settings, the first's is kept,
+but for samples and seconds: those of the one that learned longest.
 """
 
 from __future__ import annotations
@@ -25,8 +26,12 @@ from poise.learn.policy import Value
 from poise.learn.state import State
 
 
-def averaged(trackers: Sequence[Tracker], shares: Sequence[float]) -> Tracker:
+def averaged(
+    trackers: Sequence[Tracker], shares: Sequence[float], critic: Tracker | None = None
+) -> Tracker:
     """The first policy with the means of all their numbers.
+
+    critic: whose critic is kept; the first's by default.
 
     Raises:
         PoiseError: they are of different characters or networks, or the shares make no mean.
@@ -40,10 +45,8 @@ def averaged(trackers: Sequence[Tracker], shares: Sequence[float]) -> Tracker:
             raise PoiseError(f"policy {k} is of another character or of other networks than the first")
     policy = first.policy.copy()
     policy.load_state(_mean([t.policy.state() for t in trackers], shares))
-    values = [t.value for t in trackers if t.value is not None]
-    value = None
-    if len(values) == len(trackers):
-        value = Value(policy, _mean([v.state() for v in values], shares), first.config.ppo.activation)
+    told = critic or first
+    value = told.value and Value(policy, told.value.state(), told.config.ppo.activation)
     longest = max(trackers, key=lambda t: t.about["samples"]).about
     about = {**first.about, **{k: longest[k] for k in ("samples", "seconds")}}
     return replace(first, policy=policy, value=value, about=about)
@@ -65,6 +68,9 @@ def _words(numbers: Sequence[float]) -> str:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("policies", nargs="+", metavar="POLICY=SHARE")
+    parser.add_argument(
+        "--critic", metavar="POLICY", help="whose critic is kept; the first's by default"
+    )
     parser.add_argument("-o", "--out", type=Path, required=True)
     a = parser.parse_args(argv)
     parts = [text.rpartition("=") for text in a.policies]
@@ -72,7 +78,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         if not (name and share.replace(".", "", 1).isdecimal()):
             raise PoiseError(f"a policy with its share is POLICY=0.5, not '{text}'")
     trackers = [open_run(name).tracker for name, _, _ in parts]
-    save_tracker(averaged(trackers, [float(share) for _, _, share in parts]), a.out)
+    critic = open_run(a.critic).tracker if a.critic else None
+    save_tracker(averaged(trackers, [float(share) for _, _, share in parts], critic), a.out)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker, load_tracker, save_tracker
+from poise.learn.policy import Value
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,20 @@ def test_every_number_is_the_mean(both: tuple[Tracker, Tracker]) -> None:
         assert value.dtype == mine[name].dtype
     assert out.about["samples"] == both[1].about["samples"]
     assert out.about["clips"] == both[0].about["clips"]
-    assert (out.value is None) == (both[0].value is None)
+
+
+def test_the_critic_is_of_one_policy(both: tuple[Tracker, Tracker]) -> None:
+    first, other = both
+    assert first.value is not None
+    louder = Value(other.policy, {k: 2 * v for k, v in first.value.state().items()}, "relu")
+    other = replace(other, value=louder)
+    for critic, wanted in ((None, first), (other, other)):
+        made = averaged.averaged((first, other), (0.5, 0.5), critic).value
+        assert made is not None and wanted.value is not None
+        mine = wanted.value.state()
+        assert all(torch.equal(v, mine[k]) for k, v in made.state().items())
+    # Without one nothing is lost.
+    assert averaged.averaged((replace(first, value=None), other), (0.5, 0.5)).value is None
 
 
 def test_the_command_writes_a_policy(both: tuple[Tracker, Tracker], tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def place_all(clips: Sequence[Clip], tracker: Tracker) -> list[Placed]:
         notes: tuple[str, ...] = ()
         if not clip.skeleton.same_bones(first.skeleton):
             clip = retarget(clip, first)[0]
-            notes = (f"{clip.name}: it is on another skeleton than {first.name}, and was retargeted.",)
+            notes = (f"The clip is on another skeleton than {first.name}: it was retargeted onto that.",)
         p = place(clip, tracker)
         larger = (out or [p])[0].moved
         away = (clip.root_pos[0] - first.root_pos[0]) * (larger.scale - 1.0 if larger else 0.0)
