@@ -52,13 +52,14 @@ class Learned(NamedTuple):
 
 
 def settings(policy: Perpetual, seed: int = 0, starts: int = 1) -> Perpetual:
-    """The policy's own settings, for one motion."""
+    """The policy's own settings, for one motion; without prices on rough motion, since one that is quick
+    or flies is found by rough tries."""
     config = going_on(policy, Perpetual(num_envs=WORLDS, seed=seed, recovery=False))
-    ppo = replace(config.ppo, minibatch=MINIBATCH, policy_lr=STEP, kl_target=None)
+    ppo = replace(config.ppo, minibatch=MINIBATCH, policy_lr=STEP, kl_target=None, smooth_weight=0.0)
     # One motion is lost or not: that is no curve by which to tell that nothing is gained any more.
     convergence = replace(config.convergence, patience=NEVER)
     config = replace(config, ppo=ppo, convergence=convergence, teacher=None, cooling=0.0)
-    return replace(config, evaluate_every=EVERY, starts=starts)
+    return replace(config, acceleration=0.0, evaluate_every=EVERY, starts=starts)
 
 
 def learn(
