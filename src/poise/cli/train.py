@@ -15,7 +15,7 @@ from poise.cli.library_options import Library
 from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
 from poise.cli.settings import SOURCES, class_of, given
 from poise.cli.train_inbetween import Network
-from poise.cli.train_perpetual import BY_HAND, Primitives, settings
+from poise.cli.train_perpetual import BY_HAND, Primitives, goes_on, settings
 from poise.cli.training import Job, command_line, stopped
 from poise.errors import PoiseError, did_you_mean
 
@@ -65,8 +65,6 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     config = config_of(o)
     if o.training.print_config:
         if o.recipe == "perpetual" and o.primitives.going_on is not None:
-            from poise.cli.train_perpetual import goes_on
-
             config = goes_on(o, config)[1]
         return printed(config)
     again = command_line("train", argv)
