@@ -24,7 +24,7 @@ import platform
 import sys
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,7 +62,7 @@ class Results:
 
     def has(self, job: Job) -> bool:
         """Whether a job was measured with this policy and these settings."""
-        made = made_with(job.key[2])
+        made = made_with(job.key[2], job.config.seed)
         return any(_key(row) == job.key and row["made_with"] == made for row in self.rows)
 
     def add(self, row: dict[str, Any]) -> None:
@@ -82,9 +82,10 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[k] for k in KEY)
 
 
-def made_with(controller: str) -> str:
+def made_with(controller: str, seed: int) -> str:
     """A hash of what decides the figures of a controller: the policy, and the settings of lookahead."""
-    settings = json.dumps(asdict(LookaheadConfig())) if controller == "lookahead" else ""
+    config = replace(LookaheadConfig(), seed=seed)
+    settings = json.dumps(asdict(config)) if controller == "lookahead" else ""
     return hashlib.sha256(SHIPPED.read_bytes() + settings.encode()).hexdigest()[:16]
 
 
@@ -101,7 +102,7 @@ def jobs_of(a: argparse.Namespace) -> Iterator[Job]:
                     if CONDITIONS[condition].of_planner and controller != "lookahead":
                         continue
                     for budget in budgets if controller == "lookahead" else [""]:
-                        config = budgets.get(budget, LookaheadConfig())
+                        config = replace(budgets.get(budget, LookaheadConfig()), seed=a.seed)
                         key = (name, clip, controller, budget, condition, a.starts)
                         yield Job(key, clips[clip], config)
 
@@ -126,7 +127,7 @@ def main(argv: list[str] | None = None) -> None:
             for one in wait(running, return_when=FIRST_COMPLETED).done:
                 job = running.pop(one)
                 row: dict[str, Any] = dict(zip(KEY, job.key, strict=True))
-                row["made_with"] = made_with(job.key[2])
+                row["made_with"] = made_with(job.key[2], job.config.seed)
                 row |= one.result()
                 results.add(row)
                 whole = sum(e["whole"] for e in row["episodes"])
@@ -148,6 +149,7 @@ def arguments() -> argparse.ArgumentParser:
     p.add_argument("--budgets", nargs="+", default=["192"], metavar="BUDGET")
     p.add_argument("--conditions", nargs="+", choices=(*CONDITIONS, "all"), default=["none"])
     p.add_argument("--starts", type=int, default=1, metavar="N")
+    p.add_argument("--seed", type=int, default=0, help="of the draws of lookahead, at the first start")
     p.add_argument("--workers", type=int, default=2)
     p.add_argument("--cache", type=Path, help="a folder for the library that is read")
     p.add_argument("--again", action="store_true", help="measure also what FILE holds")

@@ -97,7 +97,10 @@ def measured(
     condition: Condition,
     starts: int,
 ) -> dict[str, Any]:
-    """One clip with one controller under one condition: what each start comes to, and all decisions."""
+    """One clip with one controller under one condition: what each start comes to, and all decisions.
+
+    The draws of lookahead at start k are those of the seed of `config` and k.
+    """
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
     clip = source if isinstance(source, Clip) else read_clip(source)
@@ -134,7 +137,7 @@ def _episode(
     env = task.env(1, None, False, 1, help_scale=0.0, guard=False, backend=backend)
     ahead = None
     if controller == "lookahead":
-        ahead = look_ahead(tracker, planners(task, condition), config, 1, seed)
+        ahead = look_ahead(tracker, planners(task, condition), config, 1, config.seed + seed)
         ahead.watch(env)
     acts: Acts = ahead or (tracker.policy if controller == "policy" else Nothing(env.num_actions))
     acts = Delayed(acts) if condition.delay else acts
