@@ -213,3 +213,9 @@ def test_a_benchmark_that_was_stopped_goes_on(tmp_path: Path, capsys: pytest.Cap
     assert "1 to measure, 6 rows" in capsys.readouterr().out
     again = json.loads(out.read_text())["rows"]
     assert len(again) == 6 and len({r["made_with"] for r in again}) == 2
+    # Other draws are measured anew, of lookahead alone; with ten copies at five shares none is drawn.
+    main([*given, "--budgets", "10x4", "--starts", "2", "--seed", "7"])
+    assert "1 to measure, 6 rows" in capsys.readouterr().out
+    drawn = json.loads(out.read_text())["rows"][-1]
+    same = next(r for r in again if r["controller"] == "lookahead" and r["condition"] == "none")
+    assert drawn["made_with"] != same["made_with"] and drawn["episodes"][0]["error_mm"] > 0
