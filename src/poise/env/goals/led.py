@@ -186,19 +186,24 @@ class LedGoal(Goal):
         # What has not fallen needs no rest.
         rests |= lost & returns & ~self.get_up.lies(qpos) & self.plans
         if bool(rests.any()):
-            self.lead(rests.nonzero().squeeze(-1), qpos, linvel[:, 0])
+            # Between two clips nothing waits.
+            self.lead(rests.nonzero().squeeze(-1), qpos, linvel[:, 0], self.doing == TRACKS)
         self.goal.frame.copy_(self.frame)
         return bool((rests | back | falls | over).any())
 
-    def lead(self, worlds: Tensor, qpos: Tensor, linvel: Tensor | None = None) -> None:
+    def lead(
+        self, worlds: Tensor, qpos: Tensor, linvel: Tensor | None = None, calm: Tensor | None = None
+    ) -> None:
         """Recovery motions for worlds `(n,)` from where they are, `qpos (N, 7 + n)` of all.
 
         linvel: m/s `(N, 3)`, how the roots move; by default they rest.
+        calm: bool `(N,)`, which of the worlds walk without hurry; by default none.
         """
         self._tidy()
         for i in worlds.tolist():
             moves = None if linvel is None else linvel[i, :2].double().cpu()
-            motion = self._motion(i, qpos[i].double().cpu(), moves)
+            get_up = self.get_up if calm is None or not calm[i] else self._calm
+            motion = self._motion(i, get_up, qpos[i].double().cpu(), moves)
             rows = torch.arange(motion.frames, device=self.device)
             self._first[i], self._length[i] = len(self._packed), motion.frames
             self._packed = torch.cat((self._packed, motion.packed(rows)))
@@ -224,14 +229,13 @@ class LedGoal(Goal):
         self._packed, self._qpos = self._packed[rows], self._qpos[rows]
         self._first[on] = self._length[on].cumsum(0) - self._length[on]
 
-    def _motion(self, world: int, qpos: Tensor, moves: Tensor | None) -> Reference:
+    def _motion(self, world: int, get_up: GetUpPlanner, qpos: Tensor, moves: Tensor | None) -> Reference:
         """From `qpos (7 + n)` that moves with `moves (2)` m/s to where the world's clip is entered."""
         own, one, clip = self.reference, slice(world, world + 1), int(self.goal.clip[world])
         if self.frame[world] or not self.chained:
-            self.frame[world] = entry(self.get_up, own, clip, int(self.frame[world]), qpos)
+            self.frame[world] = entry(get_up, own, clip, int(self.frame[world]), qpos)
         place, velocity = own.coordinates(self.goal.clip[one], self.frame[one])
         there, again = (place[0].cpu(), velocity[0].cpu()), int(self._vain[world])
-        get_up = self._calm if self.doing[world] == TRACKS else self.get_up
         way = way_into(get_up, qpos, *there, moves, again)
         found = Reference(own.humanoid, [way.numpy()], own.rate_hz, [f"recovery {world}"])
         return found.to(self.device)
