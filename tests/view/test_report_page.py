@@ -52,6 +52,16 @@ def test_page_has_every_section_and_figure():
     assert "{{" not in re.sub(r"<script>.*?</script>", "", page, flags=re.S)
 
 
+def test_a_cost_in_units_of_its_own_is_named_and_does_not_flatten_the_bars_of_the_reward():
+    terms = {"total": 0.9, "pose": 0.8, "energy <b>": 716.12}
+    page = render(make_report(41, score={**score(), "reward": terms}))
+    assert "Weighted total: 0.900. Not drawn: energy &lt;b&gt; 716.1." in page
+    bars = page[page.index('aria-label="Reward per term"') :].split("</svg>")[0]
+    assert "pose" in bars and "energy" not in bars and "716" not in bars
+    page = render(make_report(41, score={**score(), "reward": {"total": 3.0, "speed": 3.0}}))
+    assert "Not drawn" not in page and "speed" in page
+
+
 def test_where_a_motion_is_lost_is_said_and_marked():
     page = render(make_report(41, lost=(0.5, 1.2, 9.0)))
     assert '<span class="lost">Lost at 0.5 s, 1.2 s.</span>' in page

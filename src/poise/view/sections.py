@@ -132,6 +132,10 @@ def _reward(report: Report) -> Figure:
     if isinstance(reward, dict):
         known = ((str(k), number(v)) for k, v in reward.items() if k != "total")
         items = [(k, math.nan if v is None else v) for k, v in known]
+        # A cost in units of its own, such as watts, would flatten the bars of the others.
+        apart = [(k, v) for k, v in items if abs(v) > 1.0]
+        apart = apart if len(apart) < len(items) else []
+        items = [x for x in items if x not in apart]
         if items:
             finite = [v for _, v in items if math.isfinite(v)]
             most = 1.0 if finite and max(finite) <= 1.0 and max(finite) > 0.2 else None
@@ -140,7 +144,9 @@ def _reward(report: Report) -> Figure:
             )
             total = number(reward.get("total"))
             whole = "" if total is None else f" Weighted total: {total:.3f}."
-            return Figure(title, f"Averages over the evaluated frames.{whole}", body)
+            costs = f" Not drawn: {', '.join(f'{k} {v:.4g}' for k, v in apart)}." if apart else ""
+            text = f"Averages over the evaluated frames, not weighted.{whole}{costs}"
+            return Figure(title, text, body)
     value = number(reward.get("total") if isinstance(reward, dict) else reward)
     text = "No reward was recorded." if value is None else f"Only the total was recorded: {value:.3f}."
     return Figure(title, text)
