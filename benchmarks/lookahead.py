@@ -62,7 +62,7 @@ class Results:
 
     def has(self, job: Job) -> bool:
         """Whether a job was measured with this policy and these settings."""
-        made = made_with(job.key[2], job.config.seed)
+        made = made_with(job.key[2], job.config)
         return any(_key(row) == job.key and row["made_with"] == made for row in self.rows)
 
     def add(self, row: dict[str, Any]) -> None:
@@ -82,9 +82,10 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[k] for k in KEY)
 
 
-def made_with(controller: str, seed: int) -> str:
+def made_with(controller: str, config: LookaheadConfig) -> str:
     """A hash of what decides the figures of a controller: the policy, and the settings of lookahead."""
-    config = replace(LookaheadConfig(), seed=seed)
+    # The budget stands in the row.
+    config = replace(LookaheadConfig(), seed=config.seed, jerk_price=config.jerk_price)
     settings = json.dumps(asdict(config)) if controller == "lookahead" else ""
     return hashlib.sha256(SHIPPED.read_bytes() + settings.encode()).hexdigest()[:16]
 
@@ -102,7 +103,8 @@ def jobs_of(a: argparse.Namespace) -> Iterator[Job]:
                     if CONDITIONS[condition].of_planner and controller != "lookahead":
                         continue
                     for budget in budgets if controller == "lookahead" else [""]:
-                        config = replace(budgets.get(budget, LookaheadConfig()), seed=a.seed)
+                        config = budgets.get(budget, LookaheadConfig())
+                        config = replace(config, seed=a.seed, jerk_price=a.jerk_price)
                         key = (name, clip, controller, budget, condition, a.starts)
                         yield Job(key, clips[clip], config)
 
@@ -127,7 +129,7 @@ def main(argv: list[str] | None = None) -> None:
             for one in wait(running, return_when=FIRST_COMPLETED).done:
                 job = running.pop(one)
                 row: dict[str, Any] = dict(zip(KEY, job.key, strict=True))
-                row["made_with"] = made_with(job.key[2], job.config.seed)
+                row["made_with"] = made_with(job.key[2], job.config)
                 row |= one.result()
                 results.add(row)
                 whole = sum(e["whole"] for e in row["episodes"])
@@ -150,6 +152,7 @@ def arguments() -> argparse.ArgumentParser:
     p.add_argument("--conditions", nargs="+", choices=(*CONDITIONS, "all"), default=["none"])
     p.add_argument("--starts", type=int, default=1, metavar="N")
     p.add_argument("--seed", type=int, default=0, help="of the draws of lookahead, at the first start")
+    p.add_argument("--jerk-price", type=float, default=LookaheadConfig.jerk_price, metavar="X")
     p.add_argument("--workers", type=int, default=2)
     p.add_argument("--cache", type=Path, help="a folder for the library that is read")
     p.add_argument("--again", action="store_true", help="measure also what FILE holds")

@@ -219,3 +219,6 @@ def test_a_benchmark_that_was_stopped_goes_on(tmp_path: Path, capsys: pytest.Cap
     drawn = json.loads(out.read_text())["rows"][-1]
     same = next(r for r in again if r["controller"] == "lookahead" and r["condition"] == "none")
     assert drawn["made_with"] != same["made_with"] and drawn["episodes"][0]["error_mm"] > 0
+    main([*given, "--budgets", "10x4", "--starts", "2", "--jerk-price", "2"])
+    dear = json.loads(out.read_text())["rows"][-1]
+    assert len({x["made_with"] for x in (dear, drawn, same)}) == 3
