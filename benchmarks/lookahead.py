@@ -85,7 +85,8 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
 def made_with(controller: str, config: LookaheadConfig) -> str:
     """A hash of what decides the figures of a controller: the policy, and the settings of lookahead."""
     # The budget stands in the row.
-    config = replace(LookaheadConfig(), seed=config.seed, jerk_price=config.jerk_price)
+    plain = LookaheadConfig()
+    config = replace(config, candidates=plain.candidates, horizon=plain.horizon)
     settings = json.dumps(asdict(config)) if controller == "lookahead" else ""
     return hashlib.sha256(SHIPPED.read_bytes() + settings.encode()).hexdigest()[:16]
 
@@ -152,7 +153,8 @@ def arguments() -> argparse.ArgumentParser:
     p.add_argument("--conditions", nargs="+", choices=(*CONDITIONS, "all"), default=["none"])
     p.add_argument("--starts", type=int, default=1, metavar="N")
     p.add_argument("--seed", type=int, default=0, help="of the draws of lookahead, at the first start")
-    p.add_argument("--jerk-price", type=float, default=LookaheadConfig.jerk_price, metavar="X")
+    price = LookaheadConfig.jerk_price
+    p.add_argument("--jerk-price", type=float, default=price, metavar="X", help="of lookahead")
     p.add_argument("--workers", type=int, default=2)
     p.add_argument("--cache", type=Path, help="a folder for the library that is read")
     p.add_argument("--again", action="store_true", help="measure also what FILE holds")

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -155,7 +156,7 @@ def main(argv: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     path: Path = a.out
     result = json.loads(path.read_text()) if path.exists() else {"runs": {}}
-    words = [f"'{x}'" if " " in x else x for x in (sys.argv[1:] if argv is None else argv)]
+    words = sys.argv[1:] if argv is None else argv
     result = {"command": f"python benchmarks/perpetual.py {_plain(words)}", "machine": machine()} | {
         "runs": result["runs"]
     }
@@ -251,7 +252,8 @@ def _licences(texts: list[str]) -> Mapping[str, str]:
 
 def _plain(words: list[str]) -> str:
     """The command without what is this machine's alone: folders by their last name."""
-    return " ".join(w.rpartition("=")[0] + "=" * ("=" in w) + _last(w.rpartition("=")[2]) for w in words)
+    parts = (w.rpartition("=") for w in words)
+    return shlex.join(name + equals + _last(value) for name, equals, value in parts)
 
 
 def _last(word: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -346,8 +347,9 @@ def test_the_mark_is_the_policys(run: Path) -> None:
 
 
 def test_a_command_without_what_is_this_machines_alone() -> None:
-    words = ["--runs", "a=/srv/runs/a", "--clips", "/srv/cmu", "--hold-out", "'cmu 02'"]
+    words = ["--runs", "a=/srv/runs/a", "--clips", "/srv/cmu", "--hold-out", "cmu 02"]
     assert script._plain(words) == "--runs a=a --clips cmu --hold-out 'cmu 02'"
+    assert shlex.split(script._plain(["--title", "a teacher's"])) == ["--title", "a teacher's"]
     with pytest.raises(PoiseError, match="DATA=TEXT, got 'cmu'"):
         script._licences(["cmu"])
     assert torch.get_num_threads() == 1
