@@ -35,6 +35,8 @@ def held(seconds: float = 4.0, start: int = 30, stop: int = 75) -> Clip:
     clip = swing(seconds=seconds)
     offset = np.zeros((clip.frames, 3))
     offset[start:stop, 2] = 0.6
+    # 9 m/s on the way.
+    offset[[start, stop - 1], 2] = 0.3
     return shifted(clip, offset)
 
 
@@ -101,6 +103,35 @@ def test_rules_can_be_overruled_and_patterns_left_out(folder: Path) -> None:
     assert library.names == ("cmu-07-07_01", "cmu-07-07_02", "cmu-07-07_03", "cmu-07-swimming")
     assert report.of("cmu-02-02_01").rule == "by hand"
     assert library.clips[1].frames == 121
+
+
+def leaping(metres: float, frame: int) -> Clip:
+    """From a frame on it is elsewhere."""
+    clip = swing(seconds=4.0)
+    offset = np.zeros((clip.frames, 3))
+    offset[frame:, 0] = metres
+    return shifted(clip, offset)
+
+
+def test_a_clip_that_leaps_faster_than_people_run_is_cut_there(tmp_path: Path) -> None:
+    root = tmp_path / "cmu"
+    write(root, "09/09_01.bvh", leaping(2.0, 1))
+    write(root, "09/09_02.bvh", leaping(2.0, 90))
+    write(root, "09/09_03.bvh", leaping(0.4, 60))
+    write(root, "09/09_04.bvh", leaping(2.0, 90).replaced(fps=120.0))
+    library, report = library_of(root)
+    # 0.4 m in 1/30 s are 12 m/s.
+    fates = {c.name[-5:]: (c.state, c.rule, round(c.kept_s[0], 2), c.frames) for c in report.clips}
+    assert fates == {
+        "09_01": ("cut", "leap", 0.17, 116),
+        "09_02": ("cut", "leap", 0.0, 86),
+        "09_03": ("kept", "", 0.0, 121),
+        "09_04": ("left out", "leap", 0.0, 0),
+    }
+    assert max(np.abs(np.diff(c.root_pos, axis=0)).max() for c in library) < 0.43
+    assert "since its root leaps by 2.0" in report.of("cmu-09-09_02").sentence()
+    kept, report = library_of(root, config=LibraryConfig(keep=("09_02",)))
+    assert report.of("cmu-09-09_02").state == "kept" and kept.clips[1].frames == 121
 
 
 def test_onto_a_skeleton_a_clip_or_a_file(folder: Path, tmp_path: Path) -> None:

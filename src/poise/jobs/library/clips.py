@@ -14,7 +14,7 @@ from poise.errors import PoiseError
 from poise.jobs.library.files import MotionFile, check_patterns, matches
 from poise.jobs.library.report import ClipNote
 from poise.kin import RetargetConfig, onto_own, own_body, place_on_body
-from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
+from poise.kin.doctor.alone import AloneRules, leaps, longest_alone, not_alone
 from poise.kin.doctor.clean import clean_clip
 from poise.kin.flight import rate_sentence
 from poise.kin.place import OnBody
@@ -233,6 +233,14 @@ def place(
         repairs=taken.repairs, notes=clip.skeleton.source.notes,
     )  # fmt: skip
     keep = matches(config.keep, file.name, file.subject)
+    broken = () if keep else leaps(clip, config.rules)
+    begins, stop = longest_alone(clip, broken)
+    if broken:
+        worst = max(broken, key=lambda f: f.size_m)
+        note = replace(note, rule=worst.kind, reason=worst.sentence(clip.fps))
+        if stop - begins < _least(clip, config):
+            return None, note
+        clip = trim(clip, begins, stop)
     try:
         clip, on = set_down(clip, example, target, config)
     except PoiseError as problem:
@@ -251,7 +259,7 @@ def place(
     if doubt and not keep:
         reason = doubt.partition(";")[0]
         return None, replace(note, rule="rate", reason=reason[0].lower() + reason[1:])
-    return _alone(clip, target, note, config, keep)
+    return _alone(clip, target, note, config, keep, begins)
 
 
 def set_down(
@@ -271,18 +279,24 @@ def set_down(
 
 
 def _alone(
-    clip: Clip, target: Target, note: ClipNote, config: LibraryConfig, keep: bool
+    clip: Clip, target: Target, note: ClipNote, config: LibraryConfig, keep: bool, begins: int
 ) -> tuple[Clip | None, ClipNote]:
-    """The longest run of frames that needs no more than a floor."""
+    """The longest run of frames that needs no more than a floor, of what is left from `begins` on."""
     found = () if keep else not_alone(clip, target.table, config.rules)
     first, stop = longest_alone(clip, found) if found else (0, clip.frames)
     if found:
         worst = max(found, key=lambda f: f.seconds)
         note = replace(note, rule=worst.kind, reason=worst.sentence(clip.fps))
-        if stop - first < max(config.min_frames, config.min_cut_s * clip.fps):
+        if stop - first < _least(clip, config):
             return None, note
         clip = trim(clip, first, stop)
     # The floor is known now, so that a part of a clip in which no foot stands is not set down anew.
     made = clip.replaced(skeleton=target.skeleton.with_source(ground_m=0.0), name=note.name)
-    kept = (first / clip.fps, (stop - 1) / clip.fps)
-    return made, replace(note, state="cut" if found else "kept", kept_s=kept, frames=stop - first)
+    kept = ((begins + first) / clip.fps, (begins + stop - 1) / clip.fps)
+    state = "cut" if note.rule else "kept"
+    return made, replace(note, state=state, kept_s=kept, frames=stop - first)
+
+
+def _least(clip: Clip, config: LibraryConfig) -> float:
+    """Frames that what is left of a cut clip must have."""
+    return max(config.min_frames, config.min_cut_s * clip.fps)

@@ -18,8 +18,8 @@ class ClipNote:
         path: of the file.
         state: taken whole, in part, or not at all.
         reason: why it was cut or left out, a clause.
-        rule: that rule's name: unreadable, not human, short, word, held, leaning, below, rate, unlike,
-            by hand.
+        rule: that rule's name: unreadable, not human, short, word, held, leaning, below, leap, rate,
+            unlike, by hand.
         seconds: of the file's motion.
         kept_s: what the library has of it, (0, 0) for none.
         retargeted: it came from another skeleton.

@@ -22,7 +22,7 @@ from poise.metrics.shapes import PIECE
 from poise.motion import Clip
 from poise.spatial import GRAVITY
 
-Kind = Literal["held", "leaning", "below"]
+Kind = Literal["held", "leaning", "below", "leap"]
 #: Standard deviation (s) of the low-pass on the centre of mass before it is differentiated twice.
 SMOOTH_S = 0.1
 #: Least upward force over weight at which a balance point says anything; below, the body nearly falls.
@@ -43,7 +43,8 @@ class AloneRules:
         farther in 0.6 s, so beyond that it falls.
     aloft_m: height of the lowest part above which the body is off the floor. held_s: how long it may
         be there without falling: g t^2 / 8 = 0.44 m is how far a body that does fall is away by then.
-    jump_s: the longest flight of a jump; 1.0 s is one of 1.2 m, the best there are.
+    jump_s: the longest flight of a jump; 1.0 s is one of 1.2 m, the best there are. fastest: m/s, beyond
+        which a root leaps; sprinters reach 12.4.
     """
 
     near_m: float = 0.15
@@ -52,15 +53,17 @@ class AloneRules:
     aloft_m: float = ALOFT_M
     held_s: float = 0.6
     jump_s: float = 1.0
+    fastest: float = 13.0
 
 
 @dataclass(frozen=True)
 class NotAlone:
     """Frames `start` to `stop` (inclusive) of a clip that need more than a floor.
 
-    kind: "held" above the floor without falling, "leaning" outside of its support, "below" the floor.
-    size_m: how high, how far, or how deep at most. seconds: how long. lead, trail: frames before and
-    after it in which no floor bears the body either, too short to count by themselves.
+    kind: "held" above the floor without falling, "leaning" outside of its support, "below" the floor, or
+    a "leap" of the root (`leaps`). size_m: how high, how far, or how deep at most. seconds: how long.
+    lead, trail: frames before and after it in which no floor bears the body either, too short to count
+    by themselves.
     """
 
     kind: Kind
@@ -76,6 +79,8 @@ class NotAlone:
         when = f"for {self.seconds:.1f} s from {self.start / fps:.1f} s on"
         if self.kind == "held":
             return f"{when} it is up to {self.size_m:.2f} m above the floor and does not fall"
+        if self.kind == "leap":
+            return f"its root leaps by {self.size_m:.2f} m in a frame at {self.stop / fps:.2f} s"
         if self.kind == "below":
             return f"{when} it is up to {self.size_m:.2f} m under its floor, so it has several floors"
         return (
@@ -87,6 +92,13 @@ class NotAlone:
 def not_alone(clip: Clip, table: BodyTable, rules: AloneRules | None = None) -> tuple[NotAlone, ...]:
     """Spells of a clip, standing on z = 0, that its body `table` cannot do alone (`beyond_a_floor`)."""
     return beyond_a_floor(table, *poses_of(clip, table), clip.fps, rules or AloneRules())
+
+
+def leaps(clip: Clip, rules: AloneRules | None = None) -> tuple[NotAlone, ...]:
+    """Frames of a clip to which its root steps faster than anybody runs: breaks of the recording."""
+    steps = np.linalg.norm(np.diff(clip.root_pos, axis=0), axis=-1)
+    found = np.flatnonzero(steps * clip.fps > (rules or AloneRules()).fastest)
+    return tuple(NotAlone("leap", int(t), int(t) + 1, float(steps[t]), 1 / clip.fps) for t in found)
 
 
 def beyond_a_floor(
