@@ -10,7 +10,7 @@ python benchmarks/compliance.py flips --clip humanoid3d_backflip.txt --json benc
 python benchmarks/compliance.py cost --json benchmarks/compliance.json
 
 All by the policy that comes with Poise, alone (the flips with lookahead, too) and without help; no
-training. Each part writes its section of the same file.
+training. Each part writes its section of the same file, and under "policies" which policy it is of.
 """
 
 from __future__ import annotations
@@ -32,16 +32,19 @@ from scipy.stats import spearmanr
 import poise
 from poise.control import Compliance, Stiffness
 from poise.env.events import Pushes
-from poise.env.scenes import Balance, Chicken, Doorway, Hands, PlayScene, Trampoline
+from poise.env.scenes import Balance, Chicken, Doorway, Hands, PlayScene, Throws, Trampoline
+from poise.jobs.compliant.hopping import AT_SOMEBODY, WAYS, hopping
 from poise.jobs.compliant.play import play
+from poise.jobs.compliant.scene_meters import PUSHED_S
 from poise.jobs.compliant.standing import standing
 from poise.jobs.compliant.stiffness import Measured, measure
 from poise.jobs.compliant.throws import slope, throws
-from poise.jobs.compliant.training import Learned, shipped
+from poise.jobs.compliant.training import Learned, digest_of, shipped
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
 from poise.plan import LookaheadConfig
+from poise.sim import SimConfig
 from poise.view import line_plot
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
@@ -99,7 +102,11 @@ def _summary(rows: Sequence[Measured]) -> dict[str, Any]:
 
 
 def thrown(
-    tracker: Tracker, counts: dict[float, int], threads: int, keep: Callable[[dict[str, Any]], None]
+    tracker: Tracker,
+    counts: dict[float, int],
+    threads: int,
+    keep: Callable[[dict[str, Any]], None],
+    only: str | None = None,
 ) -> dict[str, Any]:
     """The same throws at each level, by both laws and at two physics rates, and by stiffness; `keep` is
     told what there is after each."""
@@ -108,6 +115,8 @@ def thrown(
         if not count:
             continue
         for law in ("eq8", "algorithm1"):
+            if only not in (None, law):
+                continue
             # Two tried steps for each force: a fifth of the throws is what the time allows.
             many = count if law == "eq8" else max(20, count // 5)
             out[f"{law}, {rate:g} Hz"] = _thrown(
@@ -115,7 +124,7 @@ def thrown(
             )  # type: ignore[arg-type]
             keep(out)
     soft = (4000.0, 1000.0, 400.0, 200.0, 100.0, 50.0)
-    if counts[60.0]:
+    if counts[60.0] and only in (None, "stiffness"):
         out["stiffness, 60 Hz"] = _thrown(tracker, Stiffness(), soft, counts[60.0], 60.0, threads)
     return out
 
@@ -221,6 +230,23 @@ def doors(tracker: Tracker, threads: int) -> dict[str, Any]:
     return out
 
 
+def at_rate(tracker: Tracker, rate_hz: float) -> Tracker:
+    """The same policy with other physics steps."""
+    sim = SimConfig(rate_hz=rate_hz, control_hz=tracker.config.sim.control_hz)
+    return replace(tracker, config=replace(tracker.config, sim=sim))
+
+
+def nobody(tracker: Tracker, scene: Chicken, touch_s: float, threads: int) -> dict[str, float]:
+    """How far the pelvis leaves its way in the same half second where nobody touches the player."""
+    clip = hopping(tracker, ways=AT_SOMEBODY if scene.against == "rival" else WAYS)
+    alone = play(Throws(every_s=(100.0, 100.0)), tracker, clip, None, 8, 8.0, threads)
+    rolled = alone.evaluation.rollouts
+    off = (rolled.pos - rolled.ref_pos)[:, :, 0, :2]
+    first, rate = round(touch_s * rolled.fps), rolled.fps
+    way = (off[:, first + round(PUSHED_S * rate)] - off[:, first]).norm(dim=-1)
+    return {"pushed_mm": 1000.0 * float(way.mean()), "from_s": touch_s, "lost": alone.stiff["lost"]}
+
+
 def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str, Any]:
     """Trampoline, ball and chicken fight, each beside its twin that does not give way."""
     learned = shipped("ball", tracker)
@@ -233,9 +259,18 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
         "ball": (Balance(), ball),
         "ball, pushed with 50 N": (Balance(pushes=50.0), ball),
         "ball, pushed with 100 N": (Balance(pushes=100.0), ball),
+        "ball, pushed with 50 N, another seed": (Balance(pushes=50.0, seed=1), ball),
+        "ball, rod of 0.9 m": (Balance(length=0.9), ball),
+        "ball, rod of 1.1 m": (Balance(length=1.1), ball),
         "chicken, heavy and light": (
             Chicken(against="rival"),
             {"level 0.16": Compliance(0.16), "stiffness 500, lag 0.5 s": Stiffness(500.0, 0.5)},
+        ),
+        "chicken, heavy and light, 600 Hz": (
+            Chicken(against="rival"), {"level 0.16": Compliance(0.16)}
+        ),
+        "chicken, 60 kg each": (
+            Chicken(60.0, 60.0, against="rival"), {"level 0.16": Compliance(0.16)}
         ),
         "chicken, heavy against a bag of 36 kg": (Chicken(85.0, 36.0), {"level 0.16": Compliance(0.16)}),
         "chicken, light against a bag of 85 kg": (Chicken(36.0, 85.0), {"level 0.16": Compliance(0.16)}),
@@ -249,10 +284,15 @@ def scenes(tracker: Tracker, threads: int, only: str | None = None) -> dict[str,
             own = given if isinstance(given, Learned) else None
             how = None if isinstance(given, Learned) else given
             seconds = 20.0 if isinstance(scene, Balance) else 8.0
-            made = play(scene, tracker, None, how, 8, seconds, threads, learned=own)
+            by = at_rate(tracker, 600.0) if "600 Hz" in name else tracker
+            made = play(scene, by, None, how, 8, seconds, threads, learned=own)
             rows["without"] = dict(made.stiff)
             rows[way] = dict(made.figures)
+        if isinstance(scene, Chicken):
+            touch = next(i for i, arrows in enumerate(made.arrows) if len(arrows))
+            rows["nobody touches"] = nobody(by, scene, touch / made.evaluation.rollouts.fps, threads)
         out[name] = rows
+        print(name, json.dumps(rows), flush=True)
     return out
 
 
@@ -286,23 +326,30 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--svg", type=Path)
     parser.add_argument("--clip", type=Path, help="flips: humanoid3d_backflip.txt")
-    parser.add_argument("--only", choices=("trampoline", "ball", "chicken"), help="of the scenes")
+    parser.add_argument(
+        "--only", help="of the scenes: trampoline, ball, chicken; throws: eq8, algorithm1, stiffness"
+    )
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--throws", type=int, default=200, help="at 60 Hz; 0 leaves what is there")
     parser.add_argument("--fine", type=int, default=200, help="throws at 600 Hz; 0 leaves what is there")
     args = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
+    digest = digest_of(tracker.policy)
 
     def keep(found: dict[str, Any]) -> None:
         told = json.loads(args.json.read_text()) if args.json.exists() else {}
         told[args.part] = {**told.get(args.part, {}), **found}
+        # Scenes and throws are measured one by one.
+        parts = found if args.part in ("scenes", "throws") else {"": 0}
+        names = [f"{args.part}/{name}".rstrip("/") for name in parts if name != "episodes"]
+        told["policies"] = {**told.get("policies", {}), **dict.fromkeys(names, digest)}
         args.json.write_text(json.dumps(told, indent=1) + "\n")
 
     if args.part == "stiffness":
         found = stiffness(tracker, args.svg, args.threads)
     elif args.part == "throws":
-        found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads, keep)
+        found = thrown(tracker, {60.0: args.throws, 600.0: args.fine}, args.threads, keep, args.only)
     elif args.part == "hands":
         found = hands(tracker, args.threads)
     elif args.part == "door":

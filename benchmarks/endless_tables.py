@@ -53,7 +53,7 @@ STEPS = {"ours": 280, "ERD": 80, "acLSTM": 30, "next frame": 170}
 FIXED = ("zero velocity", "acLSTM", "EgoPose", "next frame")
 #: m below the recorded root in the last frame, from which on a character counts as fallen.
 FALLEN = 0.3
-#: The dual policy, against which the others are compared.
+#: The dual policy, whose control policy does not see z, against which the others are compared.
 OURS = "RFC-Implicit"
 ALL = ("zero velocity", "ours", OURS, "RFC-Explicit", "EgoPose", "ERD", "acLSTM",
        "no residual force", "no additive action", "servos", "universal policy", *ON_TOP)  # fmt: skip

@@ -6,8 +6,10 @@
 DIR holds Bandai's motions (`other/bandai_bvh`). Each window is 10 recorded frames, a transition, and 5
 recorded frames; the in-betweening network that comes with Poise, which has learned none of them, makes
 the transition. Policies are trained on the very motions that they correct, as in the paper; that of
-poise track is not. FP and FQ are of soles, not of joint centres, which lie above the floor in these
-clips: FQ is the share of feet more than 5 mm below it. Help stands beside every row. Resumable.
+poise track is not. The analytic inverse kinematics see places of joints alone; what policies correct has
+the clips' own angles and is set on the floor. FP and FQ are of soles, not of joint centres, which lie
+above the floor in these clips: FQ is the share of feet more than 5 mm below it. Help stands beside every
+row. Resumable.
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from poise.env import Reference
 from poise.eval.inbetween import BANDAI, deviation
+from poise.jobs.compliant.training import digest_of
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate, train, trained_policy
 from poise.jobs.track import track
-from poise.kin import fit_humanoid
+from poise.kin import IkBody, clip_ik, fit_humanoid
 from poise.kin.solids import lowest_height
 from poise.learn import Until
 from poise.metrics import l2p
@@ -109,6 +113,13 @@ def figures(made: Motion, truth: Motion, task: Imitation, std: Tensor, length: i
     }  # fmt: skip
 
 
+def by_joints(clips: list[Clip], task: Imitation) -> Motion:
+    """The body as the analytic inverse kinematics pose it from the places of the clips' joints."""
+    body, names = IkBody.of(task.humanoid), [c.name for c in clips]
+    posed = Reference(task.humanoid, [clip_ik(c, body) for c in clips], FPS, names).pose
+    return Motion(*(x.unflatten(0, (len(clips), -1)) for x in (posed.pos, posed.quat)))
+
+
 def policy_row(
     task: Imitation, folder: Path, iterations: int, truth: Motion, std: Tensor, length: int
 ) -> dict[str, Any]:
@@ -151,6 +162,7 @@ def tracked_row(
         "mpjpe_mm": round(sum(d.card.mpjpe_mm for d in done) / len(done), 2),
         "mpjpe_global_mm": round(sum(d.card.mpjpe_global_mm for d in done) / len(done), 2),
         "force_mean_n": 0.0, "torque_mean_nm": 0.0, "samples": 0, "minutes": round(took / 60, 1),
+        "policy": digest_of(run.tracker.policy),
     }  # fmt: skip
 
 
@@ -195,9 +207,10 @@ def main() -> None:
     kinematic("recorded", truth)
     kinematic("base", on_joints(filled(test.truth, n, 0), joints))
     kinematic("base + TTA", on_joints(adapted, joints))
+    kinematic("base + TTA + IK", by_joints(adapted, task))
     pose, many = task.reference.pose, len(test.truth)
-    ik = Motion(*(x.unflatten(0, (many, -1)) for x in (pose.pos, pose.quat)))
-    kinematic("base + TTA + IK", ik)
+    floor = Motion(*(x.unflatten(0, (many, -1)) for x in (pose.pos, pose.quat)))
+    kinematic("base + TTA + set on the floor", floor)
     key = "base + TTA + universal policy with lookahead"
     if key not in rows:
         keep(key, tracked_row(adapted, joints, task, truth, std, n))

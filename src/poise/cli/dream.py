@@ -57,8 +57,8 @@ class Options:
     policy: Annotated[Path | None, arg(metavar="FILE|RUN", help_behavior_hint="")] = None
     """The control policy; by default the one that comes with Poise."""
     controller: Literal["lookahead", "policy"] = "lookahead"
-    """lookahead tries in copies of the character before it acts; policy acts at once, ten times faster,
-    and falls more often."""
+    """lookahead tries in copies of the character before it acts; policy acts at once, ten times faster
+    and rougher."""
     budget: Annotated[float | None, arg(metavar="STEPS", help_behavior_hint="")] = None
     """Simulated control steps of lookahead for each that is made; by default 192."""
     recover: Flag = True

@@ -65,7 +65,8 @@ class Compliant:
     cooling: float = 0.4
     num_envs: int = 128
     seed: int = 0
-    # Three layers of 256 as in the paper; its rate of 1e-5 is for days.
+    # The paper's networks. Its rate of 1e-5, its gamma of .95 and its noise of 6 degrees are not taken:
+    # this learns in minutes, over 33 control steps, with a noise of .3 of what an action may add.
     ppo: PPOConfig = PPOConfig(
         policy_hidden=(256, 256, 256), value_hidden=(256, 256, 256), gamma=0.97, std=0.3,
         policy_lr=3e-4, minibatch=512,

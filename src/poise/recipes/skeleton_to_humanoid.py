@@ -7,7 +7,8 @@ humanoid, stage III lets a policy imitate it with a residual force that becomes 
 |----------------------------------------------|----------------------------------------------------|
 | Sec. 3.1 in-betweening (Harvey et al.)       | `jobs.inbetween`, `nets.rtn`, `nets.between`       |
 | Sec. 3.2 test-time adaptation, Eqs. 1 to 4   | `learn.adapt`                                      |
-| Sec. 3.3, App. A analytic IK                 | `kin.ik`                                           |
+| Sec. 3.3, App. A analytic IK                 | `kin.ik`, for motion that is joints alone; `build` |
+|                                              | takes a clip's own angles and sets it on the floor |
 | Sec. 3.4.1 state with the next two frames    | `env.terms.next_frames`, `observation="next two"`  |
 | Sec. 3.4.1 action (u_t, eta_t), Eq. 8        | `control.PDTargets`, `control.ImplicitResidual`    |
 | Sec. 3.4.2 curriculum, Eq. 9                 | `control.LinearHelp`                               |
