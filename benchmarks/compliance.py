@@ -335,7 +335,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     tracker = open_run(None).tracker
-    digest = digest_of(tracker.policy)
+    steps = round(1e-6 * tracker.about["samples"], 1)
+    policy = {"digest": digest_of(tracker.policy), "million_steps": steps}
 
     def keep(found: dict[str, Any]) -> None:
         told = json.loads(args.json.read_text()) if args.json.exists() else {}
@@ -343,7 +344,7 @@ def main() -> None:
         # Scenes and throws are measured one by one.
         parts = found if args.part in ("scenes", "throws") else {"": 0}
         names = [f"{args.part}/{name}".rstrip("/") for name in parts if name != "episodes"]
-        told["policies"] = {**told.get("policies", {}), **dict.fromkeys(names, digest)}
+        told["policies"] = {**told.get("policies", {}), **dict.fromkeys(names, policy)}
         args.json.write_text(json.dumps(told, indent=1) + "\n")
 
     if args.part == "stiffness":
