@@ -59,7 +59,7 @@ def begin_first(
         env = own.env(1, threads=1)
         env.close()
         start = trained if isinstance(trained, WarmStart) else WarmStart(trained)
-        policy = start.policy.first_actions(env.num_actions).clipped(own.ppo().obs_clip)
+        policy = start.policy.with_actions(env.num_actions).clipped(own.ppo().obs_clip)
         start = replace(start, policy=policy)
         if not config.recovery:
             return stage, start

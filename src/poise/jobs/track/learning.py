@@ -21,7 +21,7 @@ from poise.jobs.perpetual.run import begin, going_on, train
 from poise.jobs.perpetual.stage_order import Progress
 from poise.jobs.run_file import read_run
 from poise.jobs.runs import evaluate
-from poise.jobs.track.controllers import RULE
+from poise.jobs.track.best import RULE
 from poise.jobs.track.missing import needs_of
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.supports import Wanted, with_supports
