@@ -1,4 +1,4 @@
-"""What became of a motion, told once: word, sentence and exit code are of what is kept, as the card is."""
+"""What became of a motion, told once: word, sentence and exit code are of what is kept."""
 
 from __future__ import annotations
 
