@@ -63,7 +63,7 @@ def test_a_policy_learns_the_clip_and_goes_on(
     # What is lost at first is learned with help, which is said; none is left in what is written.
     if "First result: Lost" in said.err:
         assert "a residual force of at first up to 200 N" in said.err
-        assert "a residual force of at first up to 200 N" in said.out.lower()
+        assert "A residual force of at first up to 200 N" in said.out
     assert iterations(out / "run") == [1, 2, 3, 4, 5]
     assert {p.name for p in out.iterdir()} >= {"simulated.bvh", "score.json", "report.html", "run"}
     made, source = read_clip(out / "simulated.bvh"), read_clip(short)

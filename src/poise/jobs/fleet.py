@@ -29,7 +29,7 @@ FLEET_FILE = "fleet.json"
 FORMAT = 1
 State = Literal["waiting", "running", "done", "failed"]
 Event = Literal["skipped", "started", "again", "done", "failed"]
-#: The exit code of a job that is done, but whose motion was lost.
+#: The exit code of a job that is done, with a motion that was lost.
 LOST = 3
 _NO_SCORE = ("per_clip", "variants")
 

@@ -47,7 +47,7 @@ class Merit(NamedTuple):
     def of(card: ScoreCard) -> Merit:
         """Of the score of a single episode."""
         fails = card.per_clip[0]["first_fail_s"]
-        ended = LOST if card.succ < 1.0 else SURVIVED if card.tracked < 1.0 else TRACKED
+        ended = LOST if card.succ < 1.0 else SURVIVED if card.survived else TRACKED
         usual = card.reference.get("jerk", math.nan)
         return Merit(
             ended,
