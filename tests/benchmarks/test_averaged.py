@@ -73,7 +73,7 @@ def test_shares_that_make_no_mean_are_refused(
 
 def test_another_character_is_refused(both: tuple[Tracker, Tracker]) -> None:
     first, other = both
-    narrow = replace(other, policy=other.policy.first_actions(3))
+    narrow = replace(other, policy=other.policy.with_actions(3))
     with pytest.raises(PoiseError, match="policy 2 is of another character"):
         averaged.averaged((first, narrow), (0.5, 0.5))
 

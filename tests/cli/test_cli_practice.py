@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 import poise
+from poise.cli.answer import LOST
 from poise.cli.main import main
+from poise.eval.card import Help
+from poise.jobs import practice
 from poise.jobs.open import open_run
+from poise.jobs.track import TrackConfig
 from poise.motion import read_clip, trim, write_clip
+from poise.plan import LookaheadConfig, SamplingConfig
 from toy_policy import WALK, toy_run
 
 
@@ -29,6 +35,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return toy_run(tmp_path_factory.mktemp("run"))
 
 
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A motion is looked for by few characters."""
+    few = {"lookahead": LookaheadConfig(10, 4), "search": SamplingConfig(8, retries=0)}
+    monkeypatch.setattr(practice, "TrackConfig", lambda **how: TrackConfig(**how, **few))
+    monkeypatch.setattr(practice, "help_wanted", lambda *_: 200.0)
+
+
 def iterations(run: Path) -> list[int]:
     with (run / "log.csv").open(newline="") as file:
         return [int(row["iteration"]) for row in csv.DictReader(file)]
@@ -39,9 +53,17 @@ def test_a_policy_learns_the_clip_and_goes_on(
 ) -> None:
     out = tmp_path / "out"
     argv = ["imitate", str(short), "-o", str(out), "--from", str(run), "--threads", "1"]
-    assert main([*argv, "--iterations", "5"]) == 0
+    code = main([*argv, "--iterations", "5"])
     said = capsys.readouterr()
     assert "First result: " in said.err and "the policy tracks" in said.err
+    # Exit code, sentence and score are of what is kept.
+    score = json.loads((out / "score.json").read_text())
+    assert code == (LOST if score["succ"] < 1 and score["episodes"] == 1 else 0)
+    assert ("\nLost: " in said.out) == (code == LOST)
+    # What is lost at first is learned with help, which is said; none is left in what is written.
+    if "First result: Lost" in said.err:
+        assert "a residual force of at first up to 200 N" in said.err
+        assert "A residual force of at first up to 200 N" in said.out
     assert iterations(out / "run") == [1, 2, 3, 4, 5]
     assert {p.name for p in out.iterdir()} >= {"simulated.bvh", "score.json", "report.html", "run"}
     made, source = read_clip(out / "simulated.bvh"), read_clip(short)
@@ -53,15 +75,15 @@ def test_a_policy_learns_the_clip_and_goes_on(
     assert opened.tracker.humanoid.hinges == tracker.humanoid.hinges
     assert main([*argv, "--iterations", "5"]) == 2
     assert "already holds a run" in capsys.readouterr().err
-    assert main([*argv, "--iterations", "6", "--resume"]) == 0
+    assert main([*argv, "--iterations", "6", "--resume"]) in (0, LOST)
     assert "First result" not in capsys.readouterr().err and iterations(out / "run")[-1] == 6
     score = json.loads((out / "score.json").read_text())
-    assert score["episodes"] == 15 and score["help"]["force_mean_n"] == 0
+    assert score["episodes"] in (1, 15) and set(score["help"]) == {f.name for f in fields(Help)}
 
 
 def test_python_does_the_same(run: Path, short: Path, tmp_path: Path) -> None:
     made = poise.imitate(short, policy=run, iterations=1, threads=1)
-    assert made.tracked is not None and made.card.method == "perpetual-single"
+    assert made.tracked is not None and made.card.method.startswith("perpetual-single")
     assert made.clip.skeleton.names == read_clip(short).skeleton.names
     paths = made.save(tmp_path / "made")
     assert paths["report"].exists() and (paths["run"] / "run.safetensors").exists()

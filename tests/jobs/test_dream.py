@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.eval.card import NO_HELP
 from poise.jobs.endless import frames
 from poise.jobs.endless.config import Dream
 from poise.jobs.endless.dreaming import begun, dream, past_of
@@ -67,7 +68,7 @@ def test_it_goes_about_and_is_written(model: GeneratorModel, tracker: Tracker, t
     paths = made.save(tmp_path / "out")
     assert read_clip(paths["simulated"]).frames == 45
     score = json.loads(paths["score"].read_text())
-    assert score["help_n"] == 0 and score["simulated"]["jerk_m_per_s3"] > 0
+    assert score["help"] == asdict(NO_HELP) and score["simulated"]["jerk"] > 0
     assert "Endless motion" in paths["report"].read_text()
     made.save(tmp_path / "one.bvh")
     assert read_clip(tmp_path / "one.bvh").frames == 45

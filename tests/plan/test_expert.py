@@ -40,7 +40,7 @@ def test_a_push_is_answered_by_the_stated_spring(make_env: MakeEnv) -> None:
     qpos[:, 2] -= 0.1
     qvel[:, 2] -= 0.2
     env.backend.write(None, qpos, qvel)
-    c = expert.config
+    c = expert.config.spring
     pull = mass * c.frequency**2 * 0.1 + 2 * c.damping * mass * c.frequency * 0.2
     change = (expert.act(obs)[:, -6:-3] - before) * 5000
     torch.testing.assert_close(change[:, 2], torch.full((N,), pull), atol=0.05, rtol=1e-3)

@@ -105,6 +105,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.simulation import retake_of
+    from poise.jobs.track.story import story
     from poise.plan import LookaheadConfig
     from poise.synth.gaps import check_keyframes
     from poise.synth.sparse import partials_of, times_of
@@ -132,9 +133,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     _say(done)
     print_card(delivered.card)
     say(done.sentence)
-    lost = bool(done.tracked.failures)
+    became = story(done.tracked, hint=False)
+    word = became.word if became.failed else "completed"
     result = {
-        "outcome": "lost" if lost else "completed",
+        "outcome": word,
         "controller": done.tracked.controller,
         "sentence": done.sentence,
         "keyframes": list(done.keyframes),
@@ -144,9 +146,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         "faults": [f.to_dict() for f in done.filled.faults],
         "score": delivered.card.to_dict(),
     }
-    word = "lost" if lost else "completed"
-    told = (*done.notes, *delivered.notes)
-    return Answer(result, delivered.paths, told, LOST if lost else 0, word, delivered.card.mpjpe_mm)
+    told, code = (*done.notes, *delivered.notes), LOST if became.failed else 0
+    return Answer(result, delivered.paths, told, code, word, delivered.card.mpjpe_mm)
 
 
 def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:

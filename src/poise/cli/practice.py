@@ -1,21 +1,24 @@
-"""`poise imitate` from a policy: a first result by lookahead, then the policy learns the clip."""
+"""`poise imitate` from a policy: a first result by lookahead, then the policy learns the clip, see
+`jobs.practice`."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from poise.cli.answer import Answer
+from poise.cli.answer import LOST, Answer
 from poise.cli.console import notes, print_card, say, tell
 from poise.cli.progress import clock, left, showing, working
-from poise.cli.track import follow, outcome
+from poise.cli.track import follow
 from poise.cli.training import Job, held_already, stopped
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.jobs.perpetual.stage_order import Progress
-    from poise.jobs.track import Tracked
+    from poise.jobs.track import TrackConfig, Tracked
     from poise.jobs.tracker import Tracker
     from poise.motion import Clip
 
@@ -30,12 +33,12 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
     Returns:
         None where the policy does not fit, and the clip is to be learned from nothing.
     """
-    from poise.jobs.imitate import STARTS
     from poise.jobs.open import open_run
+    from poise.jobs.practice import Watching
+    from poise.jobs.practice import practise as practised
     from poise.jobs.run_file import RUN_FILE, learning_curve
     from poise.jobs.track import write
-    from poise.jobs.track.learning import from_every_start, learn
-    from poise.jobs.track.placement import place
+    from poise.jobs.track.story import story
     from poise.learn import Until
 
     t, held = job.training, (job.run / RUN_FILE).exists()
@@ -54,52 +57,77 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
         tell(f"It is learned from nothing, since the policy does not fit: {problem.what}.")
         return None
     with claimed(job.out):
-        first = None if held else first_result(job, tracker, clip, motion, hold)
-        placed = first.placed if first else place(clip, tracker)
-        with showing("training") as bar:
-
-            def show(p: Progress) -> None:
-                spent = f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)} at most"
-                bar(p.share, f"{spent}  {p.stats.samples_per_s:,.0f} samples/s")
-                if p.results is not None:
-                    share, off = 100 * p.results.tracked_share, p.results.error_mm
-                    tell(f"{clock(p.stats.seconds)}  the policy tracks {share:.0f} %, {off:.0f} mm off")
-
-            until = Until(minutes=t.minutes, iterations=t.iterations)
-            where = (t.threads, job.config.seed, STARTS, t.device)
+        until, seed = Until(minutes=t.minutes, iterations=t.iterations), job.config.seed
+        with Shown() as shown:
+            first = First(job.out, motion, hold)
+            told = Watching(shown.follow, first, lambda s: tell(s, "yellow"), shown.iteration)
             try:
-                learned, result = learn(tracker, placed, job.run, until, show, *where)
+                made = practised(clip, tracker, job.run, until, seed, t.threads, t.device, told)
             except KeyboardInterrupt:
                 # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
                 return stopped(job.run, job.again)
-        if result.interrupted:
+        if made.tracked is None:
             return stopped(job.run, job.again)
-        with working("simulating every start frame"):
-            tracked = from_every_start(learned, clip, t.device)
-        if first is not None and tracked.failures and not first.failures:
-            say("The policy still loses the motion from its first frame: what was found first stays.")
-            say(again(job))
-            card = tracked.card
-            return Answer(card.to_dict(), {"run": job.run}, tracked.notes)
+        tracked = made.tracked
         done = write(tracked, job.out, motion, hold, learning_curve(job.run))
     print_card(done.card)
-    if tracked.failures:
-        say(f"{outcome(tracked, False)} {again(job)}")
-    return Answer(done.card.to_dict(), {**done.paths, "run": job.run}, (*tracked.notes, *done.notes))
+    became = story(tracked, hint=False)
+    for sentence in (*(tracked.doubts if became.failed else ()), became.sentence, *made.sentences):
+        say(sentence)
+    if became.failed or done.card.help.force_mean_n:
+        say(again(job))
+    told = (*tracked.notes, *done.notes)
+    code, said = (LOST, tracked.doubts) if became.failed else (0, ())
+    return Answer(
+        done.card.to_dict(), {**done.paths, "run": job.run}, told, code, became.word, said=said
+    )
 
 
-def first_result(job: Job, tracker: Tracker, clip: Clip, motion: Path | None, hold: bool) -> Tracked:
-    """The motion by lookahead, or as it is searched, written before anything is learned."""
-    from poise.jobs.track import TrackConfig, write
+class First:
+    """Writes what is done before anything is learned, and says so. motion, hold: see `practise`."""
 
-    config = TrackConfig(seed=job.config.seed, threads=job.training.threads)
-    first = follow(tracker, [clip], config, [])
-    paths = write(first, job.out, motion, hold).paths
-    tell(f"First result: {outcome(first, False)} See {paths['report']}")
-    return first
+    def __init__(self, out: Path, motion: Path | None, hold: bool):
+        self.out, self.motion, self.hold = out, motion, hold
+
+    def __call__(self, first: Tracked) -> None:
+        from poise.jobs.track import write
+        from poise.jobs.track.story import story
+
+        done = write(first, self.out, self.motion, self.hold)
+        tell(f"First result: {story(first, hint=False).sentence} See {done.paths['report']}")
+
+
+class Shown:
+    """What is shown while a motion is practised: one bar at a time."""
+
+    def __init__(self) -> None:
+        self._shown = contextlib.ExitStack()
+        self._bar: Callable[[float, str], None] | None = None
+
+    def __enter__(self) -> Shown:
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self._shown.close()
+
+    def follow(self, policy: Tracker, clip: Clip, config: TrackConfig) -> Tracked:
+        """Tracks, with bars of its own."""
+        self._shown.close()
+        self._bar = None
+        return follow(policy, [clip], config, [])
+
+    def iteration(self, p: Progress) -> None:
+        """Shows one of the training."""
+        if self._bar is None:
+            self._bar = self._shown.enter_context(showing("training"))
+        spent = f"{clock(p.stats.seconds)}, {left(p.stats.seconds, p.share)} at most"
+        aid = f", with help of at most {p.help_n:.0f} N" if p.help_n else ""
+        self._bar(p.share, f"{spent}  {p.stats.samples_per_s:,.0f} samples/s{aid}")
+        if p.results is not None:
+            share, off = 100 * p.results.tracked_share, p.results.error_mm
+            tell(f"{clock(p.stats.seconds)}  the policy tracks {share:.0f} %, {off:.0f} mm off{aid}")
 
 
 def again(job: Job) -> str:
     """What to do about a motion that was not learned in time."""
-    minutes = f"--minutes {2 * job.training.minutes:g}"
-    return f"Go on with --resume and {minutes}; or --from none learns it with help, which then goes."
+    return f"Go on with --resume and --minutes {2 * job.training.minutes:g}."

@@ -81,9 +81,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("threads", o.threads, 0)
     out, motion = places(o.out)
     may_deliver(out, motion, o.overwrite, o.clip, flag="--overwrite")
-    from poise.cli.track import is_lost, outcome
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, track, write
+    from poise.jobs.track.story import story
 
     config = TrackConfig(
         seed=o.seed, controller=o.controller, threads=o.threads, body=o.body, push=push,
@@ -100,24 +100,23 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
             done = write(tracked, out, motion, o.hold_feet)
     assert tracked.pushed is not None
     print_card(done.card)
-    said, lost = outcome(tracked, False, hint=False), is_lost(tracked)
-    say(said)
+    became = story(tracked, hint=False)
+    say(became.sentence)
     say(tracked.pushed.sentence())
-    if lost:
+    if became.word == "lost":
         say("A weaker or shorter push, or a lower --level, may be borne.")
-    survived = tracked.card.survived
-    word = "lost" if lost else "not tracked" if survived else "pushed"
+    word = became.word if became.failed else "pushed"
     result = {
         "outcome": word,
         "controller": tracked.controller,
-        "sentence": said,
+        "sentence": became.sentence,
         "failures": [{"character": k, "seconds": t} for k, t in tracked.failures],
         "push": asdict(tracked.pushed),
         "score": done.card.to_dict(),
     }
     # The sentence on the push is said already.
     told = tuple(n for n in (*tracked.notes, *done.notes) if n != tracked.pushed.sentence())
-    code = LOST if lost or survived else 0
+    code = LOST if became.failed else 0
     return Answer(result, done.paths, told, code, word, done.card.mpjpe_mm)
 
 

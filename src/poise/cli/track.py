@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from poise.motion import Clip
     from poise.motion.keypoints import Keypoints
 
-#: Failures that are named one by one.
-NAMED = 8
-
 
 @dataclass(frozen=True)
 class Options:
@@ -167,6 +164,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
     from poise.jobs.track.simulation import retake_of
+    from poise.jobs.track.story import story
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 
@@ -193,27 +191,29 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
             if (learned := practise(o, tracker, tracked, out / "learned")) is None:
                 kept = {"learned": out / "learned"}
                 return Answer(outputs=kept, exit_code=INTERRUPTED, outcome="interrupted")
-            tracker = learned
-            tracked = follow(tracker, given, config, said_early)
+            tracker, before = learned, tracked
+            tracked = max(follow(learned, given, config, said_early), before, key=lambda t: t.merit)
+            if tracked is before:
+                tell("What was learned does it no better: the motion as it was before stays.")
         with working("writing"):
             done = write(tracked, out, motion, o.hold_feet)
             if o.save_policy is not None:
-                save_tracker(tracked.tracker, o.save_policy)
+                save_tracker(tracker, o.save_policy)
     print_card(done.card)
-    said, lost = outcome(tracked, o.reset_on_fail), is_lost(tracked)
-    say(said)
+    told = story(tracked, o.reset_on_fail)
+    if told.failed:
+        for doubt in tracked.doubts:
+            say(doubt)
+    say(told.sentence)
     for part in tracked.parts:
         say(part.sentence())
-    if lost:
+    if told.word == "lost":
         say(advice(o, tracked))
-    word = "came back" if tracked.losses else "found" if tracked.controller == "search" else "tracked"
-    survived = o.count == 1 and tracked.losses is None and tracked.card.survived
-    word = "lost" if lost else "not tracked" if survived else word
     failures = [{"character": k, "seconds": t} for k, t in tracked.failures]
     result = {
-        "outcome": word,
+        "outcome": told.word,
         "controller": tracked.controller,
-        "sentence": said,
+        "sentence": told.sentence,
         "failures": failures,
         "supports": [s.to_dict() for s in tracked.supports],
         "clips": [asdict(part) | {"done": part.done} for part in tracked.parts],
@@ -224,11 +224,10 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         saved["learned"] = out / "learned"
     # What reading says of keypoints that jitter, which an option mends.
     jitter = dict(tracked.placed.source.skeleton.source.evidence).get("jitter")
-    told = (*((f"{jitter}.",) if jitter else ()), *tracked.notes, *done.notes)
-    code = LOST if lost or survived else 0
-    return Answer(
-        result, {**done.paths, **saved}, told, code, word, done.card.mpjpe_mm, tuple(said_early)
-    )
+    said = (*((f"{jitter}.",) if jitter else ()), *tracked.notes, *done.notes)
+    early = (*said_early, *(tracked.doubts if told.failed else ()))
+    code = LOST if told.failed else 0
+    return Answer(result, {**done.paths, **saved}, said, code, told.word, done.card.mpjpe_mm, early)
 
 
 def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support, ...]:
@@ -240,14 +239,6 @@ def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support
             raise PoiseError("--support states what --no-supports forbids", hint="Leave one out")
         return read_supports(options.support)
     return "auto" if options.supports else "none"
-
-
-def is_lost(tracked: Tracked) -> bool:
-    """Whether the character failed and did not end on the motion, or not on one of several."""
-    losses = tracked.losses
-    if tracked.parts:
-        return not all(part.done for part in tracked.parts)
-    return bool(tracked.failures) and (losses is None or len(losses.back) < len(losses.lost))
 
 
 def follow(
@@ -308,48 +299,6 @@ def advice(options: Options, tracked: Tracked) -> str:
     if o.count == 1 and o.controller != "auto" and not (o.recover or o.reset_on_fail):
         return f"With --controller auto many characters search what is lost; {learns}"
     return "W" + learns[1:]
-
-
-def outcome(tracked: Tracked, reset: bool, hint: bool = True) -> str:
-    """Where the character failed, in a sentence, and what was missing. hint: whether the option that
-    puts it back is named."""
-    from poise.jobs.track.missing import shortfalls
-
-    reference, times = tracked.imitation.reference, tracked.failed_s
-    seconds = (int(reference.length[0]) - 1) / reference.rate_hz
-    off = f"{tracked.card.mpjpe_global_mm:.0f} mm off on average, place included"
-    if parts := tracked.parts:
-        done, waits = sum(p.done for p in parts), max(p.after or 0.0 for p in parts)
-        return (
-            f"{done} of {len(parts)} clips done one after another in {seconds:.1f} s, without help or "
-            f"reset, {off}; the longest way to the next took {waits:.1f} s."
-        )
-    count, fell = len(reference.length), {k for k, _ in tracked.failures}
-    if count > 1:
-        first = f", the first lost at {tracked.failures[0][1]:.1f} s" if fell else ""
-        again = f"; they were put back {len(tracked.failures)} times" if fell and reset else ""
-        return f"{count - len(fell)} of {count} characters tracked all {seconds:.1f} s{first}{again}."
-    if tracked.losses is not None:
-        return tracked.losses.sentence()
-    more = " ".join(("", *shortfalls(tracked.card)))
-    if not times and tracked.card.survived:
-        return f"Not tracked: within 0.5 m for all {seconds:.1f} s, {off}.{more}"
-    if not times and tracked.controller == "search":
-        return f"Found by a search to its end, {seconds:.1f} s, without help, {off}."
-    if not times:
-        by = "with lookahead" if tracked.controller == "lookahead" else "by the policy alone"
-        return f"Tracked {by} to its end, {seconds:.1f} s, without help, {off}."
-    if not reset:
-        back = " --reset-on-fail puts it back and goes on." if hint else ""
-        return (
-            f"Lost: the character failed at {times[0]:.1f} s of {seconds:.1f} s, 0.5 m off; what "
-            f"follows is not tracking.{more}{back}"
-        )
-    named = ", ".join(f"{t:.1f}" for t in times[:NAMED]) + (", ..." if len(times) > NAMED else "")
-    return (
-        f"Lost: the character failed {len(times)} times in {seconds:.1f} s and was put back, at {named} "
-        "s; the score ends at the first failure."
-    )
 
 
 def read(path: Path, reading: Reading) -> Clip | Keypoints:

@@ -79,6 +79,8 @@ class Controls:
         self.action.copy_(actions)
         if self._task.filter:
             keep_actions(self.action, self.before, self.kept(age), self.hinges)
+        if self._task.guide is not None and budget.now > 0:
+            self.action[:, self.hinges :] += self._task.guide(self._backend.state, goal)
         targets, rows = goal.targets()
         if self._targeting and self._task.pd.mode == "additive":
             targets, rows = targets[rows], self._every

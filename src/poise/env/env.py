@@ -21,6 +21,7 @@ from poise.env.style import ClipFeatures, ClipWindows
 from poise.env.task import EnvStep, StepLog, TaskConfig
 from poise.env.terms.evaluate import Sources, Terms, seen_by
 from poise.errors import PoiseError
+from poise.machine import one_thread
 from poise.sim import Backend, NanGuard
 
 P = TypeVar("P", bound=Plugin)
@@ -209,6 +210,7 @@ class ImitationEnv:
 
     # --- stepping -----------------------------------------------------------------------------
 
+    @one_thread()
     def step(self, actions: Tensor) -> EnvStep:
         """One control step for all worlds; `actions (N, A)`."""
         self.drive(actions)
@@ -229,8 +231,8 @@ class ImitationEnv:
         waited = self._held()
         self.tick()
         ref, ahead = goal.advance(waited, self._held())
-        told = self._told(None, ref, ahead)
-        final, scores, ends, self._style = self._terms.judge(self._sources.of(told))
+        seen = self._sources.of(self._told(None, ref, ahead))
+        final, scores, ends, self._style = self._terms.judge(seen)
         reward, self.imitation, *values = scores.unbind(0)
         self.terms = {t.name: v for t, v in zip(task.rewards, values, strict=True)}
         failed, terminated, truncated = ends.unbind(0)
@@ -265,8 +267,7 @@ class ImitationEnv:
                 for plugin in self.plugins:
                     ids = plugin.seeing(ids)
                 obs = self._obs.copy_(final)
-                fresh = self._sources.of(self._told(ids), ids)
-                obs[ids] = self._terms.observe(fresh)
+                obs[ids] = self._terms.observe(self._sources.of(self._told(ids), ids))
         if self._watched():
             obs = self._observe()
             final = final if self.task.auto_reset else obs
@@ -322,8 +323,7 @@ class ImitationEnv:
         """What the goal tells worlds `ids (n,)`, see `Sources.of`. known: now and one step later."""
         goal, steps = self.goal, self.task.window
         now, ahead = known or (goal.now(ids), goal.ahead(1, ids))
-        told = {"goal": now, "ahead": ahead}
-        return {**told, "window": goal.window(steps, ids)} if steps else told
+        return {"goal": now, "ahead": ahead} | ({"window": goal.window(steps, ids)} if steps else {})
 
     def _observe(self) -> Tensor:
         return self._terms.observe(self._sources.of(self._told())).clone()

@@ -12,6 +12,7 @@ from torch import Tensor
 from poise.env.env import ImitationEnv
 from poise.env.scenes.ball import FictionalForces
 from poise.env.task import Acts, EnvStep
+from poise.machine import one_thread
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class OnTop:
         """New episodes everywhere."""
         return self._own(self.env.reset())
 
+    @one_thread()
     def step(self, actions: Tensor) -> EnvStep:
         """One control step of both."""
         below = self.policy.act(self._seen)

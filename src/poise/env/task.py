@@ -14,7 +14,7 @@ from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
 from poise.env.plugins import Plugin
 from poise.env.recovery.config import Recovery
 from poise.errors import PoiseError
-from poise.sim import Backend
+from poise.sim import Backend, SimState
 
 if TYPE_CHECKING:
     from poise.env.goals import Goal
@@ -24,6 +24,12 @@ class Acts(Protocol):
     """Anything that maps observations `(N, O)` to deterministic actions `(N, A)`."""
 
     def act(self, obs: Tensor) -> Tensor: ...
+
+
+class Guides(Protocol):
+    """Residual actions `(N, dims)` that lead characters along their goal, see `plan.guide`."""
+
+    def __call__(self, state: SimState, goal: Goal) -> Tensor: ...
 
 
 class EnvStep(NamedTuple):
@@ -50,6 +56,7 @@ class TaskConfig:
     obs, rewards, dones: the terms, in order.
     pd: how actions become joint targets.
     residual: the kind of residual force, None for plain DeepMimic.
+    guide: residual actions that are added to the policy's while there is help, None for none.
     help: how its limits change while episodes are counted, which is with auto_reset alone; None leaves
         them.
     help_by: whether "all" worlds have one share of help left, or each "clip" or each motion "bin" its
@@ -85,6 +92,7 @@ class TaskConfig:
     dones: tuple[DoneTerm, ...]
     pd: PDTargets
     residual: Residual | None = None
+    guide: Guides | None = None
     help: HelpSchedule | None = None
     help_by: Literal["all", "clip", "bin"] = "all"
     left: Tensor | None = None

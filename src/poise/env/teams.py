@@ -12,6 +12,7 @@ from poise.env.controls import steps
 from poise.env.env import ImitationEnv
 from poise.env.task import EnvStep
 from poise.errors import PoiseError
+from poise.machine import one_thread
 from poise.sim import CharacterRows
 
 
@@ -71,6 +72,7 @@ class Teams:
             env.reset()
         return {name: env.observe() for name, env in self.envs.items()}
 
+    @one_thread()
     def step(self, actions: Mapping[str, Tensor]) -> dict[str, EnvStep]:
         """One control step for all; `actions` `(N K, A)` of each team."""
         missing = self.envs.keys() ^ actions.keys()

@@ -34,6 +34,10 @@ class Help:
     share_of_body_weight: float
 
 
+#: Where nothing can help.
+NO_HELP = Help(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class ScoreCard:
     """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv
-from poise.metrics import mpjpe_global, mpjpe_root, success_rule
+from poise.metrics import has_lost, mpjpe_global, mpjpe_root
 
 #: Control steps between looks at whether anything is left to see, which a GPU must be waited for.
 LOOK = 16
@@ -75,7 +75,6 @@ class ClipJudge:
         # The first frame is the clip's own.
         self.local, self.far = (torch.zeros_like(last, dtype=torch.float64) for _ in range(2))
         self.count = torch.ones_like(self.local)
-        self._limit = success_rule("phc").limit_m * 1000.0
 
     def see(self, env: ImitationEnv, step: int) -> bool:
         """Adds one frame of each clip that has not ended or failed."""
@@ -84,7 +83,7 @@ class ClipJudge:
         sim, ref = env.pose().pos, env.goal_pose().pos
         distance, counted = mpjpe_global(sim, ref), self.alive & (step <= self.last)
         # A world that went bad has no distance, and has failed.
-        good = distance <= self._limit
+        good = ~has_lost(sim, ref)
         known = counted & distance.isfinite()
         self.far += torch.where(known, distance, 0.0)
         self.local += torch.where(known, mpjpe_root(sim, ref), 0.0)

@@ -19,6 +19,7 @@ from poise.env import Acts, ImitationEnv, Reference
 from poise.errors import PoiseError
 from poise.eval.rolloutset import RolloutSet
 from poise.kin.solids import shapes_of
+from poise.machine import one_thread
 from poise.sim import UnstableError
 from poise.spatial import quat_mul, rotvec_to_quat
 
@@ -49,6 +50,7 @@ class Observer(Protocol):
         ...
 
 
+@one_thread()
 def simulate(env: ImitationEnv, policy: Acts, obs: Tensor, steps: int, *observers: Observer) -> None:
     """Lets a policy act in all worlds from where they stand, for `steps` control steps or until every
     observer has seen enough.

@@ -4,7 +4,7 @@ succeeded, which of their frames count, and sums of figures over those."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import torch
@@ -110,6 +110,12 @@ class RolloutSet:
         """`(E, T)` bool: alive and within the episode's length."""
         within = torch.arange(self.pos.shape[1], device=self.pos.device) < self.lengths.unsqueeze(-1)
         return self.alive.bool() & within
+
+    def episode(self, row: int) -> RolloutSet:
+        """One of the episodes alone."""
+        rows = slice(row, row + 1)
+        own = {f.name: v[rows] for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return replace(self, **own, reward={name: v[rows] for name, v in self.reward.items()})
 
     def clip_name(self, index: int) -> str:
         """The name of clip `index`, or its number where no names were given."""

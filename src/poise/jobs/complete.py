@@ -21,7 +21,9 @@ from poise.jobs.open import open_run
 from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.stages import Stage, key_errors, stage_of
 from poise.jobs.track import TrackConfig, Tracked, track, write
+from poise.jobs.track.best import Merit
 from poise.jobs.track.direction import Weight
+from poise.jobs.track.story import story
 from poise.jobs.tracker import Tracker
 from poise.learn.model import InbetweenModel
 from poise.motion import Clip
@@ -89,9 +91,9 @@ class Completed(Result):
     def sentence(self) -> str:
         """How the keyframes were met."""
         worst = int(np.argmax(self.met_mm))
-        done = self.tracked.failed_s
-        if done:
-            return f"Lost: the character fell away from the motion at {done[0]:.1f} s."
+        became = story(self.tracked, hint=False)
+        if became.failed:
+            return became.sentence
         told = (
             f"Without help; keyframes met to {np.mean(self.met_mm):.0f} mm on average, frame "
             f"{self.keyframes[worst]} worst with {self.met_mm[worst]:.0f} mm"
@@ -169,7 +171,7 @@ def complete(
         source, keys = timed(source, keys, times)
     more: dict[str, Any] = {} if adapt is None else {"adapt": adapt}
     factors = np.ones(len(keys) - 1)
-    best: tuple[float, Completed] | None = None
+    best: tuple[Merit, Completed] | None = None
     for round_ in range(ROUNDS if retime else 1):
         stretched, at = retimed(source, keys, factors)
         told = None if progress is None else _telling(progress, "filling")
@@ -185,9 +187,10 @@ def complete(
         done = _completed(source, keys, filled, tracked, at, factors)
         said = done.retiming and replace(done.retiming, called=asked)
         done = replace(done, keyframes=asked, retiming=said)
-        score = float(np.mean(done.met_mm)) + 1e6 * bool(tracked.failures)
-        if best is None or score < best[0]:
-            best = score, done
+        # As attempts are compared everywhere, but that keyframes are to be met and not all frames alike.
+        merit = tracked.merit._replace(error=-float(np.mean(done.met_mm)))
+        if best is None or merit > best[0]:
+            best = merit, done
         slow = _too_fast(done)
         if not retime or not slow.any():
             break

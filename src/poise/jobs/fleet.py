@@ -29,6 +29,8 @@ FLEET_FILE = "fleet.json"
 FORMAT = 1
 State = Literal["waiting", "running", "done", "failed"]
 Event = Literal["skipped", "started", "again", "done", "failed"]
+#: The exit code of a job that is done, with a motion that was lost.
+LOST = 3
 _NO_SCORE = ("per_clip", "variants")
 
 
@@ -167,10 +169,12 @@ class _Fleet:
         record, job = self.records[ended.name], self.jobs[ended.name]
         record.seconds += time.monotonic() - self.begun.pop(ended.name)
         record.pid, record.error = None, ended.said
-        if ended.code == 0:
+        # A motion that is lost is a result, too.
+        done = ended.code in (0, LOST)
+        if done:
             record.score, record.error = _score(job.result)
         event: Event = "failed"
-        if not record.error and ended.code == 0:
+        if not record.error and done:
             event = "done"
         elif record.attempts <= self.retries:
             event = "again"

@@ -21,12 +21,11 @@ from poise.eval import ScoreCard
 from poise.jobs.deliver import Delivery, deliver, finished
 from poise.jobs.open import Run, open_run
 from poise.jobs.perpetual.stage_order import Progress
+from poise.jobs.practice import Watching, practise
 from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
 from poise.jobs.track import Tracked, write
-from poise.jobs.track.learning import from_every_start, learn
-from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, PolicyBundle, Until
@@ -37,8 +36,6 @@ from poise.settings import changed
 
 #: The run folder in a result folder.
 RUN = "run"
-#: Start frames from which a motion is to be done before its training ends.
-STARTS = 32
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,7 +48,9 @@ class Imitated(Result):
         evaluation: every start frame simulated.
         run: the run folder.
         interrupted: whether Ctrl-C ended the training early; it was evaluated all the same.
-        tracked: the same as a policy's tracking of the motion, where one began; else None.
+        tracked: what is kept, the best of what policy, lookahead and search do, where a policy began;
+            else None.
+        sentences: what is said of that beside `track.story`.
     """
 
     task: Imitation
@@ -60,6 +59,7 @@ class Imitated(Result):
     run: Path
     interrupted: bool = False
     tracked: Tracked | None = None
+    sentences: tuple[str, ...] = ()
 
     @cached_property
     def _finished(self) -> Delivery:
@@ -80,14 +80,14 @@ class Imitated(Result):
     @property
     def card(self) -> ScoreCard:
         """The score of all start frames."""
-        return self._finished.card
+        return self._finished.card if self.tracked is None else self.tracked.card
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was repaired in the motion, and what holding the feet did."""
         own = [n for clip in self.task.library for n in clip.skeleton.source.notes]
         if self.tracked is not None:
-            own += self.tracked.notes
+            own += [*self.sentences, *self.tracked.notes]
         return (*own, *self.task.report.sentences(), *self._finished.notes)
 
     def _shown(self) -> Shown:
@@ -123,9 +123,10 @@ def imitate(
     """Trains a policy on a motion, simulates it from every start frame, and scores it.
 
     By default a policy that knows many motions learns this one, on its own joints with the bones of the
-    clip, without any help, until it succeeds from `STARTS` start frames or the time is over. Several
-    clips, or any setting of the recipe but the seed, are learned from nothing by the recipe
-    `ResidualForce`, on a body with every joint of the clip.
+    clip, until it succeeds from 32 start frames or the time is over; where it loses the motion at first,
+    a residual force helps it meanwhile, and fades (`jobs.practice`). Several clips, or any setting of
+    the recipe but the seed, are learned from nothing by the recipe `ResidualForce`, on a body with every
+    joint of the clip.
 
     Args:
         clip: a clip or a file; or several on one skeleton, which one policy learns.
@@ -205,11 +206,12 @@ def _practised(
     def tell(p: Progress) -> bool | None:
         return None if on_iteration is None else on_iteration(p.stats)
 
-    placed = place(clip, tracker)
-    learned, result = learn(tracker, placed, run, until, tell, threads, seed, STARTS, device)
-    done = from_every_start(learned, clip, device)
+    made = practise(clip, tracker, run, until, seed, threads, device, Watching(iteration=tell), False)
+    done, learned = made.tracked, made.learned
+    assert done is not None
     task, evaluation = done.imitation, done.evaluation
-    return Imitated(task, learned.policy, evaluation, run, result.interrupted, done)
+    interrupted = learned.result.interrupted
+    return Imitated(task, learned.tracker.policy, evaluation, run, interrupted, done, made.sentences)
 
 
 def _kept(made: Imitated, folder: str | Path | None) -> Imitated:

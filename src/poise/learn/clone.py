@@ -21,6 +21,7 @@ from poise.learn.ppo import PPO
 from poise.learn.protocols import Teacher, VecEnv
 from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.learn.state import State, make_generator, prefixed
+from poise.machine import one_thread
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class CloneStats:
     """Since the start."""
 
 
+@one_thread()
 def clone(
     env: VecEnv,
     teacher: Teacher,

@@ -130,13 +130,20 @@ class PolicyBundle:
         """An independent copy, which later training does not change."""
         return copy.deepcopy(self)
 
-    def first_actions(self, count: int) -> PolicyBundle:
-        """The same policy without its later actions, such as those of a force that helps no more."""
+    def with_actions(self, count: int) -> PolicyBundle:
+        """The same policy for so many actions: later ones are left out, such as those of a force that
+        helps no more, and further ones are 0 in every state, with a deviation of 1."""
         out = PolicyBundle.rebuild(self.num_obs, count, self.shape)
-        wanted = out.state()
-        out.load_state(
-            {k: v if v.shape == wanted[k].shape else v[:count] for k, v in self.state().items()}
-        )
+        wanted, kept = out.state(), min(count, self.num_actions)
+
+        def fitted(name: str, value: Tensor) -> Tensor:
+            if value.shape == wanted[name].shape:
+                return value
+            made = torch.zeros_like(wanted[name])
+            made[:kept] = value[:kept]
+            return made
+
+        out.load_state({k: fitted(k, v) for k, v in self.state().items()})
         return out
 
     def widened(self, num_obs: int, columns: Tensor) -> PolicyBundle:

@@ -31,6 +31,7 @@ from poise.learn.ppo import PPO, UpdateStats
 from poise.learn.protocols import Lessons, Style, VecEnv
 from poise.learn.rollout import Episodes, Rollout, TrainingError, check_finite, collect
 from poise.learn.state import State, load_module, prefixed, take, under
+from poise.machine import one_thread
 from poise.settings import check_data
 
 
@@ -154,6 +155,7 @@ class Trainer:
         )
         self.samples = int(samples)
 
+    @one_thread()
     def iterate(self) -> IterationStats:
         """Collects one batch and learns from it.
 

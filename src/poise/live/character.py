@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.env.goals.led import LOST, REST, WAITS_S
+from poise.env.goals.led import REST, WAITS_S
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.live.passing import Passing
 from poise.live.ways import Way
+from poise.metrics import LOST
 from poise.spatial.directions import facing, heading_angle
 
 #: What a character does.

@@ -21,9 +21,11 @@ from poise.metrics.plausibility import (
 from poise.metrics.posture import LASTING_S, fallen, first_lasting, off_feet
 from poise.metrics.shapes import KINDS, Shapes, centre_of_mass, foot_points, geom_heights, lowest_points
 from poise.metrics.tracking import (
+    LOST,
     RULES,
     SuccessRule,
     acceleration_error,
+    has_lost,
     mpjpe_global,
     mpjpe_pa,
     mpjpe_root,
@@ -35,6 +37,7 @@ from poise.metrics.tracking import (
 __all__ = [
     "KINDS",
     "LASTING_S",
+    "LOST",
     "RULES",
     "HelpAudit",
     "Shapes",
@@ -50,6 +53,7 @@ __all__ = [
     "foot_points",
     "foot_slide",
     "geom_heights",
+    "has_lost",
     "help_audit",
     "jerk",
     "l2p",

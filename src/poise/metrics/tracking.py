@@ -41,6 +41,14 @@ def mpjpe_global(pos: Tensor, ref: Tensor) -> Tensor:
     return (pos - ref).norm(dim=-1).mean(-1) * MM
 
 
+def has_lost(pos: Tensor, ref: Tensor) -> Tensor:
+    """Whether characters have lost their motion: the mean distance of the bodies `(..., B, 3)` m exceeds
+    `LOST`, or is no number; `(...)` bool. The one criterion by which that is judged, while characters
+    act as afterwards."""
+    # Written as "not within" so that NaN counts as lost.
+    return ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
+
+
 def mpjpe_root(pos: Tensor, ref: Tensor, root: int = 0) -> Tensor:
     """MPJPE after each side's own root position is subtracted, mm; returns `(..., T)`.
 
@@ -91,6 +99,10 @@ def acceleration_error(pos: Tensor, ref: Tensor, fps: float = PHC_FPS) -> Tensor
     return torch.diff(pos - ref, n=2, dim=-3).norm(dim=-1).mean(-1) * (MM * (fps / PHC_FPS) ** 2)
 
 
+#: m, the mean distance of the bodies from their reference beyond which a motion is lost.
+LOST = 0.5
+
+
 @dataclass(frozen=True)
 class SuccessRule:
     """A named failure test; an episode succeeds when no frame fails.
@@ -114,7 +126,7 @@ RULES: Mapping[str, SuccessRule] = MappingProxyType(
     {
         r.name: r
         for r in (
-            SuccessRule("phc", "mean", 0.5, "mean over bodies: UHC's and PHC's evaluation"),
+            SuccessRule("phc", "mean", LOST, "mean over bodies: UHC's and PHC's evaluation"),
             SuccessRule("phc_strict", "max", 0.5, "any body: the strict evaluation of PHC's code"),
             SuccessRule("any_25cm", "max", 0.25, "any body: where PHC's code ends training"),
             SuccessRule("rfc_height", "below_min", 0.1, "root height: RFC's code"),

@@ -1,6 +1,7 @@
 """Planning over an environment: experts, trajectory optimisation, sampling-based control."""
 
 from poise.plan.expert import Expert, ExpertConfig, Plan, make_plan
+from poise.plan.guide import Guide
 from poise.plan.lookahead import Lookahead, LookaheadConfig
 from poise.plan.lqr_teacher import LqrTeacher
 from poise.plan.sampling import SamplingConfig, SamplingControl, SamplingResult
@@ -11,6 +12,7 @@ from poise.plan.trajopt_config import Trajectories, TrajOptConfig, TrajOptStats
 __all__ = [
     "Expert",
     "ExpertConfig",
+    "Guide",
     "Lookahead",
     "LookaheadConfig",
     "LookaheadTeacher",

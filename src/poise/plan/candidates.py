@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
-from poise.env.goals.led import LOST
 from poise.env.snapshot import Snapshot
 from poise.env.task import Acts
 from poise.kin.solids import shapes_of
-from poise.metrics import mpjpe_global
+from poise.metrics import has_lost
 from poise.plan.prices import Roughness
 
 #: What each control step costs in which a copy is lost.
@@ -111,8 +110,7 @@ class Candidates:
             aim = env.goal_pose()
             ref_pos.append(aim.pos[own].clone())
             ref_quat.append(aim.quat[own].clone())
-            off = mpjpe_global(pose.pos, aim.pos) / 1000.0
-            lost |= ~(off <= LOST)
+            lost |= has_lost(pose.pos, aim.pos)
             cost, factor = cost - factor * env.imitation + LOSS * lost, factor * self.discount
         cost = cost - factor * self.value(obs)
         self.steps += n * (len(pos) - 1)

@@ -8,42 +8,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
-from poise.control import ExplicitResidual, ImplicitResidual
+from poise.control import ExplicitResidual
 from poise.env.env import ImitationEnv
 from poise.env.reference import Reference
 from poise.errors import PoiseError
 from poise.plan.clearance import ClearanceRule, clearance
+from poise.plan.guide import Guide, Spring
 from poise.plan.inverse_dynamics import ContactRule, InverseDynamics, inverse_dynamics, step_midpoints
-from poise.spatial import heading_quat, quat_conj, quat_mul, quat_rotate, quat_rotate_inv, quat_to_rotvec
+from poise.spatial import heading_quat, quat_rotate_inv
 
 
 @dataclass(frozen=True)
 class ExpertConfig:
-    """How the expert pulls the root along.
-
-    The root's spring has the stiffness m w^2 and the damping 2 z m w for a character of mass m, so that
-    heavy and light characters follow alike; about the root's axes the moment of inertia takes the
-    place of m.
+    """How the expert acts.
 
     Attributes:
-        frequency: rad/s, w of the root's place.
-        damping: z, ratio of critical damping of the root's place.
-        turn_frequency: rad/s, w about the root's axes.
-        turn_damping: z about the root's axes.
+        spring: by which the root is pulled.
         lead: place in a control step from which the joint targets are taken, 0 its begin, 1 its end.
         contacts: which points may carry weight in the inverse dynamics.
         clear: how swinging feet are lifted.
     """
 
-    frequency: float = 5.0
-    damping: float = 0.4
-    turn_frequency: float = 14.0
-    turn_damping: float = 0.1
+    spring: Spring = field(default_factory=Spring)
     lead: float = 0.5
     contacts: ContactRule = field(default_factory=ContactRule)
     clear: ClearanceRule = field(default_factory=ClearanceRule)
@@ -109,14 +99,10 @@ class Expert:
         models = [model, *(h.model for h in env.reference.bodies[1:])]
         self._kp = torch.stack([torch.tensor(m.actuator_gainprm[:, 0]).float() for m in models])
         self._most = torch.stack([torch.tensor(m.actuator_forcerange[:, 1]).float() for m in models])
-        mass, inertia = float(model.body_subtreemass[1]), _turning_inertia(env.reference)
-        c = self.config
-        self._gains = (
-            mass * c.frequency**2,
-            2 * c.damping * mass * c.frequency,
-            inertia * c.turn_frequency**2,
-            2 * c.turn_damping * inertia * c.turn_frequency,
-        )
+        self._guide = None
+        if self._residual is not None:
+            path = self.plan.force_h, self.plan.torque_b
+            self._guide = Guide(env.reference, self._residual, *path, self.config.spring)
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -124,8 +110,9 @@ class Expert:
         env = self.env
         rows = env.reference.rows(env.clip, env.frame)
         joints = self._joints(rows)
-        if self._residual is not None:
-            joints = torch.cat((joints, self._help(rows)), -1)
+        if self._guide is not None:
+            qpos, qvel = env.backend.state.qpos, env.backend.state.qvel
+            joints = torch.cat((joints, self._guide.action(qpos, qvel, env.goal_pose(), rows)), -1)
         return env.unfiltered(joints)
 
     def _joints(self, rows: Tensor) -> Tensor:
@@ -141,55 +128,3 @@ class Expert:
         q, reach = env.backend.state.qpos[:, 7:].float(), self._most[body] / kp
         target = torch.maximum(torch.minimum(target, q + reach), q - reach)
         return env.task.pd.action(target, then)
-
-    def _help(self, rows: Tensor) -> Tensor:
-        """The root wrench as residual action: planned part and spring, cut to the limits."""
-        env, residual = self.env, self._residual
-        state, ref = env.backend.state, env.goal_pose()
-        qpos, qvel = state.qpos[:, :7].float(), state.qvel[:, :6].float()
-        k, d, k_turn, d_turn = self._gains
-        quat, ref_quat = qpos[:, 3:7], ref.qpos[:, 3:7]
-        # F = F_ID + K (p^ - p) + D (v^ - v), world axes
-        force = quat_rotate(ref.heading, self.plan.force_h[rows])
-        force = force + k * (ref.qpos[:, :3] - qpos[:, :3]) + d * (ref.qvel[:, :3] - qvel[:, :3])
-        # T = T_ID + K log(q^-1 q^) + D (w^ - w), the root's axes
-        turn = quat_mul(quat_conj(quat), ref_quat)
-        spin = quat_rotate(turn, ref.qvel[:, 3:6]) - qvel[:, 3:6]
-        torque = (
-            quat_rotate(turn, self.plan.torque_b[rows]) + k_turn * quat_to_rotvec(turn) + d_turn * spin
-        )
-        assert residual is not None
-        explicit = not isinstance(residual, ImplicitResidual)
-        frame = quat if explicit else heading_quat(quat)
-        unit = torch.cat(
-            (
-                _within(quat_rotate_inv(frame, force), residual.limit_n),
-                _within(torque, residual.limit_nm),
-            ),
-            -1,
-        )
-        if not explicit:
-            return unit
-        out = unit.new_zeros(len(unit), residual.dims)
-        at = 9 * residual.bodies.index(0) if isinstance(residual, ExplicitResidual) else 0
-        out[:, at + 3 : at + 9] = unit
-        return out
-
-
-def _within(vector: Tensor, limit: float) -> Tensor:
-    """`vector (N, 3)` in units of the limit, no longer than 1; zero without any help."""
-    if limit == 0.0:
-        return torch.zeros_like(vector)
-    unit = vector / limit
-    return unit / unit.norm(dim=-1, keepdim=True).clamp_min(1.0)
-
-
-def _turning_inertia(reference: Reference) -> float:
-    """Mean moment of inertia of the whole body about the root in the first frame, kg m^2."""
-    model = reference.humanoid.model
-    data = mujoco.MjData(model)
-    data.qpos[:] = reference.qpos[0].numpy()
-    mujoco.mj_forward(model, data)
-    mass = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, mass)
-    return float(np.trace(mass[3:6, 3:6])) / 3

@@ -29,6 +29,7 @@ from poise.env.env import ImitationEnv
 from poise.env.snapshot import Snapshot
 from poise.env.task import Acts
 from poise.errors import PoiseError
+from poise.machine import one_thread
 from poise.plan.candidates import Candidates, Changes
 from poise.plan.sampling import draw_offsets
 
@@ -224,6 +225,7 @@ class Lookahead:
         """Width of the actions that the policy gives."""
         return getattr(self.policy, "num_actions", self.copies.num_actions)
 
+    @one_thread()
     def act(self, obs: Tensor) -> Tensor:
         """Actions `(N, A)` for observations `(N, O)` of the worlds as they stand.
 

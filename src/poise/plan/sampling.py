@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from poise.env.env import ImitationEnv
-from poise.env.goals.led import LOST
 from poise.env.task import Acts
 from poise.errors import PoiseError
-from poise.metrics import mpjpe_global
+from poise.machine import one_thread
+from poise.metrics import has_lost, mpjpe_global
 
 
 @dataclass(frozen=True)
@@ -169,6 +169,7 @@ class SamplingControl:
         self.tries, self.scale = 0, 1.0
         self.offsets = torch.zeros(self.last, env.num_actions)
 
+    @one_thread()
     def run(self, show: Callable[[int, int], None] | None = None) -> SamplingResult:
         """Samples from the first frame to the last. show: is told of steps done and all steps."""
         rounds, best = self.config.rounds, None
@@ -240,7 +241,7 @@ class SamplingControl:
             obs = env.step(made[-1]).final_obs
             ref = env.goal_pose().pos
             off = mpjpe_global(env.pose().pos, ref) / 1000.0
-            lost |= ~(off <= LOST)
+            lost |= has_lost(env.pose().pos, ref)
             cost, error = cost - env.imitation, error + off
             if self.value is None:
                 cost = cost + c.distance * off

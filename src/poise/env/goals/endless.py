@@ -10,11 +10,12 @@ from torch import Tensor
 
 from poise.body import Humanoid
 from poise.env.goals.generator import GeneratorGoal, MotionGenerator
-from poise.env.goals.led import FALLS, LOST, REST, RETURNS, TRACKS, WAITS_S
+from poise.env.goals.led import FALLS, REST, RETURNS, TRACKS, WAITS_S
 from poise.env.goals.steering import REACHED, Steering, cost_of
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.entry import way_to_stand
 from poise.env.recovery.get_up import GetUpPlanner
+from poise.metrics import has_lost
 
 
 class EndlessGoal(GeneratorGoal):
@@ -156,7 +157,7 @@ class EndlessGoal(GeneratorGoal):
         self._see(qpos)
         falling, returning = self.doing == FALLS, self.doing == RETURNS
         ref = self.layout.unpacked(self.now()).pos
-        off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
+        off = has_lost(pos, ref)
         up = returning & ~off & (self.at >= self._until)
         for i in up.nonzero().squeeze(-1).tolist():
             self.back.append((i, int(self.steps[i])))

@@ -21,9 +21,8 @@ from poise.env.recovery.clips import RecoveryClips
 from poise.env.recovery.entry import entry, way_into
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.reference import Reference
+from poise.metrics import has_lost
 
-#: m between bodies and their reference, on average, beyond which it is lost; the field's failure.
-LOST = 0.5
 #: m/s of the bodies on average, below which a character has come to rest; s for which that is waited.
 REST, WAITS_S = 0.5, 1.5
 #: m between bodies and the first frame of the next clip, on average, with which that goes on at once.
@@ -35,7 +34,7 @@ TRACKS, FALLS, RETURNS = 0, 1, 2
 class LedGoal(Goal):
     """Worlds follow their clips, and recovery motions back to them where they are lost.
 
-    The clip waits for a character that has lost it (`LOST`). Once the character has come to rest it
+    The clip waits for a character that has lost it (`metrics.has_lost`). Once that has come to rest it
     follows a recovery motion to a frame of its clip in which it hardly moves and nearly stands, and goes
     on from there. A character that loses the recovery motion gets another one.
 
@@ -164,7 +163,7 @@ class LedGoal(Goal):
         tracks, falls, returns = (self.doing == k for k in (TRACKS, FALLS, RETURNS))
         self.frame[tracks] = self.at[tracks]
         ref = self.layout.unpacked(self.now()).pos
-        off = ~((pos - ref).norm(dim=-1).mean(-1) <= LOST)
+        off = has_lost(pos, ref)
         lost = off & (returns | (tracks & self.returns))
         self._vain[returns & off] += 1
         self.lost += [(i, int(self.frame[i])) for i in (lost & tracks).nonzero().squeeze(-1).tolist()]

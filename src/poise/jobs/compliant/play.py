@@ -34,7 +34,8 @@ from poise.jobs.deliver import make_report, simulated_clip
 from poise.jobs.open import open_run
 from poise.jobs.runs import Evaluation, scored
 from poise.jobs.track import imitation_of
-from poise.jobs.track.controllers import RULE, look_ahead
+from poise.jobs.track.best import RULE
+from poise.jobs.track.controllers import look_ahead
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip

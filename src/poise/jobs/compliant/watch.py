@@ -15,7 +15,7 @@ from poise.env.goals import DisplacedGoal
 from poise.env.plugins import Felt, Plugin
 from poise.eval.rolloutset import RolloutSet, judge
 from poise.jobs.compliant.meters import Meter
-from poise.jobs.track.controllers import RULE
+from poise.jobs.track.best import RULE
 from poise.kin import lowest_height
 from poise.metrics import success_rule
 from poise.recipes.imitation import Imitation

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from poise.eval.card import NO_HELP
 from poise.jobs.endless.config import Dream
 from poise.jobs.endless.figures import Figures
 from poise.jobs.endless.frames import PIECE, Body, FrameStore
@@ -135,15 +136,20 @@ class Dreamt(Result):
         def times(found: tuple[tuple[int, float], ...]) -> list[dict[str, float]]:
             return [{"character": i, "seconds": round(t, 3)} for i, t in found]
 
+        # A figure has the name that it has in every score card.
+        figures = {
+            kind: {"jerk" if k == "jerk_m_per_s3" else k: v for k, v in found.items()}
+            for kind, found in self.figures.items()
+        }
         return {
-            "kind": "dream", "poise": __version__, "seconds": self.seconds,
+            "kind": "dream", "version": __version__, "seconds": self.seconds,
             "characters": len(self.characters), "sentence": self.sentence,
             "seed": self.config.seed, "temperature": self.config.temperature,
             "controller": self.config.controller, "recover": self.config.recover,
-            "past": self.config.past, "style": self.config.style, "help_n": 0.0,
+            "past": self.config.past, "style": self.config.style, "help": asdict(NO_HELP),
             "falls": times(self.lost), "back": times(self.back), "reached": times(self.reached),
             "falls_per_hour": round(self.falls_per_hour, 2), "stayed_down": self.stayed_down,
-            **self.figures,
+            **figures,
         }  # fmt: skip
 
     def write(self, folder: Path) -> dict[str, Path]:

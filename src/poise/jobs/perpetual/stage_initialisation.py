@@ -59,7 +59,7 @@ def begin_first(
         env = own.env(1, threads=1)
         env.close()
         start = trained if isinstance(trained, WarmStart) else WarmStart(trained)
-        policy = start.policy.first_actions(env.num_actions).clipped(own.ppo().obs_clip)
+        policy = start.policy.with_actions(env.num_actions).clipped(own.ppo().obs_clip)
         start = replace(start, policy=policy)
         if not config.recovery:
             return stage, start
@@ -243,9 +243,9 @@ def staged(imitation: Imitation, stage: Stage) -> Imitation:
     task = stage_task(
         imitation.config, imitation.humanoid, None if imitation.recovery_clips else stage.recovers
     )
-    own = replace(imitation, task=task)
+    own = replace(imitation, task=replace(task, guide=imitation.task.guide))
     helped = stage.kind != "composer" and not stage.recovers
-    return own if helped else replace(own, task=replace(task, help=None))
+    return own if helped else replace(own, task=replace(own.task, help=None))
 
 
 def clone_config(imitation: Imitation) -> CloneConfig:

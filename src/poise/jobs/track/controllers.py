@@ -16,15 +16,16 @@ from poise.eval.contact_forces import ContactForces
 from poise.eval.episodes import Recording
 from poise.eval.rolloutset import Judged, RolloutSet, judge
 from poise.jobs.perpetual.evaluation import evaluate_clips
+from poise.jobs.track.best import RULE, merit
 from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import Placed
 from poise.jobs.track.pushed import Pushed, PushSeen, unforeseen
 from poise.jobs.track.recovering import Led, led_along
-from poise.jobs.track.searching import Replay, look_for, replay, sentence
+from poise.jobs.track.searching import Replay, look_for, replay
 from poise.jobs.track.simulation import Simulation, States
 from poise.jobs.tracker import Tracker
-from poise.metrics import mpjpe_global, success_rule
-from poise.plan import Lookahead, LookaheadConfig, SamplingResult
+from poise.metrics import has_lost, success_rule
+from poise.plan import Lookahead, LookaheadConfig, SamplingConfig, SamplingResult
 from poise.recipes.imitation import Imitation
 
 if TYPE_CHECKING:
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
 #: Is told what is done, and how many control steps of how many are done.
 Show = Callable[[str, int, int], None]
-#: Which failure ends tracking: a mean distance of 0.5 m.
-RULE = "phc"
 #: What is said where a policy cannot look ahead.
 NO_CRITIC = "The policy was saved without its critic, which lookahead needs; it acts without."
 
@@ -98,11 +97,32 @@ def done_by(
         how = replace(config.search, seed=config.seed)
         told = show and (lambda made, steps: show("searching", made, steps))
         found = look_for(tracker, imitation, how, 0, config.threads, told)
-        notes.append(sentence(found, how, imitation.reference.rate_hz))
-        if found.reached > done.failures[0][1]:
-            done = episode(imitation, config, replay(found, tracker.policy), "search")
+        # What was found is judged as it is played again, as the score card does.
+        again = episode(imitation, config, replay(found, tracker.policy), "search")
+        done, earlier = max(done, again, key=lambda x: merit(x.rollouts)), done
+        notes.append(searched(again, earlier, done, found, how, imitation.reference.rate_hz))
         done = done._replace(found=found)
     return done, notes
+
+
+def searched(
+    again: Done, earlier: Done, kept: Done, found: SamplingResult, config: SamplingConfig, rate_hz: float
+) -> str:
+    """What a search came to, and what is kept of it.
+
+    Args:
+        again: what was found, played again. earlier: what was done before it. kept: one of the two.
+    """
+    said = (
+        f"The motion was lost; {config.characters} characters looked for it, {found.tries:,} control "
+        "steps, without help, and"
+    )
+    if not again.failures:
+        return f"{said} found it to its end."
+    came, by = (f"{d.failures[0][1] / rate_hz:.1f} s" for d in (again, earlier))
+    if kept is again:
+        return f"{said} came as far as {came}."
+    return f"{said} came as far as {came}; what was done before came to {by} and is kept."
 
 
 def led_by(
@@ -220,12 +240,11 @@ class Keeper:
         sizes = (getattr(policy, name, getattr(env, name)) for name in ("num_obs", "num_actions"))
         self.num_obs, self.num_actions = sizes
         self.fallen: list[tuple[int, int]] = []
-        self._limit_mm = success_rule(RULE).limit_m * 1000.0
 
     def act(self, obs: Tensor) -> Tensor:
         """Mean actions `(N, A)` for observations `(N, O)` of the worlds as they stand."""
         env = self.env
-        failed = ~(mpjpe_global(env.pose().pos, env.goal_pose().pos) <= self._limit_mm)
+        failed = has_lost(env.pose().pos, env.goal_pose().pos)
         if bool(failed.any()):
             obs = self._mend(env, failed, obs)
         return self.policy.act(obs)

@@ -19,9 +19,11 @@ from poise.eval.rolloutset import judge
 from poise.jobs.perpetual.result import PerpetualResult
 from poise.jobs.perpetual.run import begin, going_on, train
 from poise.jobs.perpetual.stage_order import Progress
-from poise.jobs.run_file import read_run
+from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
-from poise.jobs.track.controllers import RULE
+from poise.jobs.track.best import RULE
+from poise.jobs.track.helping import GRAVITY, SHARES, enough, helped, with_guide
+from poise.jobs.track.helping import STARTS as ENOUGH_STARTS
 from poise.jobs.track.missing import needs_of
 from poise.jobs.track.placement import Placed, place
 from poise.jobs.track.supports import Wanted, with_supports
@@ -34,12 +36,15 @@ from poise.learn import LATEST, Until
 from poise.metrics import success_rule
 from poise.motion import Clip, ClipLibrary
 from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual.config import config_of
 
 #: Worlds, samples of a gradient step, and iterations from one evaluation to the next: a motion of
 #: seconds has fewer hard motion bins than a library.
 WORLDS, MINIBATCH, EVERY = 512, 2048, 5
 #: Step size, which stays: one that follows the KL divergence shrinks where much is to be learned.
 STEP = 1e-4
+#: Shares of the help that a policy learned with, of which the least is left that suffices.
+LEFT = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 #: Evaluations without success after which training would end by itself.
 NEVER = 1_000_000
 
@@ -73,6 +78,7 @@ def learn(
     starts: int = 1,
     device: str = "cpu",
     supports: Wanted = "auto",
+    help_n: float = 0.0,
 ) -> Learned:
     """Trains until the motion is tracked from its first frame to its last, or a limit is reached.
 
@@ -81,18 +87,22 @@ def learn(
         on_iteration, threads, device: see `perpetual.run.train`.
         starts: the motion is to be tracked from so many frames, evenly spread, see `Perpetual.starts`.
         supports: see `TrackConfig`.
+        help_n: N and N m, with which a hand leads the root at first, see `helping`; a run that is gone
+            on with has its own.
 
     Raises:
         PoiseError: a policy of primitives, which cannot go on, or a folder with another run.
     """
     clip = placed.level.onto(clean_clip(placed.clip)[0]).replaced(cyclic=False)
+    held = help_of(folder) if (folder / RUN_FILE).exists() else help_n
     config = settings(tracker.config, seed, starts)
+    config = helped(config, held) if held else config
     imitation = begin(folder, ClipLibrary.of(clip), config, clip.name, device, tracker)
     # Exactly what `track` will ask of the policy, on the same body.
     body, rate = imitation.humanoid, config.sim.control_hz
     qpos = place(placed.source, replace(tracker, humanoid=body)).qpos
     imitation = replace(imitation, reference=Reference(body, [qpos], rate, imitation.library.names))
-    imitation = with_supports(imitation, supports, placed)[1]
+    imitation = with_guide(with_supports(imitation, supports, placed)[1])
     # The critic goes on as well: it knows what a state is worth.
     trained = None if (folder / LATEST).exists() else widened(tracker, imitation, 0)
     result = train(imitation, folder, until, on_iteration, threads, False, device, trained=trained)
@@ -102,17 +112,42 @@ def learn(
     return Learned(learned, result)
 
 
-def from_every_start(tracker: Tracker, source: Clip, device: str = "cpu") -> Tracked:
+def help_of(folder: Path) -> float:
+    """The help with which the run in a folder began, N and N m; 0 without any."""
+    return config_of(read_run(folder).meta["config"], folder).help_start
+
+
+def help_wanted(tracker: Tracker, placed: Placed, seed: int = 0, threads: int = 0) -> float | None:
+    """The least of some amounts of help, N, with which the policy does a motion from all over; None
+    where none suffices."""
+    config = settings(tracker.config, seed)
+    for share in SHARES:
+        newtons = share * GRAVITY * tracker.humanoid.mass
+        own = replace(tracker, config=helped(config, newtons), recovery_clips=None)
+        task = with_guide(with_supports(imitation_of(own, [placed]), "auto", placed)[1])
+        dims = 0 if task.task.residual is None else task.task.residual.dims
+        policy = tracker.policy.with_actions(tracker.policy.num_actions + dims)
+        if enough(task, policy, (1.0,), ENOUGH_STARTS, threads):
+            return newtons
+    return None
+
+
+def from_every_start(
+    tracker: Tracker, source: Clip, device: str = "cpu", help_n: float = 0.0
+) -> Tracked:
     """A motion as the policy alone does it from every start frame: `Tracked.card` is that of all.
 
     The failures are those of the episode from the first frame, which is the motion that is delivered.
+
+    help_n: N and N m that a hand may lead the root with, for a policy that learned with such help.
 
     Raises:
         PoiseError: see `place`.
     """
     placed = place(source, tracker)
     supports, task = with_supports(imitation_of(tracker, [placed]), "auto", placed)
-    done = evaluate(task, tracker.policy, {**tracker.about, "help_limit": 0.0}, device=device)
+    task = with_guide(task) if help_n else task
+    done = evaluate(task, tracker.policy, {**tracker.about, "help_limit": help_n}, device=device)
     done = replace(
         done, card=replace(done.card, needs=tuple(n.to_dict() for n in needs_of(task, supports)))
     )
@@ -120,3 +155,12 @@ def from_every_start(tracker: Tracker, source: Clip, device: str = "cpu") -> Tra
     lost = ((0, failed / task.reference.rate_hz),) if failed >= 0 else ()
     notes = (*placed.notes, *(s.sentence() for s in supports))
     return Tracked(tracker, task, done, placed, lost, None, notes, supports=supports)
+
+
+def with_help(tracker: Tracker, source: Clip, device: str = "cpu") -> Tracked | None:
+    """The same with the least of some shares of the help that the policy learned with, by which it does
+    the motion from its first frame; None where none suffices."""
+    placed, most = place(source, tracker), tracker.config.help_start
+    task = with_guide(with_supports(imitation_of(tracker, [placed]), "auto", placed)[1])
+    found = enough(task, tracker.policy, LEFT, 1)
+    return None if found is None else from_every_start(tracker, source, device, found[0] * most)

@@ -19,11 +19,12 @@ from poise.env.recovery.get_up import mixed
 from poise.errors import PoiseError
 from poise.eval import simulate
 from poise.eval.rolloutset import judge
+from poise.jobs.track.best import RULE
 from poise.jobs.track.config import TrackConfig
-from poise.jobs.track.controllers import RULE, Done, Show, Told, episode, look_ahead
+from poise.jobs.track.controllers import Done, Show, Told, episode, look_ahead
 from poise.jobs.track.simulation import Retake, Simulation, States
 from poise.jobs.tracker import Tracker
-from poise.metrics import mpjpe_global, success_rule
+from poise.metrics import has_lost, mpjpe_global, success_rule
 from poise.plan import Lookahead
 from poise.plan.lookahead import PAST
 from poise.recipes.imitation import Imitation
@@ -197,8 +198,8 @@ class _Lost:
 
     def see(self, env: ImitationEnv, step: int) -> bool:
         """Looks at control step `step`; True: it is lost."""
-        off = mpjpe_global(env.pose().pos, env.goal_pose().pos)
-        if self.frame is None and not bool((off <= success_rule(RULE).limit_m * 1000.0).all()):
+        lost = has_lost(env.pose().pos, env.goal_pose().pos)
+        if self.frame is None and bool(lost.any()):
             self.frame = self.first + step
         return self.frame is not None
 

@@ -53,15 +53,6 @@ def look_for(
         env.close()
 
 
-def sentence(found: SamplingResult, config: SamplingConfig, rate_hz: float) -> str:
-    """What the search came to."""
-    much = f"{config.characters} characters looked for it, {found.tries:,} control steps, without help"
-    if found.whole:
-        return f"The motion was lost; {much}, and found it to its end."
-    at = found.reached / rate_hz
-    return f"The motion was lost; {much}, and came as far as {at:.1f} s."
-
-
 def replay(found: SamplingResult, policy: Acts) -> Replay:
     """Does what was found, and from where it was lost what the policy does."""
     return Replay(found.actions[: found.reached].clone(), policy)

@@ -14,6 +14,7 @@ from poise.jobs.deliver import Delivery, as_high_as_source, deliver, finished, s
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
 from poise.jobs.settled import settled
+from poise.jobs.track.best import Merit, merit
 from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
@@ -66,7 +67,8 @@ class Tracked(Result):
     the motion to rest on, in the world of the body. pins: limbs that stay put. simulation: the states of
     a single character on a single clip, of which a part can be simulated anew (`Retake`). pushed: what
     came of a push; None without one. undirected: the motion before pins and touch points led it; None
-    without any. retake: the part that was simulated anew; None where all was simulated.
+    without any. retake: the part that was simulated anew; None where all was simulated. doubts: the
+    notes that say that its frame rate is likely wrong, which come before all else where it is lost.
     """
 
     tracker: Tracker
@@ -86,11 +88,17 @@ class Tracked(Result):
     pushed: Pushed | None = None
     undirected: Clip | None = None
     retake: Retake | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def failed_s(self) -> tuple[float, ...]:
         """Seconds at which the first character failed."""
         return tuple(t for character, t in self.failures if character == 0)
+
+    @cached_property
+    def merit(self) -> Merit:
+        """How good the motion is that is kept, among other attempts at it."""
+        return merit(self.evaluation.rollouts, self.evaluation.recordings[0].row)
 
     @cached_property
     def card(self) -> ScoreCard:

@@ -20,8 +20,9 @@ from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
+from poise.jobs.track.best import RULE
 from poise.jobs.track.config import TrackConfig
-from poise.jobs.track.controllers import RULE, Show, done_by, led_by
+from poise.jobs.track.controllers import Show, done_by, led_by
 from poise.jobs.track.crowd import places
 from poise.jobs.track.missing import needs_of
 from poise.jobs.track.parts import Span, cut, parts_of, with_parts
@@ -35,7 +36,7 @@ from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
 from poise.kin.supports import Support
-from poise.metrics import mpjpe_global, success_rule
+from poise.metrics import has_lost, mpjpe_global
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
@@ -139,10 +140,11 @@ def track(
         assert config.push is not None
         notes += [done.pushed.sentence(), *config.push.yields.notes, GOAL_YIELDS]
     elif not several and config.retake is None:
-        notes += rate_notes(
+        said = rate_notes(
             tracker, given, placed.report.clips[0].flights,
             lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
         )  # fmt: skip
+        notes, doubts = [*notes, *said], [*doubts, *said]
     rollouts, frames = done.rollouts, done.failures
     about, rate = tracker.about, imitation.reference.rate_hz
     suffix = {"policy": "", "lookahead": ", lookahead", "search": ", searched"}[done.controller]
@@ -173,7 +175,7 @@ def track(
         tracker, imitation, evaluation, placed, times, clean, tuple(notes), losses, done.found,
         done.controller, parts, supports, config.direction.pins,
         None if several or config.recover else done.simulation, done.pushed,
-        undirected if config.direction else None, config.retake,
+        undirected if config.direction else None, config.retake, tuple(doubts),
     )  # fmt: skip
 
 
@@ -251,5 +253,5 @@ def _beside_clean(
     frames = min(len(pos), len(sim), len(noisy))
     pos, sim, noisy, kept = pos[:frames], sim[:frames], noisy[:frames], judged[:frames]
     off = mpjpe_global(sim, pos)
-    won = bool((off <= success_rule(RULE).limit_m * 1000.0).all())
+    won = not bool(has_lost(sim, pos).any())
     return Clean(float(mpjpe_global(noisy, pos).mean()), float(off[kept].mean()), won)
