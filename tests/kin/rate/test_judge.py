@@ -62,6 +62,11 @@ def test_a_rest_frame_that_jumps_is_no_fall() -> None:
     path = clip.root_pos.copy()
     path[:3] += (3.0, 1.0, 1.2)
     assert judge_rate(clip.replaced(root_pos=path)).likely is None
+    for fps in (30.0, 120.0):
+        still = played(walk(fps), 0.2)
+        path = still.root_pos.copy()
+        path[30:75] += (0.0, 0.0, 0.6)
+        assert judge_rate(still.replaced(root_pos=path, fps=fps)).likely is None
 
 
 def test_too_few_frames_and_no_human_are_not_judged() -> None:

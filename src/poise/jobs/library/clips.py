@@ -101,12 +101,13 @@ class Target:
 
 class Taken(NamedTuple):
     """A clip that was read and cleaned, at the library's rate, with its file and repairs, and the doubt
-    about the file's own rate in words."""
+    about the file's own rate in words. obeyed: the rate is one that the user stated."""
 
     file: MotionFile
     clip: Clip
     repairs: tuple[str, ...]
     doubt: str | None
+    obeyed: bool
 
 
 def read_all(
@@ -161,7 +162,8 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
     word = _telling_word(file.name, config.words)
     if word and not matches(config.keep, file.name, file.subject):
         return replace(note, rule="word", reason=f"its name says '{word}'")
-    return Taken(file, resampled, tuple(report.sentences()), judge_rate(clip).sentence())
+    doubt, obeyed = judge_rate(clip).sentence(), _stated(config.rates, file.name) is not None
+    return Taken(file, resampled, tuple(report.sentences()), doubt, obeyed)
 
 
 def _stated(pairs: Sequence[tuple[str, _T]], name: str) -> _T | None:
@@ -248,7 +250,9 @@ def place(
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
     note = replace(note, lift_m=on.ground.lift_m)
-    if taken.doubt and not keep:
+    if taken.doubt and taken.obeyed:
+        note = replace(note, notes=(*note.notes, taken.doubt))
+    elif taken.doubt and not keep:
         reason = taken.doubt.partition(";")[0]
         return None, replace(note, rule="rate", reason=reason[0].lower() + reason[1:])
     return _alone(clip, target, note, config, keep)

@@ -19,6 +19,7 @@ from poise.kin.flight import Flight, find_flights
 from poise.kin.series import find_runs
 from poise.kin.solids import centre_of_mass, poses_of
 from poise.motion import Clip
+from poise.motion.io.guess import root_jumps
 from poise.spatial import GRAVITY
 
 #: Parts lower than this (m) above the floor may bear weight; a balance point beyond them by more than
@@ -31,6 +32,8 @@ PULLED = 2.0
 #: Standing feet that slip by more than this share of the way past them tell no travel: a motion in
 #: place, or one that is not on its feet.
 IN_PLACE = 0.4
+#: Time (s) around a jump of the root's path that is no evidence.
+JUMP_S = 0.15
 #: A foot leads when it is ahead by this share of the leg's length.
 LEADS = 0.12
 
@@ -64,7 +67,13 @@ class Moved:
         self.low: np.ndarray = points[..., 2].min(-1)
         self.floor = float(np.quantile(self.low, 0.1))
         bears = points[..., 2] < self.floor + BEAR_M
-        self.touches = np.asarray(bears.any(-1))
+        # A path that jumps, as from a rest pose, falls and tips without any speed.
+        whole = np.ones(clip.frames, dtype=bool)
+        reach = math.ceil(JUMP_S * clip.fps)
+        for frame, _ in root_jumps(clip.root_pos, clip.fps):
+            whole[max(0, frame - reach) : frame + reach] = False
+        self._whole = whole
+        self._touches = np.asarray(bears.any(-1)) & whole
         self._reach = hull_reach(points[..., :2], bears)
 
     @cached_property
@@ -78,13 +87,13 @@ class Moved:
         above = self.com - np.array([0.0, 0.0, self.floor])
         point, _ = balance_point(above, self.fps * share, BALANCE_S)
         out = beyond_reach(self._reach, point) > BEYOND_M
-        return float((out & self.touches).sum() / max(1, self.touches.sum()))
+        return float((out & self._touches).sum() / max(1, self._touches.sum()))
 
     def pulled(self, share: float) -> tuple[float, int]:
         """Share of the frames, and the number of spells, in which the body falls with `PULLED` times
         gravity or more, at `share` of the clip's rate."""
         _, weight = balance_point(self.com, self.fps * share, FALL_S)
-        bad = weight < 1.0 - PULLED
+        bad = (weight < 1.0 - PULLED) & self._whole
         return float(bad.mean()), len(find_runs(bad, 1))
 
     @cached_property
