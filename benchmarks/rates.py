@@ -66,8 +66,8 @@ def takes_of(path: Path) -> list[str | None]:
     return [str(k) for k in range(30)] if "mdm_results" in path.name else [None]
 
 
-def clips(data: Path, also: list[tuple[Path, Path]]) -> Iterator[tuple[str, Clip]]:
-    """Every motion of a folder, by its path there."""
+def clips(data: Path, also: list[tuple[Path, Path]], done: set[str]) -> Iterator[tuple[str, Clip]]:
+    """Every motion of a folder that is not done, by its path there."""
     for path in sorted(p for p in data.rglob("*") if p.is_file()):
         name = path.relative_to(data).as_posix()
         if "malformed" in name or path.suffix in (".json", ".tsv", ".asf", ".csv", ".h5", ""):
@@ -77,12 +77,15 @@ def clips(data: Path, also: list[tuple[Path, Path]]) -> Iterator[tuple[str, Clip
             skeleton = data / "cmu_amc/rfc/08.asf" if "/rfc/" in name else None
             skeleton = data / "cmu_amc/01/01.asf" if "cmu_hard" in name else skeleton
         for take in takes_of(path):
+            own = name if take is None else f"{name}#{take}"
+            if own in done:
+                continue
             try:
                 clip = read_clip(path, skeleton=skeleton, take=take, allow_pickle=True)
             except PoiseError:
                 continue
-            yield name if take is None else f"{name}#{take}", clip
-    for path, skeleton in also:
+            yield own, clip
+    for path, skeleton in (pair for pair in also if pair[0].name not in done):
         yield path.name, read_clip(path, skeleton=skeleton)
 
 
@@ -201,9 +204,7 @@ def main() -> None:
     if a.raw is not None and a.raw.exists():
         rows = [json.loads(line) for line in a.raw.read_text("utf-8").splitlines()]
     done = {r["clip"] for r in rows}
-    for name, clip in clips(a.data, also):
-        if name in done:
-            continue
+    for name, clip in clips(a.data, also, done):
         rows.append(judged(name, clip))
         if a.raw is not None:
             with a.raw.open("a", encoding="utf-8") as file:
