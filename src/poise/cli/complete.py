@@ -100,6 +100,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         return _kinematic(o, keys)
     out, motion = places(o.out)
     may_deliver(out, motion, o.force, o.clip)
+    from poise.cli.track import telling
     from poise.jobs.complete import complete
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig
@@ -122,10 +123,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
     with claimed(out):
+        said_early = list[str]()
         with contextlib.ExitStack() as shown:
             done = complete(
                 clip, keys, tracker, config, model=o.model, adapt=o.adapt, retime=o.retime, times=times,
-                partial=partial, progress=staged(shown),
+                partial=partial, progress=staged(shown), warn=telling(said_early),
             )  # fmt: skip
         with working("writing"):
             delivered = done.write(out, motion, o.hold_feet)
@@ -146,7 +148,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     }
     word = "lost" if lost else "completed"
     told = (*done.notes, *delivered.notes)
-    return Answer(result, delivered.paths, told, LOST if lost else 0, word, delivered.card.mpjpe_mm)
+    code, error, early = LOST if lost else 0, delivered.card.mpjpe_mm, tuple(said_early)
+    return Answer(result, delivered.paths, told, code, word, error, early)
 
 
 def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:
