@@ -50,7 +50,8 @@ KINDS = (
 CHOSEN = re.compile(r"cmu_amc/|cmu_bvh/acrnn|deepmimic_txt|88_01")
 #: Of the shipped tracker's library: what is in FOLDER, and at which rates it was learned.
 LIBRARY = re.compile(
-    r"cmu_amc/(01|02|06|07|10|35|rfc)/(?!05)|cmu_bvh/(ad/(?!14_14)|acrnn)|deepmimic_txt/(?!sie)"
+    r"cmu_amc/(01|02|06|07|10|35|rfc)/(?!05)|cmu_bvh/(ad/(?!14_14)|acrnn_(indian|martial)"
+    r"|acrnn_salsa/(?!11|13|14|26|28|29))|deepmimic_txt/(?!sie)"
 )
 LEARNED = ((r"90_(02|08|11)\.amc", 60.0), (r"salsa", 60.0))
 TIMES = {"right": 1.0, "double": 2.0, "half": 0.5}
@@ -147,7 +148,7 @@ def figures(rows: list[dict[str, Any]]) -> list[tuple[str, str, float | str, int
                     1,
                 )
             )
-    learned = [r for r in human if "learned" in r]
+    learned = [r for r in human if LIBRARY.search(r["clip"])]
     wrong = [r for r in learned if r["learned"]["likely"] is not None]
     out.append(("tracker's library", "clips judged", len(learned), len(learned)))
     out.append(
