@@ -18,7 +18,7 @@ import torch
 from poise.body import BodyTable, find_anatomy, generate_table
 from poise.kin import Kinematics, clean_clip, clip_to_qpos, fit_humanoid, lowest_height
 from poise.kin.doctor.flips import out_of_reach
-from poise.kin.flight import clear_fall, find_flights, likely_rate
+from poise.kin.flight import find_flights
 from poise.kin.solids import centre_of_mass
 from poise.motion import Clip, read_clip, resample
 from poise.spatial import quat_angle, quat_conj, quat_mul
@@ -109,8 +109,8 @@ def compare(clip: Clip) -> dict:
         "after": _rounded(after),
         "turned_back": sum(f.stop - f.start + 1 for f in report.clips[0].clean.flips),
         "slowed": sum(s.stop - s.start + 1 for s in report.clips[0].clean.speeds),
-        "fall": clear_fall(report.clips[0].flights),
-        "likely_fps": likely_rate(report.clips[0].flights, clip.fps),
+        "fall": report.clips[0].rate.fall,
+        "likely_fps": report.clips[0].rate.likely,
         "fps": clip.fps,
         "frames": clip.frames,
     }

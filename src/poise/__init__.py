@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from poise.jobs.open import Run, open_run
     from poise.jobs.push import push
     from poise.jobs.track import TrackConfig, Tracked, track
+    from poise.kin.rate.reading import read_clip as read
     from poise.motion import Clip, ClipLibrary
-    from poise.motion import read_clip as read
     from poise.motion import write_clip as write
     from poise.recipes import ResidualForce
     from poise.recipes.perpetual import Perpetual
@@ -60,7 +60,7 @@ _PLACES = {
     "inbetween": "poise.jobs.inbetween.fill",
     "open_run": "poise.jobs.open",
     "push": "poise.jobs.push",
-    "read": "poise.motion:read_clip",
+    "read": "poise.kin.rate.reading:read_clip",
     "track": "poise.jobs.track",
     "write": "poise.motion:write_clip",
 }

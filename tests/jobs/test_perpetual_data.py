@@ -255,20 +255,27 @@ def test_real_clips(data_dir: Path, tmp_path: Path) -> None:
     files = ["cmu_amc/02/02_01.amc", "cmu_amc/02/02_03.amc", "cmu_amc/rfc/90_11.amc"]
     files += ["cmu_bvh/ad/dance001.bvh", "deepmimic_txt/humanoid3d_crawl.txt"]
     files += ["deepmimic_txt/humanoid3d_backflip.txt", "deepmimic_txt/humanoid3d_getup_faceup.txt"]
+    files += ["cmu_bvh/acrnn_salsa/12.bvh"]
     config = LibraryConfig(skeletons=(("90_", asf),))
     paths = [data_dir / f for f in files]
     onto = data_dir / "cmu_amc/02/02_01.amc"
     library, report = library_of(paths, onto=onto, config=config)
     assert report.count("left out") == 1
-    assert report.clips[2].name.endswith("rfc-90_11") and report.clips[2].rule == "rate"
-    assert "60 frames per second, not 120" in report.clips[2].reason
-    # Rolls, crawls, flips and getting up touch the floor or fall: nothing is cut.
-    assert report.count("cut") == 0 and len(library) == 6
-    assert split(library, ["cmu 02"]).test.names[0].endswith("cmu_amc-02-02_01")
-    # With the rate stated, the handspring is taken.
-    stated = LibraryConfig(skeletons=(("90_", asf),), rates=(("90_11", 60.0),))
-    (hand,), _ = library_of(paths[2:3], onto=onto, config=stated)
+    # An AMC file states no rate: the likely one is taken. A BVH file does.
+    hand, salsa = (next(c for c in report.clips if n in c.name) for n in ("90_11", "salsa"))
+    assert hand.name.endswith("rfc-90_11") and hand.state == "kept"
+    assert any("60 frames per second taken, not 120" in n for n in hand.notes)
     assert hand.seconds == pytest.approx(179 / 60, abs=0.04)
+    assert salsa.name.endswith("salsa-12") and salsa.rule == "rate"
+    assert "60 frames per second, not 120" in salsa.reason
+    # Rolls, crawls, flips and getting up touch the floor or fall: nothing is cut.
+    assert report.count("cut") == 0 and len(library) == 7
+    assert split(library, ["cmu 02"]).test.names[0].endswith("cmu_amc-02-02_01")
+    # A stated rate is obeyed, and the doubt told.
+    stated = LibraryConfig(skeletons=(("90_", asf),), rates=(("90_11", 120.0),))
+    (fast,), report = library_of(paths[2:3], onto=onto, config=stated)
+    assert fast.seconds == pytest.approx(179 / 120, abs=0.04)
+    assert any("60 frames per second, not 120" in n for n in report.clips[0].notes)
 
 
 def test_feet_that_a_humanoid_turns_otherwise_stand_on_the_floor(data_dir: Path) -> None:
@@ -299,7 +306,9 @@ def test_feet_are_turned_only_where_motion_is_simulated(data_dir: Path) -> None:
 
 def test_a_partner_is_missed(data_dir: Path) -> None:
     path = data_dir / "cmu_bvh/acrnn_salsa/01.bvh"
-    library, report = library_of([path], onto=data_dir / "cmu_amc/02/02_01.amc")
+    # Its file states 120 frames per second, at which it would be left out.
+    config = LibraryConfig(rates=(("salsa", 60.0),))
+    library, report = library_of([path], onto=data_dir / "cmu_amc/02/02_01.amc", config=config)
     assert [(c.state, c.rule) for c in report.clips] == [("cut", "leaning")]
     assert library.clips[0].seconds > 10.0
 

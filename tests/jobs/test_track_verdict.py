@@ -13,11 +13,12 @@ from poise.eval import Help, ScoreCard
 from poise.jobs.track import TrackConfig, rates
 from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.rates import rate_doubts, rate_notes
-from poise.kin.flight import Flight
+from poise.kin.rate.judge import RateJudgement, Reason
 from toy_human import swing
 
 NAN = math.nan
-FALLS, DOUBLE = Flight(10, 30, 9.8, 0.001), Flight(10, 30, 39.0, 0.001)
+UNKNOWN, FALLS = RateJudgement(120.0), RateJudgement(120.0, fall=9.8)
+DOUBLE = RateJudgement(120.0, 60.0, (Reason("fall", 1.0, "in flight the body falls"),), 39.0)
 
 
 def card(succ: float = 1.0, lost: float = NAN, fallen: float = NAN, off: float = NAN, **more: Any):
@@ -72,47 +73,47 @@ class Alone:
     policy = value = None
 
 
-def notes(fps: float, flights: tuple[Flight, ...], lost: bool = True, **settings: Any) -> list[str]:
+def notes(fps: float, judged: RateJudgement = UNKNOWN, lost: bool = True, **settings: Any) -> list[str]:
     clip = swing(1.0, 30.0).replaced(fps=fps)
     config = replace(TrackConfig(), **settings)
-    return rate_notes(Alone(), clip, flights, lambda c: c.fps, config, lost)  # type: ignore[arg-type, return-value]
+    return rate_notes(Alone(), clip, judged, lambda c: c.fps, config, lost)  # type: ignore[arg-type, return-value]
 
 
 def test_a_lost_motion_is_tried_at_half_and_double_its_rate(tries: list[float]) -> None:
-    (said,) = notes(120.0, ())
+    (said,) = notes(120.0)
     assert said == (
         "The motion was lost at its rate of 120 Hz; played at 60 Hz it is done: is the frame rate "
         "right? If not, state it with --fps 60."
     )
     assert tries == [60.0]
-    (said,) = notes(30.0, ())
+    (said,) = notes(30.0)
     assert "played at 60 Hz" in said
     # 15 and 12.5 Hz are no rates of files.
-    assert tries == [60.0, 60.0] and notes(25.0, ()) == [] and tries[2:] == [50.0]
+    assert tries == [60.0, 60.0] and notes(25.0) == [] and tries[2:] == [50.0]
 
 
 def test_where_it_is_not_tried(tries: list[float]) -> None:
-    assert notes(120.0, (), lost=False) == []
-    assert notes(120.0, (FALLS,)) == []
-    assert notes(120.0, (), controller="policy") == []
-    assert notes(120.0, (), recover=True) == []
-    assert notes(120.0, (), count=2) == []
+    assert notes(120.0, lost=False) == []
+    assert notes(120.0, FALLS) == []
+    assert notes(120.0, controller="policy") == []
+    assert notes(120.0, recover=True) == []
+    assert notes(120.0, count=2) == []
     assert tries == []
 
 
-def fit(name: str, flights: tuple[Flight, ...]) -> Any:
-    """A motion of 120 Hz that was placed, with its flights."""
+def fit(name: str, judged: RateJudgement) -> Any:
+    """A motion of 120 Hz that was placed, and what physics says of its rate."""
     clip = swing(1.0, 30.0, name=name).replaced(fps=120.0)
     return SimpleNamespace(
-        clip=clip, source=clip, report=SimpleNamespace(clips=(SimpleNamespace(flights=flights),))
+        clip=clip, source=clip, report=SimpleNamespace(clips=(SimpleNamespace(rate=judged),))
     )
 
 
-def test_flights_speak_before_anything_is_simulated(tries: list[float]) -> None:
-    (said,) = rate_doubts([fit("jump", (DOUBLE,))])
+def test_physics_speaks_before_anything_is_simulated(tries: list[float]) -> None:
+    (said,) = rate_doubts([fit("jump", DOUBLE)])
     assert "state it with --fps 60" in said and said.startswith("In flight")
-    (said,) = rate_doubts([fit("fall", (FALLS,)), fit("jump", (DOUBLE,))])
+    (said,) = rate_doubts([fit("fall", FALLS), fit("jump", DOUBLE)])
     assert said.startswith("jump: In flight")
-    assert rate_doubts([fit("fall", (FALLS,)), fit("still", ())]) == []
+    assert rate_doubts([fit("fall", FALLS), fit("still", UNKNOWN)]) == []
     # A motion that is doubted and lost is tried as well.
-    assert len(notes(120.0, (DOUBLE,))) == 1 and tries == [60.0]
+    assert len(notes(120.0, DOUBLE)) == 1 and tries == [60.0]

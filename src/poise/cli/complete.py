@@ -100,6 +100,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         return _kinematic(o, keys)
     out, motion = places(o.out)
     may_deliver(out, motion, o.force, o.clip)
+    from poise.cli.track import telling
     from poise.jobs.complete import complete
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig
@@ -123,10 +124,11 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
     with claimed(out):
+        said_early = list[str]()
         with contextlib.ExitStack() as shown:
             done = complete(
                 clip, keys, tracker, config, model=o.model, adapt=o.adapt, retime=o.retime, times=times,
-                partial=partial, progress=staged(shown),
+                partial=partial, progress=staged(shown), warn=telling(said_early),
             )  # fmt: skip
         with working("writing"):
             delivered = done.write(out, motion, o.hold_feet)
@@ -146,8 +148,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         "faults": [f.to_dict() for f in done.filled.faults],
         "score": delivered.card.to_dict(),
     }
-    told, code = (*done.notes, *delivered.notes), LOST if became.failed else 0
-    return Answer(result, delivered.paths, told, code, word, delivered.card.mpjpe_mm)
+    told, early = (*done.notes, *delivered.notes), tuple(said_early)
+    code, error = LOST if became.failed else 0, delivered.card.mpjpe_mm
+    return Answer(result, delivered.paths, told, code, word, error, early)
 
 
 def _beside(keys: tuple[int, ...], clip: Clip, path: Path) -> None:

@@ -76,6 +76,10 @@ class Reading:
             take=self.take,
             smooth_hz=self.smooth,
         )
+        if clip.skeleton.source.rates:
+            from poise.kin.rate.reading import settled
+
+            clip = settled(clip)
         if self.swap_sides or self.ground is not None:
             from poise.kin import anatomy_of, grounded, support_of, swap_sides
 

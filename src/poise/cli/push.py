@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from poise.cli.answer import LOST, Answer
 from poise.cli.console import print_card, say
 from poise.cli.options import Flag, Reading, check_range
 from poise.cli.output import places
-from poise.cli.progress import staged, working
+from poise.cli.progress import working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver
 
@@ -81,8 +80,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     check_range("threads", o.threads, 0)
     out, motion = places(o.out)
     may_deliver(out, motion, o.overwrite, o.clip, flag="--overwrite")
+    from poise.cli.track import follow
     from poise.jobs.open import open_run
-    from poise.jobs.track import TrackConfig, track, write
+    from poise.jobs.track import TrackConfig, write
     from poise.jobs.track.story import story
 
     config = TrackConfig(
@@ -93,9 +93,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     with working("opening the policy"):
         tracker = open_run(o.policy).tracker
     with claimed(out):
-        with contextlib.ExitStack() as shown:
-            shown.enter_context(working("pushing"))
-            tracked = track(clip, tracker, config, progress=staged(shown))
+        said_early = list[str]()
+        tracked = follow(tracker, [clip], config, said_early, "pushing")
         with working("writing"):
             done = write(tracked, out, motion, o.hold_feet)
     assert tracked.pushed is not None
@@ -116,8 +115,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     }
     # The sentence on the push is said already.
     told = tuple(n for n in (*tracked.notes, *done.notes) if n != tracked.pushed.sentence())
-    code = LOST if became.failed else 0
-    return Answer(result, done.paths, told, code, word, done.card.mpjpe_mm)
+    code, early = LOST if became.failed else 0, tuple(said_early)
+    return Answer(result, done.paths, told, code, word, done.card.mpjpe_mm, early)
 
 
 def push_of(options: Options) -> PushConfig:

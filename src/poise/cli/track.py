@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -242,20 +242,30 @@ def supports_wanted(options: Options) -> Literal["auto", "none"] | tuple[Support
 
 
 def follow(
-    tracker: Tracker, given: Sequence[Clip | Keypoints], config: TrackConfig, said: list[str]
+    tracker: Tracker,
+    given: Sequence[Clip | Keypoints],
+    config: TrackConfig,
+    said: list[str],
+    what: str = "tracking",
 ) -> Tracked:
     """The motions as they are tracked, with a bar while it is looked ahead or searched. What speaks
     against a motion is told before it is simulated, and once: `said` is what was."""
     from poise.jobs.track import track
+
+    with contextlib.ExitStack() as shown:
+        shown.enter_context(working(what))
+        return track(given, tracker, config, progress=staged(shown), warn=telling(said))
+
+
+def telling(said: list[str]) -> Callable[[str], None]:
+    """Tells each sentence once: `said` is what was."""
 
     def warn(sentence: str) -> None:
         if sentence not in said:
             said.append(sentence)
             tell(sentence, "yellow")
 
-    with contextlib.ExitStack() as shown:
-        shown.enter_context(working("tracking"))
-        return track(given, tracker, config, progress=staged(shown), warn=warn)
+    return warn
 
 
 def practise(options: Options, tracker: Tracker, tracked: Tracked, folder: Path) -> Tracker | None:

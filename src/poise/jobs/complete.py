@@ -25,6 +25,7 @@ from poise.jobs.track.best import Merit
 from poise.jobs.track.direction import Weight
 from poise.jobs.track.story import story
 from poise.jobs.tracker import Tracker
+from poise.kin.rate.judge import judge_rate
 from poise.learn.model import InbetweenModel
 from poise.motion import Clip
 from poise.motion.io import home_suffix, write_clip
@@ -130,6 +131,7 @@ def complete(
     times: Sequence[float] | None = None,
     partial: Sequence[Partial] = (),
     progress: Show | None = None,
+    warn: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> Completed:
     """Makes a motion of keyframes, and gives it a body: in-betweening, then a simulated character.
@@ -145,7 +147,8 @@ def complete(
         retime: gaps that no body does in their time get more of it, see `Retiming`.
         times: s, at which each keyframe is to be, from the first on; by default where it is.
         partial: further frames of which only hands, feet or the pelvis stay.
-        progress: is told what is done.
+        progress: is told what is done. warn: see `track`; of the clip that came in, and of what is
+            filled.
 
     Raises:
         PoiseError: keyframes that make no sense, or a skeleton that is no human's.
@@ -158,6 +161,9 @@ def complete(
     if retime and config.retake is not None:
         raise PoiseError("a range has the times of the earlier result", hint="Leave --retime out")
     source = clip_of(clip)
+    doubt = judge_rate(source).sentence()
+    if doubt is not None and warn is not None:
+        warn(doubt)
     keys = tuple(check_keyframes(keyframes, source.frames, source.name))
     for sparse in partial:
         if not keys[0] < sparse.frame < keys[-1]:
@@ -183,7 +189,11 @@ def complete(
         direction = replace(direction, weights=(*direction.weights, *weights))
         # A retimed motion is searched at last, when its times are settled.
         how = config if round_ + 1 == ROUNDS or not retime else replace(config, controller="lookahead")
-        tracked = track(filled.clip, tracker, replace(how, direction=direction), progress=progress)
+        tracked = track(
+            filled.clip, tracker, replace(how, direction=direction), progress=progress, warn=warn
+        )
+        if doubt is not None and doubt not in tracked.notes:
+            tracked = replace(tracked, notes=(doubt, *tracked.notes))
         done = _completed(source, keys, filled, tracked, at, factors)
         said = done.retiming and replace(done.retiming, called=asked)
         done = replace(done, keyframes=asked, retiming=said)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 from poise.eval import ScoreCard
 from poise.eval import table as rows_of
 from poise.jobs.keep import claimed, may_deliver, may_write, refusing
-from poise.motion import Clip, read_clip
+from poise.kin.rate.reading import read_clip
+from poise.motion import Clip
 from poise.motion.io import check_writable, names_file, write_clip
 from poise.view.notebook import result_html
 

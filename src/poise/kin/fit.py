@@ -15,9 +15,9 @@ from poise.body import BodyConfig, BodyTable, Humanoid, generate_table, make_hum
 from poise.body.table import BodyRow
 from poise.kin.cycle import Cycle
 from poise.kin.doctor.clean import CleanReport, clean_clip
-from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence
-from poise.kin.ground import GroundFit, clip_flights
+from poise.kin.ground import GroundFit
 from poise.kin.place import on_own_body, place_on_body
+from poise.kin.rate.judge import RateJudgement, judge_rate
 from poise.motion import Clip, ClipLibrary, resample
 from poise.spatial import quat_between, quat_mul, quat_to_euler
 
@@ -31,15 +31,14 @@ GIMBAL = 1.2
 class ClipFit:
     """What was measured and changed of one clip.
 
-    fps: its own frame rate. flights: where it falls freely, in its own frames. clean: flips and
-    impossible speeds that were repaired. cycle: how the ends of a cyclic clip met, None for others.
+    rate: what physics says of its own frame rate. clean: flips and impossible speeds that were
+    repaired. cycle: how the ends of a cyclic clip met, None for others.
     ground: how it was set on the floor. joint_error_mm: mean distance between its joints and the
     humanoid's after conversion (turns that a chain cannot make), before a cycle was closed.
     """
 
     name: str
-    fps: float
-    flights: tuple[Flight, ...]
+    rate: RateJudgement
     clean: CleanReport
     cycle: Cycle | None
     ground: GroundFit
@@ -51,8 +50,8 @@ class ClipFit:
             **self.clean.to_dict(),
             "ground": self.ground.to_dict(),
             "cycle": None if self.cycle is None else asdict(self.cycle),
-            "fall": clear_fall(self.flights),
-            "likely_fps": likely_rate(self.flights, self.fps),
+            "fall": self.rate.fall,
+            "likely_fps": self.rate.likely,
         }
 
     def sentences(self) -> list[str]:
@@ -91,7 +90,7 @@ class FitReport:
         """The report in words, one line each."""
         out: list[str] = []
         for c in self.clips:
-            doubt = rate_sentence(c.flights, c.fps)
+            doubt = c.rate.sentence()
             out += [f"{c.name}: {doubt}"] if doubt else []
         out += [sentence for c in self.clips for sentence in c.sentences()]
         if self.widened:
@@ -146,8 +145,8 @@ def fit_humanoid(
         table = replace(table, contact_exclusions=table.contact_exclusions + overlaps)
         humanoid = make_humanoid(clips[0].skeleton, table)
     fits = (
-        ClipFit(c.name, c.fps, clip_flights(mended, table), found, p.cycle, p.ground, p.joint_error_mm)
-        for c, (mended, found), p in zip(library, repaired, placed, strict=True)
+        ClipFit(c.name, judge_rate(c, table), found, p.cycle, p.ground, p.joint_error_mm)
+        for c, (_, found), p in zip(library, repaired, placed, strict=True)
     )
     return humanoid, motions, FitReport(tuple(fits), widened, overlaps)
 

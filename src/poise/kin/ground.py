@@ -13,8 +13,7 @@ from poise.kin.feet.contact import stance_heights
 from poise.kin.fk import Kinematics
 from poise.kin.flight import Flight, find_flights
 from poise.kin.series import find_runs, smooth_hull, smooth_lift
-from poise.kin.solids import low_and_com, poses_of
-from poise.motion import Clip
+from poise.kin.solids import low_and_com
 
 #: Depth (m) that a shape may sink into the floor in the reference; contacts there push it out gently.
 SINK_M = 0.02
@@ -68,11 +67,6 @@ class GroundFit:
             "lowest_before_m": self.before_m,
             "lowest_after_m": self.after_m,
         }
-
-
-def clip_flights(clip: Clip, table: BodyTable) -> tuple[Flight, ...]:
-    """The flights of a clip at its own frame rate."""
-    return find_flights(*low_and_com(table, *poses_of(clip, table)), clip.fps)
 
 
 def fit_ground(

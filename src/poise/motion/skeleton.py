@@ -46,6 +46,8 @@ class Source:
         ("jitter", sentence) where keypoints tremble so much that they are better smoothed.
     mended: (kind, joint, first frame, last frame, size) of what the reader had to mend: "bone drift" m,
         "quaternion length" (distance from 1), "rest frame" (frames dropped); last frame -1 is the end.
+    rates: where neither the file nor the user states a frame rate, those that such files have, frames/s;
+        the first was taken.
     """
 
     format: str = "poise"
@@ -60,6 +62,7 @@ class Source:
     evidence: tuple[tuple[str, str], ...] = ()
     mended: tuple[tuple[str, str, int, int, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
+    rates: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,12 @@ from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.kin import FitReport, fit_humanoid
 from poise.kin.place import on_own_body
+from poise.kin.rate.reading import read_clip
 from poise.learn import Amp, AmpConfig, LessonConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
 from poise.learn.protocols import Lessons, Style
 from poise.machine import cores as machine_cores
-from poise.motion import Clip, ClipLibrary, read_clip
+from poise.motion import Clip, ClipLibrary
 from poise.plan import LookaheadTeacher, TeacherConfig
 from poise.sim import (
     Backend,

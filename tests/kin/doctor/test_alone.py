@@ -10,14 +10,8 @@ import torch
 
 from poise.body import BodyTable, generate_table
 from poise.kin import lowest_height
-from poise.kin.doctor.alone import (
-    AloneRules,
-    balance_point,
-    extreme_points,
-    hull_distance,
-    longest_alone,
-    not_alone,
-)
+from poise.kin.balance import balance_point, extreme_points, hull_distance
+from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
 from poise.kin.ground import fit_heights
 from poise.motion import Clip, shifted
 from toy_human import human, swing, turn

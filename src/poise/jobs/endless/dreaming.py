@@ -31,8 +31,9 @@ from poise.jobs.track.crowd import crowd, places
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
+from poise.kin.rate.reading import read_clip
 from poise.learn.run import interruptible
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.settings import changed
 from poise.sim.guard import UnstableError
 from poise.synth.generator import Kinematic

@@ -14,9 +14,9 @@ import torch
 from poise.errors import PoiseError
 from poise.jobs.library.clips import LibraryConfig
 from poise.jobs.library.folder import library_of
+from poise.kin.rate.reading import read_clip
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip
-from poise.motion.io import read_clip
 from poise.motion.io.formats import READERS
 from poise.motion.windows import LAFAN1_FACING, FrameBank, pack_frames, without_still_root
 

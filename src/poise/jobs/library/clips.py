@@ -16,9 +16,10 @@ from poise.jobs.library.report import ClipNote
 from poise.kin import RetargetConfig, onto_own, own_body, place_on_body
 from poise.kin.doctor.alone import AloneRules, leaps, longest_alone, not_alone
 from poise.kin.doctor.clean import clean_clip
-from poise.kin.flight import rate_sentence
 from poise.kin.place import OnBody
-from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
+from poise.kin.rate.judge import judge_rate
+from poise.kin.rate.reading import read_clip
+from poise.motion import Clip, Skeleton, resample, shifted, trim
 from poise.motion.io import read_skeleton
 
 _T = TypeVar("_T")
@@ -99,12 +100,14 @@ class Target:
 
 
 class Taken(NamedTuple):
-    """A clip that was read and cleaned, at the library's rate, with its file, rate and repairs."""
+    """A clip that was read and cleaned, at the library's rate, with its file and repairs, and the doubt
+    about the file's own rate in words. obeyed: the rate is one that the user stated."""
 
     file: MotionFile
     clip: Clip
-    fps: float
     repairs: tuple[str, ...]
+    doubt: str | None
+    obeyed: bool
 
 
 def read_all(
@@ -159,7 +162,8 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
     word = _telling_word(file.name, config.words)
     if word and not matches(config.keep, file.name, file.subject):
         return replace(note, rule="word", reason=f"its name says '{word}'")
-    return Taken(file, resampled, clip.fps, tuple(report.sentences()))
+    doubt, obeyed = judge_rate(clip).sentence(), _stated(config.rates, file.name) is not None
+    return Taken(file, resampled, tuple(report.sentences()), doubt, obeyed)
 
 
 def _stated(pairs: Sequence[tuple[str, _T]], name: str) -> _T | None:
@@ -254,10 +258,10 @@ def place(
         reason = f"its limbs point {note.direction_deg:.0f} degrees elsewhere on the other skeleton"
         return None, replace(note, rule="unlike", reason=reason)
     note = replace(note, lift_m=on.ground.lift_m)
-    # The file's own rate is what a doubt is about, at whatever rate the library is.
-    doubt = rate_sentence(on.ground.flights, taken.fps)
-    if doubt and not keep:
-        reason = doubt.partition(";")[0]
+    if taken.doubt and taken.obeyed:
+        note = replace(note, notes=(*note.notes, taken.doubt))
+    elif taken.doubt and not keep:
+        reason = taken.doubt.partition(";")[0]
         return None, replace(note, rule="rate", reason=reason[0].lower() + reason[1:])
     return _alone(clip, target, note, config, keep, begins)
 

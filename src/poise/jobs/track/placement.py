@@ -14,7 +14,7 @@ from poise.body import Humanoid
 from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
 from poise.kin.feet.level import Levelled
 from poise.kin.fit import ClipFit
-from poise.kin.ground import clip_flights
+from poise.kin.rate.judge import judge_rate
 from poise.motion import Clip, shifted
 from poise.spatial import quat_between, quat_mul
 
@@ -53,8 +53,7 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     humanoid, rate = tracker.humanoid, tracker.config.sim.control_hz
     clip = clip.replaced(cyclic=False)
     on = place_on_body(clip, humanoid.table, tracker.example, rate, how=tracker.onto, near=humanoid)
-    flights = clip_flights(on.moved, humanoid.table)
-    fit = ClipFit(clip.name, clip.fps, flights, on.cleaned, None, on.ground, on.joint_error_mm)
+    fit = ClipFit(clip.name, judge_rate(clip), on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
     return Placed(clip, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
 

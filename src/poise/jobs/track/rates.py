@@ -1,4 +1,4 @@
-"""Doubts about a motion's frame rate: what its flights say, and if a lost one is done at another."""
+"""Doubts about a motion's frame rate: what physics says, and if a lost one is done at another."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from poise.eval import ClipJudge, simulate
 from poise.jobs.track.controllers import Show, Told, look_ahead
 from poise.jobs.track.placement import Placed
 from poise.jobs.tracker import Tracker
-from poise.kin.flight import Flight, clear_fall, likely_rate, rate_sentence, usual_rate
+from poise.kin.rate.judge import RateJudgement, usual_rate
 from poise.motion import Clip
 from poise.plan import Lookahead
 from poise.recipes.imitation import Imitation
@@ -26,11 +26,11 @@ TRIED, USUAL = (0.5, 2.0), 0.02
 
 
 def rate_doubts(placed: Sequence[Placed]) -> list[str]:
-    """Sentences on frame rates that flights speak against, known before anything is simulated; of
+    """Sentences on frame rates that physics speaks against, known before anything is simulated; of
     several motions each names its own."""
     out = []
     for p in placed:
-        doubt = rate_sentence(p.report.clips[0].flights, p.source.fps)
+        doubt = p.report.clips[0].rate.sentence()
         if doubt is not None:
             out.append(f"{p.clip.name}: {doubt}" if len(placed) > 1 else doubt)
     return out
@@ -39,7 +39,7 @@ def rate_doubts(placed: Sequence[Placed]) -> list[str]:
 def rate_notes(
     tracker: Tracker,
     given: Clip,
-    flights: Sequence[Flight],
+    judged: RateJudgement,
     on_body: Callable[[Clip], Imitation],
     config: TrackConfig,
     lost: bool,
@@ -53,18 +53,17 @@ def rate_notes(
     that fall with gravity vouch for the rate, nothing is tried. What was tracked stays as it is.
 
     Args:
-        given: the motion as it was tracked. flights: of it on the tracker's body.
+        given: the motion as it was tracked. judged: what physics says of its rate.
         on_body: makes a task of a clip. lost: whether the motion was.
         show: is told of tries with lookahead.
     """
     notes = list[str]()
-    vouched = clear_fall(flights) is not None and likely_rate(flights, given.fps) is None
     single = (
         config.count == 1
         and config.controller != "policy"
         and not (config.recover or config.reset_on_fail or config.noise)
     )
-    if lost and single and not vouched:
+    if lost and single and not judged.vouched:
         rate = _done_at(tracker, given, on_body, config, show)
         if rate is not None:
             notes.append(

@@ -35,6 +35,7 @@ from poise.jobs.track.supports import with_supports
 from poise.jobs.track.tracked import Clean, Tracked
 from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
+from poise.kin.rate.reading import settled
 from poise.kin.supports import Support
 from poise.metrics import has_lost, mpjpe_global
 from poise.motion import Clip, ClipLibrary, read_clip
@@ -141,7 +142,7 @@ def track(
         notes += [done.pushed.sentence(), *config.push.yields.notes, GOAL_YIELDS]
     elif not several and config.retake is None:
         said = rate_notes(
-            tracker, given, placed.report.clips[0].flights,
+            tracker, given, placed.report.clips[0].rate,
             lambda c: imitation_of(tracker, [place(c, tracker)]), config, bool(done.failures), progress,
         )  # fmt: skip
         notes, doubts = [*notes, *said], [*doubts, *said]
@@ -231,7 +232,7 @@ def read_motion(clip: Motion) -> Clip | Keypoints:
     if isinstance(clip, Clip | Keypoints):
         return clip
     made = read_clip(clip)
-    return points_of(made, ReadOptions()) or made
+    return points_of(made, ReadOptions()) or settled(made)
 
 
 def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoints | None]:

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.fk import carried
+from poise.kin.balance import LEAST_WEIGHT, balance_point, extreme_points, hull_distance
 from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
-from poise.kin.series import find_runs, gaussian
+from poise.kin.series import find_runs
 from poise.kin.solids import centre_of_mass, poses_of
-from poise.metrics.shapes import PIECE
 from poise.motion import Clip
-from poise.spatial import GRAVITY
 
 Kind = Literal["held", "leaning", "below", "leap"]
-#: Standard deviation (s) of the low-pass on the centre of mass before it is differentiated twice.
-SMOOTH_S = 0.1
-#: Least upward force over weight at which a balance point says anything; below, the body nearly falls.
-LEAST_WEIGHT = 0.5
-#: Directions in which the support is measured; between two of them it is 0.5 % off.
-DIRECTIONS = 32
 #: Gap (s) that belongs to one spell under the floor, of leaning, and what is cut off around any spell.
 GAP_S, TOUCH_S, EDGE_S = 0.2, 0.1, 0.1
 
@@ -145,57 +134,6 @@ def longest_alone(clip: Clip, found: Sequence[NotAlone]) -> tuple[int, int]:
         bad[max(f.start - f.lead - edge, 0) : f.stop + f.trail + 1 + edge] = True
     free = [(a, b + 1) for a, b in find_runs(~bad, 0)]
     return max(free, key=lambda s: s[1] - s[0], default=(0, 0))
-
-
-def extreme_points(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
-    """`(T, P, 3)` m, the ends and corners of all shapes, lowered by their radius."""
-    out = []
-    for i, row in enumerate(table.rows):
-        for geom in row.geoms:
-            size, turn = geom.size, torch.tensor(geom.quat, dtype=pos.dtype)
-            ends, radius = [(0.0, 0.0, 0.0)], size[0]
-            if geom.kind == "capsule":
-                ends = [(0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]
-            elif geom.kind == "box":
-                ends, radius = list(itertools.product(*((-x, x) for x in size))), 0.0
-            down = torch.tensor([0.0, 0.0, radius], dtype=pos.dtype)
-            for end in ends:
-                local = carried(torch.tensor(geom.pos, dtype=pos.dtype), turn, end)
-                out.append(carried(pos[:, i], quat[:, i], local) - down)
-    return torch.stack(out, 1)
-
-
-def balance_point(com: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Zero moment point `(T, 2)` m on z = 0 of a centre of mass `(T, 3)` m, and force over weight `(T)`.
-
-    The path is smoothed by a Gaussian of `SMOOTH_S`, going on beyond its ends as it comes.
-    """
-    reach = min(round(4 * SMOOTH_S * fps), len(com) - 1)
-    kernel = gaussian(SMOOTH_S * fps, reach)
-    # An odd reflection keeps the speed at the ends, where an even one would stop the body.
-    padded = np.pad(com, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
-    smooth = np.stack([np.convolve(x, kernel, "valid") for x in padded.T], -1)
-    acc = np.gradient(np.gradient(smooth, axis=0), axis=0) * fps**2
-    up = GRAVITY + acc[:, 2]
-    held = np.maximum(up, LEAST_WEIGHT * GRAVITY)
-    return smooth[:, :2] - (smooth[:, 2] / held)[:, None] * acc[:, :2], up / GRAVITY
-
-
-def hull_distance(points: np.ndarray, mask: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """`(T)` m, how far `at (T, 2)` lies outside the hull of `points (T, P, 2)` under `mask (T, P)`.
-
-    The distance to a convex set is max_d (d . at - max_p d . p) over unit directions d, of which
-    `DIRECTIONS` are tried. Inside it is negative; without any point it is infinite.
-    """
-    angle = 2 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    ways = np.stack((np.cos(angle), np.sin(angle)))
-    out = np.empty(len(at))
-    # All frames of an hour at once would take gigabytes.
-    for k in range(0, len(at), PIECE):
-        part = slice(k, k + PIECE)
-        reach = np.where(mask[part, :, None], points[part] @ ways, -np.inf).max(1)
-        out[part] = (at[part] @ ways - reach).max(-1)
-    return out
 
 
 def _beyond(points: np.ndarray, com: np.ndarray, fps: float, near: float) -> np.ndarray:

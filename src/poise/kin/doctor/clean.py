@@ -10,8 +10,7 @@ from poise.body import Anatomy, find_anatomy, generate_table
 from poise.errors import PoiseError
 from poise.kin.doctor.flips import Flip, out_of_reach, unflip
 from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds, without_rougher
-from poise.kin.flight import likely_rate, rate_sentence
-from poise.kin.ground import clip_flights
+from poise.kin.rate.judge import judge_rate
 from poise.motion import Clip
 
 
@@ -94,7 +93,7 @@ def clean_clip(
 @dataclass(frozen=True)
 class Faults:
     """What a clip's fit will repair or doubt: in words, and as numbers (`CleanReport.to_dict` and
-    `likely_fps`, the frame rate that gravity vouches for where it is far from the file's)."""
+    `likely_fps`, the frame rate that physics vouches for where it is far from the file's)."""
 
     sentences: tuple[str, ...]
     numbers: dict[str, Any]
@@ -103,10 +102,10 @@ class Faults:
 def find_faults(clip: Clip) -> Faults | None:
     """The faults of a clip, before a body is fitted; None where its joints are no human's."""
     try:
-        cleaned, report = clean_clip(clip)
-        flights = clip_flights(cleaned, generate_table(cleaned.skeleton, None, [cleaned]))
+        _, report = clean_clip(clip)
+        judged = judge_rate(clip, generate_table(clip.skeleton, None, [clip]))
     except PoiseError:
         return None
-    doubt = rate_sentence(flights, clip.fps)
-    numbers = {**report.to_dict(), "likely_fps": likely_rate(flights, clip.fps)}
+    doubt = judged.sentence()
+    numbers = {**report.to_dict(), "likely_fps": judged.likely}
     return Faults((*([doubt] if doubt else []), *report.sentences()), numbers)

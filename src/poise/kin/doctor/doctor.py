@@ -18,8 +18,8 @@ from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
-from poise.kin.flight import likely_rate
 from poise.kin.hinges import chain_angles
+from poise.kin.rate.judge import judge_rate
 from poise.kin.series import smooth_lift
 from poise.metrics import floating, jerk, penetration
 from poise.motion import Clip
@@ -178,11 +178,11 @@ def limit_faults(clip: Clip) -> list[Fault]:
 
 
 def _rate_faults(support: Support, clip: Clip) -> list[Fault]:
-    rate = likely_rate(support.fit.flights, clip.fps)
-    if rate is None:
+    judged = judge_rate(clip, support.table)
+    if judged.likely is None:
         return []
-    detail = f"falling bodies vouch for {rate:g} frames per second; state it with --fps {rate:g}"
-    return [Fault("frame rate", "", 0, clip.frames - 1, rate, detail)]
+    detail = f"{judged.why()}; state it with --fps {judged.likely:g}"
+    return [Fault("frame rate", "", 0, clip.frames - 1, judged.likely, detail)]
 
 
 def _figures(clip: Clip, support: Support | None) -> dict[str, float | None]:

@@ -13,9 +13,8 @@ from poise.errors import PoiseError
 from poise.kin.doctor.flips import neutral_pose
 from poise.kin.doctor.sides import exchanged_sides, side_votes
 from poise.kin.doctor.support import SOLE_M, Support, anatomy_of, support_of
-from poise.kin.flight import clear_fall, likely_rate
+from poise.kin.rate.judge import RateJudgement, judge_rate
 from poise.motion import Clip, ground_shift
-from poise.spatial import GRAVITY
 
 _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches"}
 _WORDS = {"feet": "where the feet point", "knees": "where the knees bend", "travel": "where it goes"}
@@ -76,16 +75,12 @@ def grounded(clip: Clip, support: Support | None, stated: float | None) -> Clip:
 
 
 def _rate(clip: Clip, support: Support | None, why: str) -> Guess:
-    flights = () if support is None else support.fit.flights
-    fall, rate = clear_fall(flights), likely_rate(flights, clip.fps)
-    if rate is not None and fall is not None:
-        why += (
-            f"; but in flight the body falls with {fall / GRAVITY:.3g} times gravity, "
-            f"as it would at {rate:g} frames per second"
-        )
-    elif fall is not None:
-        why += f"; in flight the body falls with {fall:.1f} m/s^2, which agrees"
-    override = "--fps F" if rate is None else f"--fps {rate:g}"
+    judged = RateJudgement(clip.fps) if support is None else judge_rate(clip, support.table)
+    if judged.likely is not None:
+        why += f"; but {judged.why()}: likely it has {judged.likely:g} frames per second"
+    elif judged.fall is not None:
+        why += f"; in flight the body falls with {judged.fall:.1f} m/s^2, which agrees"
+    override = "--fps F" if judged.likely is None else f"--fps {judged.likely:g}"
     return Guess("fps", clip.fps, why, override)
 
 

@@ -42,7 +42,7 @@ class Support:
     soles: `(T, F, 3)` heel and toe end of every sole. feet: `(F,)` the foot joint of each.
     low: `(T, P)` heights of the body's joints and of its bone tips, each with its `margin (P,)`;
     names: `(P,)` the joint that each belongs to. sole_low: `(T,)` lowest point of the body's shapes.
-    com: `(T, 3)` centre of mass. fit: how the clip would be set on the floor.
+    com: `(T, 3)` centre of mass. fit: how the clip would be set on the floor. table: its body.
     """
 
     fps: float
@@ -54,6 +54,7 @@ class Support:
     sole_low: np.ndarray
     com: np.ndarray
     fit: GroundFit
+    table: BodyTable
 
     @classmethod
     def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
@@ -71,6 +72,7 @@ class Support:
             names,
             *low_and_com(table, pos, quat),
             fit_heights(table, pos, quat, clip.fps),
+            table,
         )
 
     @property

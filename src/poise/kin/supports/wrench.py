@@ -17,7 +17,7 @@ import numpy as np
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.doctor.alone import SMOOTH_S
+from poise.kin.balance import SMOOTH_S
 from poise.kin.series import gaussian
 from poise.kin.solids import centre_of_mass
 from poise.spatial import GRAVITY

@@ -50,7 +50,7 @@ class RawMotion:
     unit_hint: a unit the file suggests, checked with the person's height.
     strays: `(joint, largest distance)` of position channels that did not stay constant.
     whole: frame 0 belongs to the motion for certain, so no rest pose is sought there.
-    mended: what the reader mended, as in `Source.mended`.
+    mended, rates: as in `Source`.
     """
 
     format: str
@@ -74,6 +74,7 @@ class RawMotion:
     mended: tuple[tuple[str, str, int, int, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
     whole: bool = False
+    rates: tuple[float, ...] = ()
 
 
 def vectors_to_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
@@ -149,6 +150,7 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
             evidence=evidence(options, up, unit, _rate(raw)),
             mended=tuple(mended),
             extra=raw.extra,
+            rates=() if options.fps is not None else raw.rates,
         ),
     )
     for part in _parts(rot):

@@ -17,8 +17,9 @@ from poise.motion.io.text import CUT_OFF, at_line, decode, listed, read_bytes, s
 from poise.motion.skeleton import Channel, triple
 from poise.spatial import quat_conj, quat_mul
 
-DEFAULT_FPS = 120.0
-"""The CMU library's rate; AMC files state none."""
+RATES = (120.0, 60.0)
+"""The CMU library's rates, frames/s, the usual one first; AMC files state none."""
+DEFAULT_FPS = RATES[0]
 _NAME_SKELETON = "Name its skeleton with --skeleton FILE"
 
 
@@ -130,6 +131,7 @@ def _raw(
         root_pos=root_pos,
         rot=rot,
         fps=DEFAULT_FPS,
+        rates=RATES,
         channels=channels,
         unit_hint=None if asf.length is None else 0.0254 / asf.length,
         notes=(*asf.notes, *notes),

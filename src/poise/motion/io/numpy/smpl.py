@@ -41,6 +41,8 @@ _JOINTS = ("rest_joints", "J", "joints")
 _UNUSED = ("dmpls", "expression", "pose_est_dmpls")
 _AIST_FPS = 60.0
 _HY_FPS = 30.0
+#: Rates that files without a stated one have, frames/s, the usual one first.
+_UNSTATED = {_AIST_FPS: (60.0, 30.0), _HY_FPS: (30.0, 60.0)}
 Z_TO_Y_UP = (2**-0.5, -(2**-0.5), 0.0, 0.0)
 """wxyz, the turn of the world from Z up to Y up: -90 degrees about X."""
 
@@ -94,6 +96,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
         up_axis="Y",
         notes=tuple(notes),
         extra=_extra(data, layout, pelvis, up),
+        rates=() if _first(data, _RATES) is not None else _UNSTATED.get(fps, ()),
     )
     clip = assemble(raw, ReadOptions(fps=options.fps))
     taken = "The file states no unit: metres taken, as AMASS has it"

@@ -24,6 +24,8 @@ HUMANML3D = (
 )
 """The 22 joints of HumanML3D (Guo et al. 2022), in the order of its arrays."""
 _HUMANML3D_FPS = 20.0
+#: Rates of arrays that state none, frames/s, the usual one first.
+_UNSTATED = (_HUMANML3D_FPS, 30.0)
 #: What joints' names are called in files.
 _NAMES = ("names", "joint_names")
 _HANDS = ("left_hand", "right_hand")
@@ -53,6 +55,7 @@ def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED)
     return RawPoints(
         "joints", path, names, positions, fps, 1.0, None, notes=tuple(notes),
         unit_note="The file states no unit: metres taken (--unit METRES)",
+        rates=_UNSTATED if options.fps is None else (),
     )  # fmt: skip
 
 

@@ -32,6 +32,7 @@ class RawPoints:
 
     positions: `(T, K, 3)`, NaN where missing. unit_m, up_axis: what the file states, None where it
     states nothing. confidence: `(T, K)` or None. unit_note: why `unit_m`, where no file states it.
+    rates: as in `Source.rates`.
     """
 
     format: str
@@ -44,6 +45,7 @@ class RawPoints:
     confidence: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     unit_note: str = ""
+    rates: tuple[float, ...] = ()
 
 
 # The places with the bones that make up a body's height, as the guesses know their names.
@@ -86,6 +88,7 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
         Source(
             format=raw.format, path=str(raw.path), unit_m=scale, up_axis=axis, notes=tuple(notes),
             frame_time=1.0 / raw.fps, evidence=evidence(options, up, unit, rate),
+            rates=() if options.fps is not None else raw.rates,
         ),
     )  # fmt: skip
 
