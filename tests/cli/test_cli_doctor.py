@@ -151,7 +151,7 @@ def test_every_guess_has_evidence_and_a_way_to_override_it(capsys) -> None:
     assert guesses["rest pose"]["value"] == "T-pose" and guesses["sides"]["value"] == "as named"
     assert guesses["feet"]["value"] == "LeftFoot, RightFoot" and abs(guesses["ground"]["value"]) < 0.02
     text = said(capsys, "info", WALK)
-    assert "[--up Y|Z]" in text and "[--ground METRES" in text
+    assert "[--up Y|Z|-Y|-Z]" in text and "[--ground METRES" in text
 
 
 def test_what_is_stated_is_no_guess(capsys) -> None:

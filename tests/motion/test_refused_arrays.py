@@ -55,7 +55,10 @@ def mdm(**more: Any) -> dict[str, Any]:
 CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "unit below 0": (
         lambda f: save_npz(f / "a.npz", keys(unit_m=-1.0)), ": unit_m must be above 0, got -1"),
-    "up X": (lambda f: save_npz(f / "a.npz", keys(up_axis=b"X")), ": up_axis must be Y or Z, got 'X'"),
+    "up W": (
+        lambda f: save_npz(f / "a.npz", keys(up_axis=b"W")),
+        ": up_axis must be one of Y, Z, X, -Y, -Z, -X, got 'W'",
+    ),
     "poses of two lengths": (
         lambda f: save_npz(f / "a.npz", gvhmr(5)), ": its poses have different lengths: 12, 12, 5"),
     "a scaling of 0": (

@@ -30,6 +30,8 @@ T = TypeVar("T")
 #: A switch; its help states no default, which the sentence tells.
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
+#: `motion.io.guess.UPS`; stated here since motion is imported only when a verb reads.
+Up = Literal["Y", "Z", "X", "-Y", "-Z", "-X"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 
@@ -47,8 +49,8 @@ class Reading:
     """Frames per second."""
     unit: Annotated[str | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Metres in one unit of the file, 0.01 for example; or m, cm, mm, in."""
-    up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
-    """The file's vertical."""
+    up: Annotated[Up | None, arg(metavar="Y|Z|-Y|-Z", help_behavior_hint="")] = None
+    """The file's vertical: Y, Z or X, with - where it points down."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
     """Which animation of a file that holds several (glTF, USD); by default the longest."""
     ground: Annotated[str | None, arg(metavar="METRES|auto", help_behavior_hint="")] = None

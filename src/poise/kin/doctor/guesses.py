@@ -46,7 +46,7 @@ def find_guesses(clip: Clip) -> list[Guess]:
     unit = _UNITS.get(source.unit_m, f"{source.unit_m:.6g} m")
     made = "The clip was made in code" if source.path is None else "The format itself states it"
     return [
-        Guess("up", source.up_axis, why.get("up", made), "--up Y|Z"),
+        Guess("up", source.up_axis, why.get("up", made), "--up Y|Z|-Y|-Z"),
         Guess("unit", source.unit_m, why.get("unit", f"The clip is in {unit}"), "--unit METRES"),
         _rate(clip, support, why.get("fps", made)),
         _rest(clip, anatomy),

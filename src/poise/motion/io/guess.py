@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +9,11 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.info import landmarks
 from poise.motion.io.text import listed
 from poise.spatial import quat_angle, quat_conj, quat_mul
+
+UPS = ("Y", "Z", "X", "-Y", "-Z", "-X")
+"""Verticals that a file may have; with "-" the axis points down."""
 
 ASF_UNIT_M = 0.0254 / 0.45
 """Metres in the unit of the CMU library's ASF files (`length 0.45`, inches)."""
@@ -89,54 +90,6 @@ def _closest(height: float) -> tuple[str, float]:
 
 def _size(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 0.1 else f"{metres * 1e3:.3g} mm"
-
-
-def guess_up(names: Sequence[str], positions: np.ndarray, rest: np.ndarray) -> Guess:
-    """The vertical of a file, "Y" or "Z", from sampled poses `(S, J, 3)` and the rest pose `(J, 3)`.
-
-    The body mostly stands along it, in the motion and in the rest pose. Where these two
-    contradict each other (someone lies or crawls), the floor decides: the lowest joint keeps its
-    height better than its place along any other axis.
-    """
-    first = max(1, len(positions) // 10)
-    moving = (_upright(names, positions[:first]) + _upright(names, positions)) / 2
-    resting = _upright(names, rest[None])
-    axes = [_axis(moving, "the body stands along it"), _axis(resting, "the rest pose stands along it")]
-    sure = [a for a in axes if a is not None]
-    if sure and all(a[0] == sure[0][0] for a in sure):
-        axis, why = sure[0]
-        return Guess(axis, f"The file states no vertical: {axis} taken, since {why}")
-    low = positions.min(1)
-    wander = np.percentile(low, 95, axis=0) - np.percentile(low, 5, axis=0)
-    axis = "Y" if wander[1] <= wander[2] else "Z"
-    return Guess(
-        axis,
-        f"The file states no vertical and the body lies along several axes: {axis} taken, since the "
-        "lowest joint keeps its height along it (uncertain; override with --up Y or --up Z)",
-    )
-
-
-def _upright(names: Sequence[str], positions: np.ndarray) -> np.ndarray:
-    """`(3,)` how far the bodies `(S, J, 3)` stand along each axis, 0 to 1.
-
-    The mean direction from ankles to head, or the body's extent where names tell nothing.
-    """
-    heads, necks, ankles = landmarks(names)
-    tops = heads or necks
-    if tops and ankles:
-        way = positions[:, tops[0]] - positions[:, ankles].mean(1)
-        way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
-        return np.abs(way.mean(0))
-    extent = (positions.max(1) - positions.min(1)).mean(0)
-    return extent / max(float(np.linalg.norm(extent)), 1e-12)
-
-
-def _axis(along: np.ndarray, why: str) -> tuple[str, str] | None:
-    """The clearly larger one of Y and Z, None where neither is or where X is larger than both."""
-    y, z = float(along[1]), float(along[2])
-    if min(y, z) > 0.7 * max(y, z) or max(y, z) < 0.5:
-        return None
-    return ("Y" if y > z else "Z"), why
 
 
 def inserted_rest_frames(rot: np.ndarray) -> tuple[int, str]:

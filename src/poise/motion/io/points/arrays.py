@@ -11,6 +11,7 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.clip import check_rate
+from poise.motion.io.guess import UPS
 from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
 from poise.motion.io.points.raw import RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
@@ -117,8 +118,8 @@ def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNS
     up = text_of(data["up_axis"]).upper() if "up_axis" in data else None
     if unit is not None and not unit > 0:
         raise PoiseError(f"unit_m must be above 0, got {unit:g}", path)
-    if up not in (None, "Y", "Z"):
-        raise PoiseError(f"up_axis must be Y or Z, got {shown(up or '')}", path)
+    if up not in (None, *UPS):
+        raise PoiseError(f"up_axis must be one of {', '.join(UPS)}, got {shown(up or '')}", path)
     scores = numeric(data, "confidence", positions.shape[:2], path) if "confidence" in data else None
     return RawPoints("keypoints-npz", path, names, positions, fps, unit, up, scores)
 

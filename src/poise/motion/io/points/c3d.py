@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.guess import UPS
 from poise.motion.io.limited import read_limited
 from poise.motion.io.points.raw import UNITS_M, RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
@@ -112,7 +113,7 @@ def _text(point: dict[str, np.ndarray], key: str) -> str:
 def _vertical(point: dict[str, np.ndarray]) -> str | None:
     """The file's vertical, where it says which axis points up on the screen."""
     axis = _text(point, "Y_SCREEN").upper().lstrip("+")
-    return axis if axis in ("Y", "Z") else None
+    return axis if axis in UPS else None
 
 
 def _chosen(labels: list[str], point: dict[str, np.ndarray]) -> tuple[list[int], list[str]]:

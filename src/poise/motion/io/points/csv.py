@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.guess import UPS
 from poise.motion.io.points.raw import UNITS_M, RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
 from poise.motion.io.refused import FLAT_HINT
@@ -81,8 +82,8 @@ def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     unit, up = stated.get("unit"), stated.get("up", "").upper()
     if unit is not None and unit not in UNITS_M:
         raise PoiseError(f"the unit {shown(unit)} is not known", path, f"Known: {', '.join(UNITS_M)}")
-    if up not in ("", "Y", "Z"):
-        raise PoiseError(f"up must be Y or Z, got {shown(up)}", path)
+    if up not in ("", *UPS):
+        raise PoiseError(f"up must be one of {', '.join(UPS)}, got {shown(up)}", path)
     return RawPoints(
         "csv", path, tuple(layout.points), positions, rate, UNITS_M.get(unit or ""), up or None, scores
     )
