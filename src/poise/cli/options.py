@@ -36,7 +36,7 @@ Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 
 #: Units that --unit knows by name, in metres.
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Reading:
     fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
     """Frames per second."""
     unit: Annotated[str | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """Metres in one unit of the file, 0.01 for example; or m, cm, mm, in."""
+    """Metres in one unit of the file, 0.01 for example; or m, dm, cm, mm, in, ft."""
     up: Annotated[Up | None, arg(metavar="Y|Z|-Y|-Z", help_behavior_hint="")] = None
     """The file's vertical: Y, Z or X, with - where it points down."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None

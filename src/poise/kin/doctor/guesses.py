@@ -17,7 +17,7 @@ from poise.kin.flight import clear_fall, likely_rate
 from poise.motion import Clip, ground_shift
 from poise.spatial import GRAVITY
 
-_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches"}
+_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.1: "decimetres"}
 _WORDS = {"feet": "where the feet point", "knees": "where the knees bend", "travel": "where it goes"}
 
 

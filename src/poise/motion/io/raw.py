@@ -248,7 +248,7 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
     elif raw.unit_m is not None:
         unit = Guess(raw.unit_m)
     else:
-        unit = guess_unit(height, how, raw.unit_hint, raw.path)
+        unit = guess_unit(height, how, raw.unit_hint, raw.path, raw.format)
     stated = options.up_axis or raw.up_axis
     if stated is not None:
         return Guess(stated.upper()), unit

@@ -10,8 +10,8 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.bvh.file import POSITIONS
-from poise.motion.io.nodes import place_of_travel
 from poise.motion.io.guess import UPS
+from poise.motion.io.nodes import place_of_travel
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
 from poise.motion.skeleton import Skeleton

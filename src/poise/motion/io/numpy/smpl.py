@@ -18,6 +18,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_poses
 from poise.motion.info import sampled
+from poise.motion.io.angle_units import check_radians
 from poise.motion.io.guess import UPS, Guess
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
@@ -76,6 +77,10 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
         raise PoiseError(f"it has {len(poses)} poses but {len(trans)} translations", path)
     refuse_bad(poses, "the rotation", path, layout.names)
     refuse_bad(trans, "the translation", path)
+    # Roots may turn often, and fits of fingers are wild.
+    limbs = {name: poses[:, j] for j, name in enumerate(layout.names[:22]) if j}
+    hint = "Convert the axis-angle vectors to radians"
+    check_radians(limbs, "the SMPL family has", path, hint)
     notes: list[str] = []
     pelvis, offsets = _rest(data, path, layout, notes)
     root_pos = trans / scale * world_unit + pelvis

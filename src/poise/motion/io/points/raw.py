@@ -23,7 +23,7 @@ from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
 from poise.motion.skeleton import Source
 
-UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, "dm": 0.1}
 """Metres in a unit, as tables of points call it."""
 
 
