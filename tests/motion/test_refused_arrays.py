@@ -179,7 +179,7 @@ def test_c3d_files_of_several_people_and_unknown_units(tmp_path: Path) -> None:
     raw = c3d.c3d_points(tmp_path / "a.c3d")
     assert raw.names == labels[: len(NAMES)] and raw.unit_m is None
     assert np.allclose(raw.positions, both[:, : len(NAMES)], atol=1e-3)
-    assert "2 subjects (Anna, Ben): the first one was read" in raw.notes[0]
+    assert "holds 2 people: 'Anna' was read; the other is 'Ben'" in raw.notes[0]
     assert raw.notes[1] == "The unit 'yards' is not known"
 
 

@@ -52,7 +52,8 @@ class Reading:
     up: Annotated[Up | None, arg(metavar="Y|Z|-Y|-Z", help_behavior_hint="")] = None
     """The file's vertical: Y, Z or X, with - where it points down."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
-    """Which animation of a file that holds several (glTF, USD); by default the longest."""
+    """Which animation of a file that holds several (glTF, USD; by default the longest), or which of its
+    people (TRC, C3D, CSV, arrays; by default the first)."""
     ground: Annotated[str | None, arg(metavar="METRES|auto", help_behavior_hint="")] = None
     """The floor's height, which becomes 0; auto takes the one that the soles tell."""
     swap_sides: Flag = False

@@ -14,7 +14,8 @@ from poise.kin.doctor.flips import neutral_pose
 from poise.kin.doctor.sides import exchanged_sides, side_votes
 from poise.kin.doctor.support import SOLE_M, Support, anatomy_of, support_of
 from poise.kin.flight import clear_fall, likely_rate
-from poise.motion import Clip, ground_shift
+from poise.motion import Clip, find_roles, ground_shift
+from poise.motion.roles import BY_PLACE
 from poise.spatial import GRAVITY
 
 _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.1: "decimetres"}
@@ -133,7 +134,10 @@ def _feet(clip: Clip, anatomy: Anatomy) -> Guess:
     ends = [f"toes '{names[j]}'" for j in toes] or [
         f"a bone tip of '{names[j]}'" for j in feet if j in tips
     ]
-    why = f"Named so and at the ends of three-joint legs; soles reach to {' and '.join(ends)}"
+    sure = {row.joint: row.confidence for row in find_roles(clip.skeleton).rows}
+    named = all(sure.get(j, 0.0) > BY_PLACE for j in feet)
+    how = "Named so and at" if named else "Not told by their names, but by their place at"
+    why = f"{how} the ends of three-joint legs; soles reach to {' and '.join(ends)}"
     return Guess("feet", ", ".join(names[j] for j in feet), why if ends else why.split(";")[0], override)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from poise.motion.io.angle_units import check_radians
 from poise.motion.io.guess import UPS, Guess
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
+from poise.motion.io.people import MOST_PEOPLE, one_person
 from poise.motion.io.raw import (
     RawMotion,
     ReadOptions,
@@ -35,10 +37,10 @@ from poise.motion.io.vertical import clear_axis, guess_up, later_frames, lean, s
 from poise.motion.skeleton import Channel, posed
 from poise.spatial import matrix_to_quat, quat_mul, rotvec_to_quat
 
-_POSES = ("poses", "smpl_poses", "pose_aa", "fullpose")
+_POSES = ("poses", "smpl_poses", "pose_aa", "fullpose", "pose_world")
 _ROOT = ("root_orient", "global_orient")
 _BODY = ("pose_body", "body_pose")
-_TRANS = ("trans", "smpl_trans", "transl")
+_TRANS = ("trans", "smpl_trans", "transl", "trans_world")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "framerate", "fps")
 _JOINTS = ("rest_joints", "J", "joints")
 _UNUSED = ("dmpls", "expression", "pose_est_dmpls")
@@ -70,6 +72,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
     Raises:
         PoiseError: arrays that are missing, of the wrong shape or not finite.
     """
+    data, people = _of_one_person(data, options.take, path)
     poses, layout = _poses(data, path)
     scale, world_unit = _scale(data, path, options)
     trans = numeric(data, _needed(data, _TRANS, path), (None, 3), path)
@@ -81,7 +84,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
     limbs = {name: poses[:, j] for j, name in enumerate(layout.names[:22]) if j}
     hint = "Convert the axis-angle vectors to radians"
     check_radians(limbs, "the SMPL family has", path, hint)
-    notes: list[str] = []
+    notes = people
     pelvis, offsets = _rest(data, path, layout, notes)
     root_pos = trans / scale * world_unit + pelvis
     quat = rotvec_to_quat(torch.tensor(poses))
@@ -119,6 +122,25 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
 
 def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str | None:
     return next((n for n in names if n in keys), None)
+
+
+def _of_one_person(
+    data: Mapping[str, Any], take: str | None, path: Path
+) -> tuple[Mapping[str, Any], list[str]]:
+    """The arrays of one person where `trans` is (P, T, 3) or (T, P, 3), and the note about the others."""
+    key = _first(data, _TRANS)
+    trans = np.zeros((0, 3)) if key is None else np.asarray(data[key])
+    if trans.ndim != 3 or min(trans.shape[:2]) > MOST_PEOPLE:
+        return data, []
+    both, notes = trans.shape[:2], one_person(trans, 2, take, path)[1]
+    out: dict[str, Any] = {}
+    for name in data:
+        with suppress(PoiseError):
+            # Pickled arrays beside the motion stay unread.
+            value = np.asarray(data[name])
+            mine = value.ndim > 2 and value.shape[:2] == both
+            out[name] = one_person(value, value.ndim - 1, take, path)[0] if mine else data[name]
+    return out, notes
 
 
 def _needed(data: Mapping[str, Any], names: Sequence[str], path: Path) -> str:

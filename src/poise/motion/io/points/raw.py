@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_poses, check_rate
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import Guess, guess_unit, stated_unit
+from poise.motion.io.people import person_of
+from poise.motion.io.points.gaps import without_zeros
 from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
 from poise.motion.io.refused import FLAT_HINT
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
@@ -63,6 +65,7 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     Raises:
         PoiseError: too few frames, flat (2D) points, a person of no human size.
     """
+    raw = _of_one_person(raw, options)
     _check(raw)
     check_rate(float(options.fps or raw.fps), raw.path)
     source = Source(format=raw.format, path=str(raw.path))
@@ -86,6 +89,16 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
             frame_time=1.0 / raw.fps, evidence=evidence(options, up, unit, rate),
         ),
     )  # fmt: skip
+
+
+def _of_one_person(raw: RawPoints, options: ReadOptions) -> RawPoints:
+    """The points of one person, without those that are 0 0 0 since they were not seen."""
+    keep, people = person_of(raw.names, options.take, raw.path)
+    names = tuple(raw.names[k] for k in keep)
+    positions, zeros = without_zeros(names, raw.positions[:, keep])
+    scores = None if raw.confidence is None else raw.confidence[:, keep]
+    notes = (*raw.notes, *people, *zeros)
+    return replace(raw, names=names, positions=positions, confidence=scores, notes=notes)
 
 
 def as_clip(points: Callable[..., RawPoints]) -> Callable[..., Clip]:

@@ -1,0 +1,134 @@
+"""Files that hold several people: one is read, and the others are named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poise.errors import PoiseError, did_you_mean
+from poise.motion.io.text import listed, shown
+from poise.motion.points.labels import split_label, unknown_labels
+
+# A person's mark before or behind a label: "P1:LKnee", "Anna_LASI", "LKnee-2", "LKnee (P2)".
+_BEFORE = re.compile(r"^(.+?)[\s:|/._-]+(.+)$")
+_BEHIND = re.compile(r"^(.+)[\s:|/._(\[-]+([^\s:|/._()\[\]-]+)[)\]]?$")
+_SIDES = {"l", "r", "left", "right", "lt", "rt"}
+#: An axis of people is no longer than this.
+MOST_PEOPLE = 8
+#: So many points make a person, and this share of them the other people have too.
+_POINTS, _SHARED = 8, 0.7
+
+
+def person_of(names: Sequence[str], take: str | None, path: Path) -> tuple[list[int], list[str]]:
+    """Columns of one person's points, and a note about the others; all columns where there is one person.
+
+    People are told by a mark before or behind their labels: the same labels appear with several marks.
+
+    Args:
+        take: which one, by mark or by number from 0; the first by default.
+
+    Raises:
+        PoiseError: there is nobody called `take`.
+    """
+    people = _marked(names, _BEFORE, (1, 2)) or _marked(names, _BEHIND, (2, 1))
+    if not people:
+        return list(range(len(names))), []
+    who, note = chosen(list(people), take, path)
+    return people[who], note
+
+
+def chosen(people: Sequence[str], take: str | None, path: Path) -> tuple[str, list[str]]:
+    """One of several people, the first unless `take` says another by name or number, and the note.
+
+    Raises:
+        PoiseError: there is nobody called `take`.
+    """
+    who = people[0]
+    if take is not None:
+        if take in people:
+            who = take
+        elif take.isdecimal() and int(take) < len(people):
+            who = people[int(take)]
+        else:
+            raise PoiseError(
+                f"it holds {len(people)} people, and none is called {shown(take)}",
+                path,
+                f"{did_you_mean(take, people)}, or give a number from 0",
+            )
+    if len(people) == 1:
+        return who, []
+    others = listed(shown(p) for p in people if p != who)
+    verb = "is" if len(people) == 2 else "are"
+    return who, [
+        f"The file holds {len(people)} people: {shown(who)} was read; the other{'s' * (verb == 'are')} {verb} "
+        f"{others} (--take NAME, or a number from 0)"
+    ]
+
+
+def _marked(names: Sequence[str], pattern: re.Pattern[str], groups: tuple[int, int]) -> dict[str, list[int]]:
+    """The columns of each person by mark, empty if the labels tell no two people."""
+    by_mark: dict[str, dict[str, int]] = {}
+    for k, name in enumerate(names):
+        match = pattern.match(name)
+        if match and match.group(groups[0]).lower() not in _SIDES:
+            by_mark.setdefault(match.group(groups[0]), {}).setdefault(match.group(groups[1]), k)
+    whole = {mark: parts for mark, parts in by_mark.items() if _is_person(list(parts))}
+    shared = {
+        mark: parts
+        for mark, parts in whole.items()
+        if any(len(parts.keys() & o.keys()) >= _SHARED * len(parts) for m, o in whole.items() if m != mark)
+    }
+    return {mark: list(parts.values()) for mark, parts in shared.items()}
+
+
+def _is_person(labels: list[str]) -> bool:
+    """Whether labels are those of a body: enough places, on both sides."""
+    known = set(labels) - set(unknown_labels(labels))
+    sides = {split_label(label)[0] for label in known}
+    return len(known) >= _POINTS and {"left", "right"} <= sides
+
+
+def one_person(
+    table: np.ndarray, axes: int, take: str | None, path: Path
+) -> tuple[np.ndarray, list[str]]:
+    """A table of `axes` axes, the first its frames: where it has one more, one person's, and the note.
+
+    The axis of people is the shorter one of the first two.
+    """
+    if table.ndim != axes + 1 or min(table.shape[:2]) > MOST_PEOPLE:
+        return table, []
+    axis = 0 if table.shape[0] < table.shape[1] else 1
+    names = [str(k) for k in range(table.shape[axis])]
+    if not names:
+        raise PoiseError("its axis of people is empty", path)
+    who, note = chosen(names, take, path)
+    return np.take(table, int(who), axis=axis), note
+
+
+def one_of_dicts(
+    value: Any, known: Callable[[Mapping[str, Any]], bool], take: str | None, path: Path
+) -> tuple[Any, list[str]]:
+    """Of a dict (or list) of people, each a dict of arrays that is `known`, one; else the value itself."""
+    pairs: Iterable[tuple[Any, Any]]
+    if isinstance(value, dict):
+        pairs = value.items()
+    elif isinstance(value, list):
+        pairs = enumerate(value)
+    else:
+        return value, []
+    parts = list(pairs)
+    # What stands beside the people, such as the frame rate, is everybody's.
+    shared = {k: v for k, v in parts if isinstance(k, str) and not isinstance(v, dict)}
+    people = {
+        str(key): {**shared, **item}
+        for key, item in parts
+        if isinstance(item, dict) and all(isinstance(k, str) for k in item) and known({**shared, **item})
+    }
+    if not people or known(shared):
+        return value, []
+    who, note = chosen(list(people), take, path)
+    return people[who], note
