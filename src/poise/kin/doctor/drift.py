@@ -13,10 +13,10 @@ from poise.kin.series import find_runs, gaussian
 from poise.motion import Clip
 
 #: A drift of less (m) over the whole clip is none, and so is one of a clip that is shorter (s).
-LEAST_M, LEAST_S = 0.06, 0.8
+LEAST_M, LEAST_S = 0.1, 0.8
 # A body on stairs or a slope is borne at one height for the time of each step. One that drifts moves up
 # while it is borne: about as fast (shares of the whole clip's speed) in its usual frame as in the mean.
-_USUAL = (0.6, 1.6)
+_USUAL = (0.7, 1.5)
 # Share of the frames in which the lowest point keeps to the line, and deviation (s) of the smoothing.
 _BORNE, _SMOOTH_S = 0.5, 0.05
 #: A spell off the floor that is said to be none by its steady height alone: for so long (s), this fast.
