@@ -74,7 +74,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda f: save_npy(f / "a.npy", _tree(node_names=[])),
         ": it has 0 joints; 1 to 2000 are allowed"),
     "a list of two dicts": (
-        lambda f: save_pickle(f / "a.pkl", [aist(), aist()]),
+        lambda f: save_pickle(f / "a.pkl", [{"a": 1}, {"a": 2}]),
         ": the pickle holds a list, not a dict of named arrays"),
     "a type among the data": (
         lambda f: save_pickle(f / "a.pkl", {"smpl_poses": np.ndarray}),

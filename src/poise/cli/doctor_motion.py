@@ -52,7 +52,7 @@ def run_on(path: Path, options: Options) -> Answer:
     _show(str(path), found)
     outcome = f"{len(found.faults)} faults"
     if target is None:
-        return Answer(facts, outcome=outcome)
+        return Answer(facts, notes=clip.skeleton.source.notes, outcome=outcome)
     healed = heal(clip) if fix else clip
     written, said = healed, ""
     if rest:
@@ -73,7 +73,7 @@ def run_on(path: Path, options: Options) -> Answer:
         facts["fixed"]["rest_pose"] = said
         say(said)
     if not fix:
-        return Answer(facts, {"clip": target}, outcome=outcome)
+        return Answer(facts, {"clip": target}, clip.skeleton.source.notes, outcome=outcome)
     _compare(found, left)
     if worse := facts["fixed"]["worse"]:
         say(f"Mending made these figures worse: {', '.join(worse)}.")
@@ -85,7 +85,8 @@ def run_on(path: Path, options: Options) -> Answer:
     if rate := _hidden_rate(found, left):
         say(rate)
     _written(clip, healed, found, left)
-    return Answer(facts, {"clip": target}, outcome=f"{outcome}, {len(left.faults)} after")
+    notes, outcome = clip.skeleton.source.notes, f"{outcome}, {len(left.faults)} after"
+    return Answer(facts, {"clip": target}, notes, outcome=outcome)
 
 
 def _show(title: str, found: Examination) -> None:

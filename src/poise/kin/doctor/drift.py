@@ -24,7 +24,7 @@ HELD_S, RISES = 0.6, 0.02
 
 
 class Drift(NamedTuple):
-    """speed: m/s, upwards. at_start: height (m) of the drifting floor in frame 0. frames, fps: the clip's."""
+    """speed: m/s, upwards. at_start: m, the drifting floor in frame 0. frames, fps: the clip's."""
 
     speed: float
     at_start: float
@@ -75,7 +75,7 @@ def find_drift(low: np.ndarray, fps: float) -> Drift | None:
 
 
 def mend_drift(clip: Clip, low: np.ndarray) -> Clip:
-    """The clip without the steady drift of its floor, which the lowest points `low (T)` m of its body tell."""
+    """The clip without the steady drift of its floor, which its lowest points `low (T)` m tell."""
     drift = find_drift(low, clip.fps)
     if drift is None:
         return clip
@@ -83,7 +83,7 @@ def mend_drift(clip: Clip, low: np.ndarray) -> Clip:
 
 
 def drift_faults(low: np.ndarray, fps: float, flying: np.ndarray) -> list[Fault]:
-    """The steady drift, or else the spells in which the body is off the floor and rises or sinks steadily.
+    """The steady drift, or else the spells off the floor in which the body rises or sinks steadily.
 
     Args:
         low: `(T)` m, the body's lowest point. flying: `(T)`, where it falls freely.

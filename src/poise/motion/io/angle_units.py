@@ -46,8 +46,8 @@ def check_radians(angles: Mapping[str, np.ndarray], stated: str, path: Path, hin
 
 
 def few_degrees(angles: Mapping[str, np.ndarray]) -> tuple[str, float] | None:
-    """The joint that moves most and its largest angle (in degrees as they stand), if angles that are said
-    to be degrees look like radians: all are tiny, and several would move well if they were radians.
+    """The joint that moves most and its largest angle, if angles that are said to be degrees look like
+    radians: all are tiny, and several joints would move well if they were radians.
 
     angles: `(T, ...)` by the joint's name, without roots.
     """
@@ -67,6 +67,7 @@ def few_degrees_note(angles: Mapping[str, np.ndarray]) -> list[str]:
     if found is None:
         return []
     return [
-        f"No joint turns by more than {_FEW_DEG:g} degrees ('{found[0]}' most, to {found[1]:.3g}): the angles "
-        "look like radians, but were read as degrees, which the format has (uncertain; write degrees)"
+        f"No joint turns by more than {_FEW_DEG:g} degrees ('{found[0]}' most, to {found[1]:.3g}): the "
+        "angles look like radians, but were read as degrees, as the format has them (uncertain; write "
+        "degrees)"
     ]

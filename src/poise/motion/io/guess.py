@@ -30,9 +30,12 @@ UNITS = {
 # How usual a unit is in files; those of the Acclaim system are the CMU library's as a rule.
 _USUAL = {"inches": 0.1, "ASF units": 0.03, "decimetres": 0.03, "feet": 0.02}
 _USUAL_ASF = {**_USUAL, "ASF units": 1.0}
-# Densities (per m) of heights in motion files: grown-ups about 1.72 m, some children, few dolls and giants.
+# Densities (per m) of heights in motion files: grown-ups about 1.72 m, some children, few others.
 _GROWN_M, _SPREAD_M = 1.72, 0.12
-_BANDS = (((0.75, 1.5), 0.07), ((0.6, 0.75), 0.02), ((0.5, 0.6), 0.004), ((2.0, 2.3), 0.004), ((2.3, 3.0), 0.001))
+_BANDS = (
+    *(((0.75, 1.5), 0.07), ((0.6, 0.75), 0.02), ((0.5, 0.6), 0.004)),
+    *(((2.0, 2.3), 0.004), ((2.3, 3.0), 0.001)),
+)
 # A unit that is so many times likelier than the next one is sure.
 _CLEARLY = 20.0
 _GUESS_BAND = (0.5, 3.0)

@@ -24,7 +24,7 @@ _POINTS, _SHARED = 8, 0.7
 
 
 def person_of(names: Sequence[str], take: str | None, path: Path) -> tuple[list[int], list[str]]:
-    """Columns of one person's points, and a note about the others; all columns where there is one person.
+    """Columns of one person's points, and a note about the others; all where there is one person.
 
     People are told by a mark before or behind their labels: the same labels appear with several marks.
 
@@ -62,14 +62,16 @@ def chosen(people: Sequence[str], take: str | None, path: Path) -> tuple[str, li
     if len(people) == 1:
         return who, []
     others = listed(shown(p) for p in people if p != who)
-    verb = "is" if len(people) == 2 else "are"
+    rest = "other is" if len(people) == 2 else "others are"
     return who, [
-        f"The file holds {len(people)} people: {shown(who)} was read; the other{'s' * (verb == 'are')} {verb} "
-        f"{others} (--take NAME, or a number from 0)"
+        f"The file holds {len(people)} people: {shown(who)} was read; the {rest} {others} (--take NAME, or "
+        "a number from 0)"
     ]
 
 
-def _marked(names: Sequence[str], pattern: re.Pattern[str], groups: tuple[int, int]) -> dict[str, list[int]]:
+def _marked(
+    names: Sequence[str], pattern: re.Pattern[str], groups: tuple[int, int]
+) -> dict[str, list[int]]:
     """The columns of each person by mark, empty if the labels tell no two people."""
     by_mark: dict[str, dict[str, int]] = {}
     for k, name in enumerate(names):
@@ -80,7 +82,9 @@ def _marked(names: Sequence[str], pattern: re.Pattern[str], groups: tuple[int, i
     shared = {
         mark: parts
         for mark, parts in whole.items()
-        if any(len(parts.keys() & o.keys()) >= _SHARED * len(parts) for m, o in whole.items() if m != mark)
+        if any(
+            len(parts.keys() & o.keys()) >= _SHARED * len(parts) for m, o in whole.items() if m != mark
+        )
     }
     return {mark: list(parts.values()) for mark, parts in shared.items()}
 
@@ -112,7 +116,7 @@ def one_person(
 def one_of_dicts(
     value: Any, known: Callable[[Mapping[str, Any]], bool], take: str | None, path: Path
 ) -> tuple[Any, list[str]]:
-    """Of a dict (or list) of people, each a dict of arrays that is `known`, one; else the value itself."""
+    """One of a dict (or list) of people, each a dict of arrays that is `known`; else the value itself."""
     pairs: Iterable[tuple[Any, Any]]
     if isinstance(value, dict):
         pairs = value.items()

@@ -1,9 +1,9 @@
-"""The vertical of a file that states none: by what bears weight, by how the body stands, by its rest pose.
+"""The vertical of a file that states none: by what bears weight, by posture, by the rest pose.
 
-Whatever bears weight keeps one height, stands still while it does, and lies under the body, averaged over
-time: by Newton's law a body whose weight lies beside its supports falls over. Of the six directions of a
-file's axes the true one fulfils that best, also where someone lies, crawls or stands on the hands; a
-body that stands still fulfils it along several axes, and there its posture decides.
+Whatever bears weight keeps one height, stands still while it does, and lies under the body, averaged
+over time: by Newton's law a body whose weight lies beside its supports falls over. Of the six directions
+of a file's axes the true one fulfils that best, also where someone lies, crawls or stands on the hands;
+a body that stands still fulfils it along several axes, and there its posture decides.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ LATER_S = 0.1
 # Shares of the body's size: how far above the lowest point others bear weight as well, how far a point
 # gets in `LATER_S` that stands still, how far soles and palms reach beyond their joints.
 _NEAR, _STILL, _REACH = 0.06, 0.02, 0.1
+# The same: what stands still while a trunk moves by twice as much, and the most that creeping counts.
+_HELD, _CREEPS = 0.003, 0.03
 # What a posture is worth against the supports (shares of the size, like their cost), and what an unusual
 # axis costs. A rest pose along Y tells less: templates stand so in files of any vertical.
 _STANDS, _RESTS, _RESTS_Y = 0.12, 0.16, 0.10
@@ -32,6 +34,7 @@ _ON_HEAD = 0.5
 #: A guess that is better than the next one by less is uncertain.
 SURE = 0.15
 _HIPS = ("hip", "upleg", "upperleg", "thigh", "femur")
+_ARMS = ("shoulder", "upperarm", "uparm", "humerus", "shldr")
 _HANDS = ("hand", "wrist")
 
 
@@ -40,20 +43,24 @@ class Support:
     """How a body is borne if one axis is the vertical; shares of its size.
 
     wander: how much the height of what bears it varies. off: how far its weight lies beside it, averaged
-    over time. share: part of the frames in which something that bears it stands still. slide: how fast the
-    slowest supporting point is in the mean, over the speed of the whole body.
+    over time. share: part of the frames in which something that bears it stands still. apart: how much
+    the heights of hands and feet differ that stand still while the trunk moves. creep: how far the
+    slowest supporting point gets in `LATER_S` in the mean. slide: the same over what the body does.
     """
 
     wander: float
     off: float
     share: float
+    apart: float
+    creep: float
     slide: float
     on_head: bool = False
 
     @property
     def cost(self) -> float:
         """0 where the axis bears the body as the ground does."""
-        return self.wander + self.off + 0.5 * (1.0 - self.share) + _ON_HEAD * self.on_head
+        lost = 0.5 * (1.0 - self.share) + _ON_HEAD * self.on_head
+        return self.wander + self.off + 0.4 * self.apart + 10.0 * self.creep + lost
 
 
 def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> dict[str, Support]:
@@ -61,7 +68,13 @@ def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> 
     size = max(float(np.median(np.linalg.norm(np.ptp(positions, axis=1), axis=-1))), 1e-12)
     weight = _weight(names, positions)
     moved = np.linalg.norm(later - positions, axis=-1) / size
-    heads, hands = landmarks(names)[0], _named(names, _HANDS)
+    heads, _, feet = landmarks(names)
+    hands = _named(names, _HANDS)
+    ends = [*hands, *feet]
+    trunk = [moved[:, at].min(1) for at in (_named(names, _HIPS), _named(names, _ARMS)) if at]
+    holding = np.zeros((len(moved), len(ends)), dtype=bool)
+    if len(trunk) == 2:
+        holding = (moved[:, ends] < _HELD) & (np.minimum(*trunk) > 2 * _HELD)[:, None]
     out = {}
     for up in UPS:
         c = "XYZ".index(up[-1])
@@ -72,12 +85,14 @@ def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> 
         borne = still.any(1)
         slowest = np.where(near, moved, np.inf).min(1)
         slide = float(slowest.mean() / max(np.median(moved, axis=1).mean(), 1e-9))
+        creep = float(np.minimum(slowest, _CREEPS).mean())
+        apart = _apart(height[:, ends], holding) / size
         head = bool(heads and hands) and bool(
             np.median(height[:, heads[0]] - height[:, hands].min(1)) < -_REACH * size / 2
             and np.median(height[:, heads[0]] - low) < 2 * _REACH * size
         )
         if not borne.any():
-            out[up] = Support(np.ptp(low) / size, 1.0, 0.0, slide, head)
+            out[up] = Support(float(np.ptp(low)) / size, 1.0, 0.0, apart, creep, slide, head)
             continue
         wander = float(np.subtract(*np.percentile(low[borne], [95, 5]))) / size
         flat = [k for k in range(3) if k != c]
@@ -87,8 +102,17 @@ def supports(names: Sequence[str], positions: np.ndarray, later: np.ndarray) -> 
         over = np.where(mask, places, -np.inf).max(1) + _REACH * size
         beside = np.maximum(at - over, 0.0) - np.maximum(under - at, 0.0)
         off = float(np.linalg.norm(beside.mean(0))) / size
-        out[up] = Support(wander, off, float(borne.mean()), slide, head)
+        out[up] = Support(wander, off, float(borne.mean()), apart, creep, slide, head)
     return out
+
+
+def _apart(height: np.ndarray, mask: np.ndarray) -> float:
+    """The spread of heights `(S, N)` where `mask` is true in two places at least, averaged over S."""
+    some = mask.sum(1) > 1
+    if not some.any():
+        return 0.0
+    spread = np.where(mask, height, -np.inf).max(1)[some] - np.where(mask, height, np.inf).min(1)[some]
+    return float(spread.sum()) / len(height)
 
 
 def later_frames(at: np.ndarray, fps: float, frames: int) -> np.ndarray:
@@ -103,7 +127,7 @@ def _named(names: Sequence[str], words: Sequence[str]) -> list[int]:
 
 
 def _weight(names: Sequence[str], positions: np.ndarray) -> np.ndarray:
-    """`(S, 3)` about where the body's weight lies: between hips and neck, or in the middle of the joints."""
+    """`(S, 3)` about where the body's weight lies: between hips and neck, or amid the joints."""
     heads, necks, _ = landmarks(names)
     hips, tops = _named(names, _HIPS), necks or heads
     if not (hips and tops):
@@ -175,12 +199,16 @@ def _why(
     why = []
     if moving == best:
         why.append("the body stands along it")
+    elif moving is not None and moving[-1] == best[-1]:
+        why.append("what bears the body keeps its height and its place there, under a head that is down")
     elif moving is not None:
-        why.append(f"it bears the body, which lies along {moving.lstrip('-')},")
+        why.append(
+            f"what bears the body keeps one height along it, while the body lies along {moving[-1]}"
+        )
     if resting == best and not agree:
         why.append("the rest pose stands along it")
     reason = " and ".join(why) or "the lowest points keep one height and stand still along it"
-    text = f"The file states no vertical: {best} taken, since {reason.rstrip(',')}"
+    text = f"The file states no vertical: {best} taken, since {reason}"
     if best[0] == "-":
         text += f"; along {best[1]} alone it would be head down, and was turned over"
     if sure and moving == best:

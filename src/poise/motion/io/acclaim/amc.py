@@ -81,9 +81,7 @@ def read_amc(path: Path, options: ReadOptions) -> Clip:
     return assemble(_raw(asf, path, names, root_pos, rot, notes), options)
 
 
-def _check_unit(
-    frames: dict[str, np.ndarray], degrees: bool, path: Path, notes: list[str]
-) -> None:
+def _check_unit(frames: dict[str, np.ndarray], degrees: bool, path: Path, notes: list[str]) -> None:
     """Refuses angles that cannot be radians, and doubts degrees that look like them."""
     angles = {name: values for name, values in frames.items() if name != "root"}
     if degrees:

@@ -216,7 +216,7 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
 
 
 def one_number(data: Mapping[str, Any], key: str, path: Path) -> float:
-    """A finite number that stands alone, in an array of any number of axes; text such as "30 fps" too."""
+    """A finite number that stands alone, in an array of any number of axes or as text ("30 fps")."""
     if (text := text_of(data[key])) and (rate := rate_in(text)) is not None:
         return rate
     value = float(numeric({key: np.ravel(np.asarray(data[key]))}, key, (1,), path)[0])

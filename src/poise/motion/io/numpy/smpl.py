@@ -127,7 +127,7 @@ def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str
 def _of_one_person(
     data: Mapping[str, Any], take: str | None, path: Path
 ) -> tuple[Mapping[str, Any], list[str]]:
-    """The arrays of one person where `trans` is (P, T, 3) or (T, P, 3), and the note about the others."""
+    """The arrays of one person where `trans` is (P, T, 3) or (T, P, 3), and a note about the others."""
     key = _first(data, _TRANS)
     trans = np.zeros((0, 3)) if key is None else np.asarray(data[key])
     if trans.ndim != 3 or min(trans.shape[:2]) > MOST_PEOPLE:
@@ -271,11 +271,11 @@ def _up(
         if along in (None, "Z"):
             return "Z", [plain]
         borne = supports(layout.names, pos, later)
-        if borne["Z"].wander > 0.5 and borne[along].cost < 0.3 and borne[along].slide < 0.8:
+        if borne["Z"].wander > 0.5 and borne[along].cost + 0.5 < borne["Z"].cost:
             told = f"it would climb and fall along Z, and stands and steps along {along}"
             return along, [
-                f"The file has the keys of AMASS, which is Z up, but the body does not fit: {told}; {along} "
-                "taken (uncertain; override with --up Z)"
+                f"The file has the keys of AMASS, which is Z up, but the body does not fit: {told}; "
+                f"{along} taken (uncertain; override with --up Z)"
             ]
         return "Z", [
             f"{plain}; the body lies along {along[-1]} (if it stands there, state --up {along})"

@@ -76,7 +76,9 @@ def named_joint_points(
         PoiseError: another number of joints, names that do not fit them, or what `numeric` refuses.
     """
     if named := next((key for key in _NAMES if key in data), None):
-        own: dict[str, Any] = {key: data[key] for key in ("fps", "confidence", "unit_m", "up_axis") if key in data}
+        own: dict[str, Any] = {
+            key: data[key] for key in ("fps", "confidence", "unit_m", "up_axis") if key in data
+        }
         as_points = {**own, "positions": data["joints"], "names": data[named]}
         return replace(array_points(as_points, path, options), format="joints")
     table, people = one_person(np.asarray(data["joints"]), 3, options.take, path)
@@ -131,9 +133,7 @@ def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNS
     if "confidence" in data:
         own, _ = one_person(np.asarray(data["confidence"]), 2, options.take, path)
         scores = numeric({"confidence": own}, "confidence", positions.shape[:2], path)
-    return RawPoints(
-        "keypoints-npz", path, names, positions, fps, unit, up, scores, notes=tuple(notes)
-    )
+    return RawPoints("keypoints-npz", path, names, positions, fps, unit, up, scores, notes=tuple(notes))
 
 
 def is_mdm(data: Mapping[str, Any]) -> bool:

@@ -41,10 +41,12 @@ def without_zeros(names: Sequence[str], positions: np.ndarray) -> tuple[np.ndarr
     if not missing.any():
         return positions, []
     counts = missing.sum(0)
-    told = listed((f"{names[k]} {counts[k]}" for k in np.argsort(-counts, kind="stable") if counts[k]), 6)
+    told = listed(
+        (f"{names[k]} {counts[k]}" for k in np.argsort(-counts, kind="stable") if counts[k]), 6
+    )
     note = (
-        f"{int(counts.sum())} of {missing.size} points are written as 0 0 0 where they are missing: they were "
-        f"not taken as places ({told})"
+        f"{int(counts.sum())} of {missing.size} points are written as 0 0 0 where they are missing: they "
+        f"were not taken as places ({told})"
     )
     return np.where(missing[..., None], np.nan, positions), [note]
 

@@ -25,7 +25,8 @@ from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
 from poise.motion.skeleton import Source
 
-UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048, "dm": 0.1}
+UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS_M |= {"ft": 0.3048, "dm": 0.1}
 """Metres in a unit, as tables of points call it."""
 
 
@@ -170,7 +171,7 @@ def _body(points: Keypoints) -> _Body:
             points.source.path,
         )
     after = later_frames(frames, points.fps, len(seen))
-    # Frames that are followed by others tell what stands still; the last ones are followed by themselves.
+    # Frames with a later one tell what stands still; without any, each is its own later one.
     both = seen[after]
     frames, after = (frames[both], after[both]) if both.any() else (frames, frames)
     at = sampled(len(frames))

@@ -32,7 +32,10 @@ class _Header:
 
 def looks_like_trc(head: bytes) -> bool:
     """Whether a file's first bytes are a TRC header."""
-    return head[:12].lower() == b"pathfiletype" or re.search(rb"\ndatarate[\t ]", head[:2000].lower()) is not None
+    return (
+        head[:12].lower() == b"pathfiletype"
+        or re.search(rb"\ndatarate[\t ]", head[:2000].lower()) is not None
+    )
 
 
 def trc_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
