@@ -93,12 +93,12 @@ def lying(along_up: bool = False) -> dict:  # type: ignore[type-arg]
     data["trans"] = np.tile([0.1, 0.3, 0.35], (60, 1))
     data["trans"][:, 2] += 0.05 * np.sin(np.arange(60) / 6.0)
     if along_up:
-        # A walk of 2.4 m along Z, which would be a climb if Z were up.
-        data["trans"] = np.stack((np.zeros(60), np.full(60, 1.2), 0.04 * np.arange(60)), -1)
-        data["poses"] = np.zeros((60, 66))
-        phase = 2 * np.pi * np.arange(60) / 30
-        for side, sign in ((1, 1.0), (2, -1.0)):
-            data["poses"][:, 3 * side] = sign * 0.45 * np.sin(phase)
+        # A walk of 2 m along Z, which would be a climb if Z were up; the legs swing as fast as it goes.
+        t = np.arange(120) / 60.0
+        data["trans"] = np.stack((0 * t, 1.2 + 0 * t, 1.0 * t), -1)
+        data["poses"] = np.zeros((120, 66))
+        for joint, sign in ((1, 1.0), (2, -1.0)):
+            data["poses"][:, 3 * joint] = sign * 0.2 * np.sin(2 * np.pi * t)
     return data
 
 

@@ -13,9 +13,11 @@ from poise.errors import PoiseError, did_you_mean
 from poise.motion.io.text import listed, shown
 from poise.motion.points.labels import split_label, unknown_labels
 
-# A person's mark before or behind a label: "P1:LKnee", "Anna_LASI", "LKnee-2", "LKnee (P2)".
-_BEFORE = re.compile(r"^(.+?)[\s:|/._-]+(.+)$")
-_BEHIND = re.compile(r"^(.+)[\s:|/._(\[-]+([^\s:|/._()\[\]-]+)[)\]]?$")
+# A person's mark before or behind a label, which may consist of words itself: "P1:LKnee", "Anna_LASI",
+# "person 1 LKnee", "L_Knee-2", "LKnee (P2)".
+_APART = r"[\s:|/._(\[-]"
+_FIRST = re.compile(rf"^([^\s:|/._(\[-]+){_APART}+(.+)$")
+_LAST = re.compile(rf"^(.+?){_APART}+([^\s:|/._(\[-]+)$")
 _SIDES = {"l", "r", "left", "right", "lt", "rt"}
 #: An axis of people is no longer than this.
 MOST_PEOPLE = 8
@@ -23,8 +25,11 @@ MOST_PEOPLE = 8
 _POINTS, _SHARED = 8, 0.7
 
 
-def person_of(names: Sequence[str], take: str | None, path: Path) -> tuple[list[int], list[str]]:
-    """Columns of one person's points, and a note about the others; all where there is one person.
+def person_of(
+    names: Sequence[str], take: str | None, path: Path
+) -> tuple[list[int], tuple[str, ...], list[str]]:
+    """Columns and bare labels of one person's points, and a note about the others; all as they are where
+    there is one person.
 
     People are told by a mark before or behind their labels: the same labels appear with several marks.
 
@@ -34,11 +39,12 @@ def person_of(names: Sequence[str], take: str | None, path: Path) -> tuple[list[
     Raises:
         PoiseError: there is nobody called `take`.
     """
-    people = _marked(names, _BEFORE, (1, 2)) or _marked(names, _BEHIND, (2, 1))
-    if not people:
-        return list(range(len(names))), []
+    ways = ((pattern, mark) for mark in (1, 2) for pattern in (_FIRST, _LAST))
+    people = next((found for pattern, mark in ways if (found := _marked(names, pattern, mark))), None)
+    if people is None:
+        return list(range(len(names))), tuple(names), []
     who, note = chosen(list(people), take, path)
-    return people[who], note
+    return list(people[who].values()), tuple(people[who]), note
 
 
 def chosen(people: Sequence[str], take: str | None, path: Path) -> tuple[str, list[str]]:
@@ -69,24 +75,22 @@ def chosen(people: Sequence[str], take: str | None, path: Path) -> tuple[str, li
     ]
 
 
-def _marked(
-    names: Sequence[str], pattern: re.Pattern[str], groups: tuple[int, int]
-) -> dict[str, list[int]]:
-    """The columns of each person by mark, empty if the labels tell no two people."""
+def _marked(names: Sequence[str], pattern: re.Pattern[str], mark: int) -> dict[str, dict[str, int]]:
+    """Each person's columns by bare label, by mark; empty if the labels tell no two people.
+
+    mark: the group of the pattern that is the person's, 1 or 2.
+    """
     by_mark: dict[str, dict[str, int]] = {}
     for k, name in enumerate(names):
-        match = pattern.match(name)
-        if match and match.group(groups[0]).lower() not in _SIDES:
-            by_mark.setdefault(match.group(groups[0]), {}).setdefault(match.group(groups[1]), k)
-    whole = {mark: parts for mark, parts in by_mark.items() if _is_person(list(parts))}
-    shared = {
-        mark: parts
-        for mark, parts in whole.items()
-        if any(
-            len(parts.keys() & o.keys()) >= _SHARED * len(parts) for m, o in whole.items() if m != mark
-        )
+        match = pattern.match(name.strip(")] "))
+        if match and match.group(mark).lower() not in _SIDES:
+            by_mark.setdefault(match.group(mark), {}).setdefault(match.group(3 - mark), k)
+    whole = {who: parts for who, parts in by_mark.items() if _is_person(list(parts))}
+    return {
+        who: parts
+        for who, parts in whole.items()
+        if any(len(parts.keys() & o.keys()) >= _SHARED * len(parts) for w, o in whole.items() if w != who)
     }
-    return {mark: list(parts.values()) for mark, parts in shared.items()}
 
 
 def _is_person(labels: list[str]) -> bool:

@@ -94,8 +94,7 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
 
 def _of_one_person(raw: RawPoints, options: ReadOptions) -> RawPoints:
     """The points of one person, without those that are 0 0 0 since they were not seen."""
-    keep, people = person_of(raw.names, options.take, raw.path)
-    names = tuple(raw.names[k] for k in keep)
+    keep, names, people = person_of(raw.names, options.take, raw.path)
     positions, zeros = without_zeros(names, raw.positions[:, keep])
     scores = None if raw.confidence is None else raw.confidence[:, keep]
     notes = (*raw.notes, *people, *zeros)
