@@ -89,7 +89,9 @@ def _marked(names: Sequence[str], pattern: re.Pattern[str], mark: int) -> dict[s
     return {
         who: parts
         for who, parts in whole.items()
-        if any(len(parts.keys() & o.keys()) >= _SHARED * len(parts) for w, o in whole.items() if w != who)
+        if any(
+            len(parts.keys() & o.keys()) >= _SHARED * len(parts) for w, o in whole.items() if w != who
+        )
     }
 
 
