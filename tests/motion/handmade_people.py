@@ -20,6 +20,11 @@ def _points(**rows: np.ndarray) -> np.ndarray:
     return np.stack([*columns, rows["Neck"], rows["Head"], rows["Nose"]], 1)
 
 
+def _by(x: float, y: float, z: float) -> np.ndarray:
+    """A step, m."""
+    return np.array([x, y, z])
+
+
 def _pair(half: float, middle: np.ndarray) -> np.ndarray:
     """Two points beside a middle one `(T, 3)`, along X."""
     return middle[:, None] + _SIDE[:, None] * np.array([half, 0.0, 0.0])
@@ -58,15 +63,15 @@ def crawl(frames: int = 120, fps: float = 30.0) -> np.ndarray:
 
     body = np.stack((0 * t, length * t / step, 0 * t), -1)
     by = (feet(0.0), feet(0.5))
-    hands = np.stack((by[1] + [-0.18, 0.55, 0.04], by[0] + [0.18, 0.55, 0.04]), 1)
-    knees = np.stack((by[0] + [-0.1, 0.0, 0.05], by[1] + [0.1, 0.0, 0.05]), 1)
-    ankles = knees + [0.0, -0.42, 0.03]
-    shoulders = _pair(0.18, body + [0.0, 0.6, 0.6])
+    hands = np.stack((by[1] + _by(-0.18, 0.55, 0.04), by[0] + _by(0.18, 0.55, 0.04)), 1)
+    knees = np.stack((by[0] + _by(-0.1, 0.0, 0.05), by[1] + _by(0.1, 0.0, 0.05)), 1)
+    ankles = knees + _by(0.0, -0.42, 0.03)
+    shoulders = _pair(0.18, body + _by(0.0, 0.6, 0.6))
     return _points(
-        Hip=_pair(0.1, body + [0.0, 0.1, 0.5]), Knee=knees, Ankle=ankles,
-        BigToe=ankles + [0.0, -0.15, -0.05], Shoulder=shoulders, Elbow=(shoulders + hands) / 2,
-        Wrist=hands, Neck=body + [0.0, 0.65, 0.62], Head=body + [0.0, 0.85, 0.68],
-        Nose=body + [0.0, 0.9, 0.6],
+        Hip=_pair(0.1, body + _by(0.0, 0.1, 0.5)), Knee=knees, Ankle=ankles,
+        BigToe=ankles + _by(0.0, -0.15, -0.05), Shoulder=shoulders, Elbow=(shoulders + hands) / 2,
+        Wrist=hands, Neck=body + _by(0.0, 0.65, 0.62), Head=body + _by(0.0, 0.85, 0.68),
+        Nose=body + _by(0.0, 0.9, 0.6),
     )  # fmt: skip
 
 
@@ -84,16 +89,17 @@ def walk(frames: int = 90, fps: float = 30.0) -> np.ndarray:
     ankles = np.stack((foot(0.0, -0.1), foot(0.5, 0.1)), 1)
     body = np.stack((0 * t, ankles[..., 1].mean(1), 0 * t), -1)
     swing = 0.25 * np.sin(2 * np.pi * t / step)
-    hips = _pair(0.1, body + [0.0, 0.0, 0.88])
-    shoulders = _pair(0.18, body + [0.0, 0.0, 1.4])
-    wrists = shoulders + [0.0, 0.0, -0.54]
+    hips = _pair(0.1, body + _by(0.0, 0.0, 0.88))
+    shoulders = _pair(0.18, body + _by(0.0, 0.0, 1.4))
+    wrists = shoulders + _by(0.0, 0.0, -0.54)
     wrists[:, 0, 1] += swing
     wrists[:, 1, 1] -= swing
     return _points(
-        Hip=hips, Knee=(hips + ankles) / 2 + [0.0, -0.05, 0.0], Ankle=ankles,
-        BigToe=ankles + [0.0, -0.18, -0.08], Shoulder=shoulders,
-        Elbow=(shoulders + wrists) / 2 + [0.0, 0.02, 0.0], Wrist=wrists,
-        Neck=body + [0.0, 0.0, 1.45], Head=body + [0.0, 0.0, 1.68], Nose=body + [0.0, -0.1, 1.6],
+        Hip=hips, Knee=(hips + ankles) / 2 + _by(0.0, -0.05, 0.0), Ankle=ankles,
+        BigToe=ankles + _by(0.0, -0.18, -0.08), Shoulder=shoulders,
+        Elbow=(shoulders + wrists) / 2 + _by(0.0, 0.02, 0.0), Wrist=wrists,
+        Neck=body + _by(0.0, 0.0, 1.45), Head=body + _by(0.0, 0.0, 1.68),
+        Nose=body + _by(0.0, -0.1, 1.6),
     )  # fmt: skip
 
 
@@ -109,7 +115,7 @@ def handstand(frames: int = 60, fps: float = 30.0) -> np.ndarray:
     return _points(
         Hip=_pair(0.1, at(1.05)), Knee=_pair(0.1, at(1.47)), Ankle=_pair(0.1, at(1.88)),
         BigToe=_pair(0.1, at(2.05)), Shoulder=shoulders, Elbow=(hands + shoulders) / 2, Wrist=hands,
-        Neck=at(0.5), Head=at(0.3), Nose=at(0.33) + [0.0, -0.1, 0.0],
+        Neck=at(0.5), Head=at(0.3), Nose=at(0.33) + _by(0.0, -0.1, 0.0),
     )  # fmt: skip
 
 

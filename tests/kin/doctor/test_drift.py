@@ -21,8 +21,8 @@ def raised(clip: Clip, heights: np.ndarray) -> Clip:
 
 
 def soles(frames: int = 240, climb: float = 0.0) -> np.ndarray:
-    """`(T)` lowest points of a walk: borne for 0.4 s each on one height, `climb` m higher each step, with
-    a touch of roll."""
+    """`(T)` lowest points of a walk: borne for 0.4 s each on one height, `climb` m higher each step,
+    with a touch of roll."""
     t = np.arange(frames) / FPS
     step = np.floor(t / 0.4)
     return climb * step + 0.004 * np.sin(2 * np.pi * t / 0.4)

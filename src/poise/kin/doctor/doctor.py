@@ -79,9 +79,10 @@ def examine(clip: Clip) -> Examination:
 def heal(clip: Clip, path: bool = True) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
-    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, a height that
-    drifts, the height above the floor, sliding feet. A step changes nothing if its faults are not there.
-    path: whether the root's path may be freed of the slip of standing feet, or legs alone hold them.
+    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, a
+    drifting height, the height above the floor, sliding feet. A step changes nothing if its faults are
+    not there. path: whether the root's path may be freed of the slip of standing feet, or legs alone
+    hold them.
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)

@@ -37,41 +37,41 @@ def person_of(
         take: which one, by mark or by number from 0; the first by default.
 
     Raises:
-        PoiseError: there is nobody called `take`.
+        PoiseError: no person is called `take`.
     """
     ways = ((pattern, mark) for mark in (1, 2) for pattern in (_FIRST, _LAST))
     people = next((found for pattern, mark in ways if (found := _marked(names, pattern, mark))), None)
     if people is None:
         return list(range(len(names))), tuple(names), []
-    who, note = chosen(list(people), take, path)
-    return list(people[who].values()), tuple(people[who]), note
+    one, note = chosen(list(people), take, path)
+    return list(people[one].values()), tuple(people[one]), note
 
 
 def chosen(people: Sequence[str], take: str | None, path: Path) -> tuple[str, list[str]]:
     """One of several people, the first unless `take` says another by name or number, and the note.
 
     Raises:
-        PoiseError: there is nobody called `take`.
+        PoiseError: no person is called `take`.
     """
-    who = people[0]
+    one = people[0]
     if take is not None:
         if take in people:
-            who = take
+            one = take
         elif take.isdecimal() and int(take) < len(people):
-            who = people[int(take)]
+            one = people[int(take)]
         else:
             raise PoiseError(
                 f"it holds {len(people)} people, and none is called {shown(take)}",
                 path,
-                f"{did_you_mean(take, people)}, or give a number from 0",
+                f"{did_you_mean(take, list(people))}, or give a number from 0",
             )
     if len(people) == 1:
-        return who, []
-    others = listed(shown(p) for p in people if p != who)
+        return one, []
+    others = listed(shown(p) for p in people if p != one)
     rest = "other is" if len(people) == 2 else "others are"
-    return who, [
-        f"The file holds {len(people)} people: {shown(who)} was read; the {rest} {others} (--take NAME, or "
-        "a number from 0)"
+    return one, [
+        f"The file holds {len(people)} people: {shown(one)} was read; the {rest} {others} (--take NAME, "
+        "or a number from 0)"
     ]
 
 
@@ -85,12 +85,12 @@ def _marked(names: Sequence[str], pattern: re.Pattern[str], mark: int) -> dict[s
         match = pattern.match(name.strip(")] "))
         if match and match.group(mark).lower() not in _SIDES:
             by_mark.setdefault(match.group(mark), {}).setdefault(match.group(3 - mark), k)
-    whole = {who: parts for who, parts in by_mark.items() if _is_person(list(parts))}
+    whole = {one: parts for one, parts in by_mark.items() if _is_person(list(parts))}
     return {
-        who: parts
-        for who, parts in whole.items()
+        one: parts
+        for one, parts in whole.items()
         if any(
-            len(parts.keys() & o.keys()) >= _SHARED * len(parts) for w, o in whole.items() if w != who
+            len(parts.keys() & o.keys()) >= _SHARED * len(parts) for w, o in whole.items() if w != one
         )
     }
 
@@ -115,14 +115,14 @@ def one_person(
     names = [str(k) for k in range(table.shape[axis])]
     if not names:
         raise PoiseError("its axis of people is empty", path)
-    who, note = chosen(names, take, path)
-    return np.take(table, int(who), axis=axis), note
+    one, note = chosen(names, take, path)
+    return np.take(table, int(one), axis=axis), note
 
 
 def one_of_dicts(
     value: Any, known: Callable[[Mapping[str, Any]], bool], take: str | None, path: Path
 ) -> tuple[Any, list[str]]:
-    """One of a dict (or list) of people, each a dict of arrays that is `known`; else the value itself."""
+    """One of a dict (or list) of people, each a dict of arrays that is `known`; else the value."""
     pairs: Iterable[tuple[Any, Any]]
     if isinstance(value, dict):
         pairs = value.items()
@@ -132,7 +132,9 @@ def one_of_dicts(
         return value, []
     parts = list(pairs)
     # What stands beside the people, such as the frame rate, is everybody's.
-    shared = {k: v for k, v in parts if isinstance(k, str) and not isinstance(v, dict)}
+    shared: dict[str, Any] = {
+        str(k): v for k, v in parts if isinstance(k, str) and not isinstance(v, dict)
+    }
     people = {
         str(key): {**shared, **item}
         for key, item in parts
@@ -140,5 +142,5 @@ def one_of_dicts(
     }
     if not people or known(shared):
         return value, []
-    who, note = chosen(list(people), take, path)
-    return people[who], note
+    one, note = chosen(list(people), take, path)
+    return people[one], note

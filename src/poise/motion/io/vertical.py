@@ -1,8 +1,8 @@
 """The vertical of a file that states none: by what bears weight, by posture, by the rest pose.
 
 Whatever bears weight keeps one height, stands still while it does, and lies under the body, averaged
-over time: by Newton's law a body whose weight lies beside its supports falls over. Of the six directions
-of a file's axes the true one fulfils that best, also where someone lies, crawls or stands on the hands;
+over time: by Newton's law a body falls over if its weight lies beside its supports. Of the six
+directions of a file's axes the true one fulfils that best, also of a body that lies or crawls;
 a body that stands still fulfils it along several axes, and there its posture decides.
 """
 

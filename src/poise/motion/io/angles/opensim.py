@@ -156,8 +156,8 @@ def _check_unit(turns: Mapping[str, np.ndarray], degrees: bool, path: Path) -> N
     found = few_degrees(angles)
     if found is not None:
         raise PoiseError(
-            f"no joint turns by more than a few degrees ('{found[0]}' most, to {found[1]:.3g}), the unit "
-            "that inDegrees=yes in the header states: the angles seem to be radians",
+            f"no joint turns by more than a few degrees ('{found[0]}' most, to {found[1]:.3g}), the "
+            "unit that inDegrees=yes in the header states: the angles seem to be radians",
             path,
             "Write inDegrees=no in the header, or convert the table",
         )

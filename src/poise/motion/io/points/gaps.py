@@ -30,7 +30,7 @@ def without_zeros(names: Sequence[str], positions: np.ndarray) -> tuple[np.ndarr
         return positions, []
     size = float(np.median(np.linalg.norm(_extent(seen), axis=-1)))
     missing = zero.copy()
-    for k in np.flatnonzero(zero.any(0)):
+    for k in map(int, np.flatnonzero(zero.any(0))):
         if zero[:, k].all():
             missing[:, k] = not (middle_label(names[k]) and _around_origin(seen, size))
             continue
@@ -45,14 +45,14 @@ def without_zeros(names: Sequence[str], positions: np.ndarray) -> tuple[np.ndarr
         (f"{names[k]} {counts[k]}" for k in np.argsort(-counts, kind="stable") if counts[k]), 6
     )
     note = (
-        f"{int(counts.sum())} of {missing.size} points are written as 0 0 0 where they are missing: they "
-        f"were not taken as places ({told})"
+        f"{int(counts.sum())} of {missing.size} points are written as 0 0 0 where they are missing: "
+        f"they were not taken as places ({told})"
     )
     return np.where(missing[..., None], np.nan, positions), [note]
 
 
 def _extent(points: np.ndarray) -> np.ndarray:
-    """`(T, 3)` how far the known points `(T, K, 3)` reach along each axis; each frame has one at least."""
+    """`(T, 3)` how far the known points `(T, K, 3)` reach along each axis; each frame has one."""
     return np.nanmax(points, axis=1) - np.nanmin(points, axis=1)
 
 

@@ -162,7 +162,7 @@ class _Body:
 
 def _body(points: Keypoints) -> _Body:
     tracks, _ = places_of(points)
-    seen = ~np.isnan(np.stack([tracks[p][:, 0] for p in NEEDED], -1)).any(-1)
+    seen = np.asarray(~np.isnan(np.stack([tracks[p][:, 0] for p in NEEDED], -1)).any(-1))
     frames = np.flatnonzero(seen)
     if not len(frames):
         raise PoiseError(
