@@ -46,7 +46,10 @@ def test_a_rest_pose_for_other_tools(capsys: pytest.CaptureFixture[str], tmp_pat
 
 
 def test_a_clean_clip_is_told_to_be_clean(capsys: pytest.CaptureFixture[str]) -> None:
-    assert said(capsys, "doctor", WALK) == f"{WALK}: nothing wrong was found.\n"
+    text = said(capsys, "doctor", WALK)
+    assert text.endswith(f"\n{WALK}: nothing wrong was found.\n")
+    # The unit and the vertical for which that holds are told.
+    assert "centimetres taken, which make the person 1.64 m tall" in text and "Y taken" in text
 
 
 def test_faults_are_listed_with_joint_frames_and_size(broken: Path, capsys) -> None:
