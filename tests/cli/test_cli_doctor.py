@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -205,3 +206,17 @@ def test_keypoints_state_their_evidence(tmp_path: Path, answered) -> None:
     raw = RawPoints("trc", tmp_path / "a.trc", tuple(clip.skeleton.names), points, 30.0)
     evidence = dict(assemble_points(raw, ReadOptions()).source.evidence)
     assert evidence["fps"] == "The file has 30 frames per second" and "code" not in evidence["unit"]
+
+
+def test_feet_without_names_are_not_called_named(tmp_path: Path) -> None:
+    """Feet that their place alone tells are said to be told so."""
+    from poise.kin.doctor.guesses import find_guesses
+    from poise.motion import read_clip
+
+    clip = read_clip(WALK)
+    named = next(g for g in find_guesses(clip) if g.what == "feet")
+    assert named.evidence.startswith("Named so and at the ends")
+    numbers = tuple(f"j{k}" for k in range(len(clip.skeleton)))
+    bare = clip.replaced(skeleton=replace(clip.skeleton, names=numbers))
+    told = next(g for g in find_guesses(bare) if g.what == "feet")
+    assert told.value is None or told.evidence.startswith("Not told by their names, but by their place")
