@@ -57,6 +57,11 @@ class Support:
     on_head: bool = False
 
     @property
+    def firm(self) -> bool:
+        """Whether something that bears the body stands still nearly always."""
+        return self.slide < 0.5 and self.share > 0.8
+
+    @property
     def cost(self) -> float:
         """0 where the axis bears the body as the ground does."""
         lost = 0.5 * (1.0 - self.share) + _ON_HEAD * self.on_head
@@ -179,15 +184,23 @@ def guess_up(
     borne = supports(names, positions, positions if later is None else later)
     score = {up: s.cost + _UNUSUAL[up] for up, s in borne.items()}
     if moving is not None:
+        on = borne[moving]
+        if on.slide >= 0.8 and on.wander < _NEAR and not on.on_head:
+            # Motion in place, or relative to the pelvis: the feet slide, and keep their height.
+            score[moving] = on.wander + _UNUSUAL[moving]
         score[moving] -= _STANDS
     if resting is not None:
         score[resting] -= _RESTS_Y if resting == "Y" else _RESTS
     plain = dict(score)
     if moving is not None and moving == resting:
         score[moving] -= _AGREE
-    best = min(UPS, key=score.__getitem__)
-    second = min((up for up in UPS if up != best), key=plain.__getitem__)
-    return Guess(best, _why(best, second, moving, resting, borne[best], plain[second] - plain[best]))
+    # A clear posture is overruled only by an axis along which the body is borne as by the ground.
+    tried = [up for up in UPS if moving is None or up in (moving, resting) or borne[up].firm]
+    best = min(tried, key=score.__getitem__)
+    others = [up for up in tried if up != best]
+    second = min(others or [up for up in UPS if up != best], key=plain.__getitem__)
+    margin = plain[second] - plain[best] if others else np.inf
+    return Guess(best, _why(best, second, moving, resting, borne[best], float(margin)))
 
 
 def _why(
