@@ -185,7 +185,7 @@ def guess_up(
     score = {up: s.cost + _UNUSUAL[up] for up, s in borne.items()}
     if moving is not None:
         on = borne[moving]
-        if on.slide >= 0.8 and on.wander < _NEAR and not on.on_head:
+        if moving[0] != "-" and on.slide >= 0.8 and on.wander < _NEAR and not on.on_head:
             # Motion in place, or relative to the pelvis: the feet slide, and keep their height.
             score[moving] = on.wander + _UNUSUAL[moving]
         score[moving] -= _STANDS
