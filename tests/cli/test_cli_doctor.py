@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -46,7 +47,10 @@ def test_a_rest_pose_for_other_tools(capsys: pytest.CaptureFixture[str], tmp_pat
 
 
 def test_a_clean_clip_is_told_to_be_clean(capsys: pytest.CaptureFixture[str]) -> None:
-    assert said(capsys, "doctor", WALK) == f"{WALK}: nothing wrong was found.\n"
+    text = said(capsys, "doctor", WALK)
+    assert text.endswith(f"\n{WALK}: nothing wrong was found.\n")
+    # The unit and the vertical for which that holds are told.
+    assert "centimetres taken, which make the person 1.64 m tall" in text and "Y taken" in text
 
 
 def test_faults_are_listed_with_joint_frames_and_size(broken: Path, capsys) -> None:
@@ -151,7 +155,7 @@ def test_every_guess_has_evidence_and_a_way_to_override_it(capsys) -> None:
     assert guesses["rest pose"]["value"] == "T-pose" and guesses["sides"]["value"] == "as named"
     assert guesses["feet"]["value"] == "LeftFoot, RightFoot" and abs(guesses["ground"]["value"]) < 0.02
     text = said(capsys, "info", WALK)
-    assert "[--up Y|Z]" in text and "[--ground METRES" in text
+    assert "[--up Y|Z|-Y|-Z]" in text and "[--ground METRES" in text
 
 
 def test_what_is_stated_is_no_guess(capsys) -> None:
@@ -202,3 +206,17 @@ def test_keypoints_state_their_evidence(tmp_path: Path, answered) -> None:
     raw = RawPoints("trc", tmp_path / "a.trc", tuple(clip.skeleton.names), points, 30.0)
     evidence = dict(assemble_points(raw, ReadOptions()).source.evidence)
     assert evidence["fps"] == "The file has 30 frames per second" and "code" not in evidence["unit"]
+
+
+def test_feet_without_names_are_not_called_named(tmp_path: Path) -> None:
+    """Feet that their place alone tells are said to be told so."""
+    from poise.kin.doctor.guesses import find_guesses
+    from poise.motion import read_clip
+
+    clip = read_clip(WALK)
+    named = next(g for g in find_guesses(clip) if g.what == "feet")
+    assert named.evidence.startswith("Named so and at the ends")
+    numbers = tuple(f"j{k}" for k in range(len(clip.skeleton)))
+    bare = clip.replaced(skeleton=replace(clip.skeleton, names=numbers))
+    told = next(g for g in find_guesses(bare) if g.what == "feet")
+    assert told.value is None or told.evidence.startswith("Not told by their names, but by their place")

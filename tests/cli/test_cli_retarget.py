@@ -14,7 +14,7 @@ from poise.cli.main import main
 from poise.cli.retarget import pairs
 from poise.errors import PoiseError
 from poise.jobs.library.clips import target_of
-from poise.motion import Clip, Skeleton, read_clip, write_clip
+from poise.motion import Clip, Skeleton, read_clip, write_bvh, write_clip
 from toy_human import human, swing
 
 
@@ -118,3 +118,15 @@ def test_bandais_root_survives_the_file(data_dir, tmp_path: Path, capsys) -> Non
 
     wanted, _ = retarget(read_clip(source), read_clip(target))
     assert np.abs(made.positions() - wanted.positions()).max() < 1e-3
+
+
+def test_the_units_of_both_files_are_told(files, tmp_path: Path, capsys) -> None:
+    """A wrong unit of either file would change the steps, so both are said."""
+    source, target = (read_clip(f) for f in files)
+    write_bvh(source, files[0], unit_m=0.1)
+    write_bvh(target, files[1], unit_m=0.0254)
+    out = tmp_path / "out.bvh"
+    assert main(["retarget", str(files[0]), "--onto", str(files[1]), "-o", str(out)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The file states no unit: decimetres taken" in said
+    assert "big.bvh: The file states no unit: inches taken" in said

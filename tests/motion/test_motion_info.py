@@ -41,8 +41,8 @@ def test_unit_override(tmp_path: Path) -> None:
     for unit in (0.0, -1.0, float("nan")):
         with pytest.raises(PoiseError, match="--unit must be above 0"):
             read_clip(path, unit_m=unit)
-    with pytest.raises(PoiseError, match="--up must be Y or Z, got 'X'"):
-        read_clip(path, up_axis="X")
+    with pytest.raises(PoiseError, match="--up must be one of Y, Z, X, -Y, -Z, -X, got 'W'"):
+        read_clip(path, up_axis="W")
     for fps in (0, -1.0, float("nan"), 1e6, 1e300):
         with pytest.raises(PoiseError, match="--fps: the frame rate must be from"):
             read_clip(path, fps=fps)

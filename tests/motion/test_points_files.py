@@ -242,7 +242,7 @@ def test_keypoint_arrays(tmp_path: Path) -> None:
         ({"positions": walking()[..., :2]}, "they are 2D"),
         ({"names": np.array(NAMES[:-1])}, "16 names and 17 keypoints"),
         ({"fps": np.array(0.0)}, "frame rate must be from 0.1 to 2000"),
-        ({"up_axis": np.array("X")}, "up_axis must be Y or Z"),
+        ({"up_axis": np.array("W")}, "up_axis must be one of Y, Z"),
         ({"positions": np.array(["a"])}, "not numbers"),
     ):
         data = {"positions": walking(), "names": np.array(NAMES), "fps": np.array(30.0), **change}

@@ -55,7 +55,10 @@ def mdm(**more: Any) -> dict[str, Any]:
 CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "unit below 0": (
         lambda f: save_npz(f / "a.npz", keys(unit_m=-1.0)), ": unit_m must be above 0, got -1"),
-    "up X": (lambda f: save_npz(f / "a.npz", keys(up_axis=b"X")), ": up_axis must be Y or Z, got 'X'"),
+    "up W": (
+        lambda f: save_npz(f / "a.npz", keys(up_axis=b"W")),
+        ": up_axis must be one of Y, Z, X, -Y, -Z, -X, got 'W'",
+    ),
     "poses of two lengths": (
         lambda f: save_npz(f / "a.npz", gvhmr(5)), ": its poses have different lengths: 12, 12, 5"),
     "a scaling of 0": (
@@ -71,7 +74,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda f: save_npy(f / "a.npy", _tree(node_names=[])),
         ": it has 0 joints; 1 to 2000 are allowed"),
     "a list of two dicts": (
-        lambda f: save_pickle(f / "a.pkl", [aist(), aist()]),
+        lambda f: save_pickle(f / "a.pkl", [{"a": 1}, {"a": 2}]),
         ": the pickle holds a list, not a dict of named arrays"),
     "a type among the data": (
         lambda f: save_pickle(f / "a.pkl", {"smpl_poses": np.ndarray}),
@@ -176,7 +179,7 @@ def test_c3d_files_of_several_people_and_unknown_units(tmp_path: Path) -> None:
     raw = c3d.c3d_points(tmp_path / "a.c3d")
     assert raw.names == labels[: len(NAMES)] and raw.unit_m is None
     assert np.allclose(raw.positions, both[:, : len(NAMES)], atol=1e-3)
-    assert "2 subjects (Anna, Ben): the first one was read" in raw.notes[0]
+    assert "holds 2 people: 'Anna' was read; the other is 'Ben'" in raw.notes[0]
     assert raw.notes[1] == "The unit 'yards' is not known"
 
 

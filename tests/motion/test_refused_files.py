@@ -100,7 +100,7 @@ def test_a_clip_goes_back_to_the_format_it_came_from(tmp_path: Path) -> None:
     [
         ({"unit_m": 0.0}, "the unit must be above 0 metres, got 0.0"),
         ({"unit_m": float("inf")}, "the unit must be above 0 metres, got inf"),
-        ({"up_axis": "X"}, "the up axis must be Y or Z, got 'X'"),
+        ({"up_axis": "W"}, "the up axis must be one of Y, Z, X, -Y, -Z, -X, got 'W'"),
     ],
 )
 def test_units_and_verticals_of_a_bvh(tmp_path: Path, options: dict[str, Any], said: str) -> None:

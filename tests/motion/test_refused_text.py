@@ -44,7 +44,7 @@ CASES: dict[str, tuple[str, Callable[[str], str], str]] = {
         "a.csv", lambda t: "# " + t.replace("\n", "\n# "),
         "a.csv: it is no table of keypoints and no CSV of Poise"),
     "table of keypoints with a vertical of its own": (
-        "a.csv", lambda t: "# up = X\n" + t, "a.csv: up must be Y or Z, got 'X'"),
+        "a.csv", lambda t: "# up = W\n" + t, "a.csv: up must be one of Y, Z, X, -Y, -Z, -X, got 'W'"),
     "TRC of no rate and no times": (
         "a.trc", lambda t: "\n".join(
             x if k < 5 else x.replace(x.split("\t")[1], "", 1) if x else x

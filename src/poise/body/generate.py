@@ -172,16 +172,26 @@ def _hinges(skeleton: Skeleton, part: Part, cmu: bool) -> tuple[str, tuple]:
     return "ZYX"[: PARTS[part.kind].dofs], _IDENTITY
 
 
+#: wxyz, not of unit length: the turn that carries a file's vertical to Z, as `vectors_to_z_up` does it.
+_TO_Z_UP = {
+    "Y": (1.0, 1.0, 0.0, 0.0),
+    "Z": (1.0, 0.0, 0.0, 0.0),
+    "X": (1.0, -1.0, -1.0, -1.0),
+    "-Y": (1.0, -1.0, 0.0, 0.0),
+    "-Z": (0.0, 1.0, 0.0, 0.0),
+    "-X": (1.0, -1.0, 1.0, 1.0),
+}
+
+
 def asf_axis_quat(axis: tuple[float, float, float], order: str, up_axis: str) -> np.ndarray:
     """wxyz of an ASF bone's own axes in our Z-up rest frame.
 
-    The file states extrinsic turns in `order` (Rz Ry Rx for XYZ) in its own frame; a Y-up file is
-    brought over by the quarter turn about X that carries its Y to Z.
+    The file states extrinsic turns in `order` (Rz Ry Rx for XYZ) in its own frame; the turn that
+    carries its vertical to Z brings them over.
     """
     q = euler_to_quat(torch.tensor([axis[::-1]], dtype=torch.float64), order[::-1])
-    if up_axis == "Y":
-        q = quat_mul(torch.tensor([[0.5**0.5, 0.5**0.5, 0.0, 0.0]], dtype=torch.float64), q)
-    return q[0].numpy()
+    turn = torch.tensor([_TO_Z_UP[up_axis]], dtype=torch.float64)
+    return quat_mul(turn / turn.norm(), q)[0].numpy()
 
 
 def _ranges(skeleton: Skeleton, part: Part, order: str) -> tuple[tuple[float, float], ...]:

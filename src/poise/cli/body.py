@@ -59,7 +59,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     facts = {"height_m": humanoid.table.height_m, "mass_kg": humanoid.mass}
     facts |= {"hinges": len(humanoid.hinges), "bodies": rows}
     outputs = {} if out is None else {"body": write_mjcf(humanoid, out)}
-    return Answer(facts, outputs, [*_made(clip, config), *report.sentences()])
+    return Answer(
+        facts, outputs, [*clip.skeleton.source.notes, *_made(clip, config), *report.sentences()]
+    )
 
 
 def _made(clip: Clip, config: BodyConfig) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from poise.cli.answer import Answer
-from poise.cli.console import say, table
+from poise.cli.console import notes, say, table
 from poise.errors import PoiseError
 from poise.jobs.keep import may_write
 
@@ -49,10 +49,14 @@ def run_on(path: Path, options: Options) -> Answer:
     found = examine(clip)
     facts: dict[str, Any] = {"clip": str(path), "frames": clip.frames, "fps": clip.fps}
     facts |= found.to_dict()
+    # All that is found holds for the unit and the vertical that were guessed.
+    source = clip.skeleton.source
+    told = [n for n in source.notes if n in dict(source.evidence).values()]
+    notes(told)
     _show(str(path), found)
     outcome = f"{len(found.faults)} faults"
     if target is None:
-        return Answer(facts, outcome=outcome)
+        return Answer(facts, notes=told, said=told, outcome=outcome)
     healed = heal(clip) if fix else clip
     written, said = healed, ""
     if rest:
@@ -73,7 +77,7 @@ def run_on(path: Path, options: Options) -> Answer:
         facts["fixed"]["rest_pose"] = said
         say(said)
     if not fix:
-        return Answer(facts, {"clip": target}, outcome=outcome)
+        return Answer(facts, {"clip": target}, told, outcome=outcome, said=told)
     _compare(found, left)
     if worse := facts["fixed"]["worse"]:
         say(f"Mending made these figures worse: {', '.join(worse)}.")
@@ -85,7 +89,8 @@ def run_on(path: Path, options: Options) -> Answer:
     if rate := _hidden_rate(found, left):
         say(rate)
     _written(clip, healed, found, left)
-    return Answer(facts, {"clip": target}, outcome=f"{outcome}, {len(left.faults)} after")
+    outcome = f"{outcome}, {len(left.faults)} after"
+    return Answer(facts, {"clip": target}, told, outcome=outcome, said=told)
 
 
 def _show(title: str, found: Examination) -> None:

@@ -30,11 +30,13 @@ T = TypeVar("T")
 #: A switch; its help states no default, which the sentence tells.
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
+#: `motion.io.guess.UPS`; stated here since motion is imported only when a verb reads.
+Up = Literal["Y", "Z", "X", "-Y", "-Z", "-X"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 
 #: Units that --unit knows by name, in metres.
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,12 @@ class Reading:
     fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
     """Frames per second."""
     unit: Annotated[str | None, arg(metavar="METRES", help_behavior_hint="")] = None
-    """Metres in one unit of the file, 0.01 for example; or m, cm, mm, in."""
-    up: Annotated[Literal["Y", "Z"] | None, arg(metavar="Y|Z", help_behavior_hint="")] = None
-    """The file's vertical."""
+    """Metres in one unit of the file, 0.01 for example; or m, dm, cm, mm, in, ft."""
+    up: Annotated[Up | None, arg(metavar="Y|Z|-Y|-Z", help_behavior_hint="")] = None
+    """The file's vertical: Y, Z or X, with - where it points down."""
     take: Annotated[str | None, arg(metavar="NAME|N", help_behavior_hint="")] = None
-    """Which animation of a file that holds several (glTF, USD); by default the longest."""
+    """Which animation of a file that holds several (glTF, USD; by default the longest), or which of its
+    people (TRC, C3D, CSV, arrays; by default the first)."""
     ground: Annotated[str | None, arg(metavar="METRES|auto", help_behavior_hint="")] = None
     """The floor's height, which becomes 0; auto takes the one that the soles tell."""
     swap_sides: Flag = False

@@ -46,7 +46,7 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
         does = about(options)
         with _told(refuse), _whole_lines(does), contextlib.redirect_stderr(io.StringIO()):
             how: dict[str, Any] = {"prog": prog, "config": _CONFIG, "default": default}
-            made = tyro.cli(options, args=dotted(argv), description=does, **how)
+            made = tyro.cli(options, args=_joined_up(dotted(argv)), description=does, **how)
         assert made is not None
         return made
     except SystemExit as stop:
@@ -54,6 +54,17 @@ def parse(options: type[T], argv: Sequence[str], prog: str, default: T | None = 
             raise
         what = "the command line was not understood"
         raise PoiseError(what, hint=f"See {prog} --help") from None
+
+
+def _joined_up(argv: Sequence[str]) -> list[str]:
+    """The command line with `--up -Y` as `--up=-Y`: a value that begins with - is no option."""
+    out: list[str] = []
+    for word in argv:
+        if out[-1:] == ["--up"] and re.fullmatch(r"-[XYZ]", word):
+            out[-1] = f"--up={word}"
+        else:
+            out.append(word)
+    return out
 
 
 def _told(refuse: Any) -> contextlib.AbstractContextManager[None]:

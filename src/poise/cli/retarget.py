@@ -59,7 +59,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     write_clip(made, out)
     show(report)
     say(f"{made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
-    return Answer(report.to_dict(), {"clip": out}, report.sentences())
+    # Both files' guesses (unit, vertical, ...) decide what is written.
+    guessed = [*clip.skeleton.source.notes]
+    guessed += [f"{options.onto.name}: {n}" for n in onto.skeleton.source.notes]
+    return Answer(report.to_dict(), {"clip": out}, [*guessed, *report.sentences()])
 
 
 def pairs(texts: Sequence[str]) -> dict[str, str]:

@@ -20,8 +20,8 @@ ARM = ("clavicle", "upper_arm", "forearm", "hand")
 NEEDED = ("hips", *(f"{side}_{kind}" for kind in LEG[:3] for side in SIDES))
 #: Parts that a limb may lack weigh less than those that it needs, where names can be read either way.
 _WEIGHT = {"clavicle": 0.5, "toes": 0.5}
-#: How sure a part is that only its place between others tells, and what it weighs against names.
-_BY_PLACE, _STATED = 0.4, 10.0
+#: How sure a part is that only its place between others tells, and what stated ones weigh against names.
+BY_PLACE, _STATED = 0.4, 10.0
 _MANY = ("spine", "neck")
 _FINGER_KINDS = tuple(dict.fromkeys(FINGERS.values()))
 
@@ -299,7 +299,7 @@ class _Finder:
                     return
                 name = self.skeleton.names[joint]
                 evidence = f"'{name}' lies above the {split_role(self._role_at(below))[1]}"
-                self._add(f"{side}_{kind}", joint, _BY_PLACE, evidence.replace("_", " "))
+                self._add(f"{side}_{kind}", joint, BY_PLACE, evidence.replace("_", " "))
                 known = self.found[f"{side}_{kind}"]
             below = known.joint
 
@@ -326,7 +326,7 @@ class _Finder:
         joint = self._above(arm.joint, chest)
         if joint is not None:
             name = self.skeleton.names[joint]
-            self._add(f"{side}_clavicle", joint, _BY_PLACE, f"'{name}' lies between chest and arm")
+            self._add(f"{side}_clavicle", joint, BY_PLACE, f"'{name}' lies between chest and arm")
 
     def _fingers(self, side: str) -> None:
         hand = self.found.get(f"{side}_hand")

@@ -37,7 +37,8 @@ class Source:
     """Where a skeleton came from: enough to write the same hierarchy, names, order and unit.
 
     format: "bvh", "asf-amc", "deepmimic", or "poise" for one made in code.
-    unit_m: metres in one file unit. up_axis: "Y" or "Z", the file's vertical.
+    unit_m: metres in one file unit. up_axis: the file's vertical, "Y", "Z" or "X", with "-" where
+    the axis points down.
     channels: one `Channel` per joint. notes: what was guessed or repaired, one sentence each.
     frame_time: seconds per frame exactly as the file states it.
     travel_joint: the joint with the channels that carry the travel (Bandai: "Hips", not the root).

@@ -12,6 +12,7 @@ import torch
 from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
+from poise.kin.doctor.drift import mend_drift
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
@@ -78,9 +79,10 @@ def examine(clip: Clip) -> Examination:
 def heal(clip: Clip, path: bool = True) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
-    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, the height
-    above the floor, sliding feet. A step changes nothing if its faults are not there. path: whether the
-    root's path may be freed of the slip of standing feet, or legs alone hold them.
+    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, a
+    drifting height, the height above the floor, sliding feet. A step changes nothing if its faults are
+    not there. path: whether the root's path may be freed of the slip of standing feet, or legs alone
+    hold them.
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)
@@ -91,6 +93,8 @@ def heal(clip: Clip, path: bool = True) -> Clip:
     clip = mend_jitter(clip)
     if support is None:
         return clip
+    support = support_of(clip, anatomy)
+    clip = clip if support is None else mend_drift(clip, support.sole_low)
     return _on_floor(_locked(_on_floor(clip, anatomy), anatomy, path), anatomy)
 
 

@@ -14,9 +14,10 @@ from poise.kin.doctor.flips import neutral_pose
 from poise.kin.doctor.sides import exchanged_sides, side_votes
 from poise.kin.doctor.support import SOLE_M, Support, anatomy_of, support_of
 from poise.kin.rate.judge import RateJudgement, judge_rate
-from poise.motion import Clip, ground_shift
+from poise.motion import Clip, find_roles, ground_shift
+from poise.motion.roles import BY_PLACE
 
-_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches"}
+_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.1: "decimetres"}
 _WORDS = {"feet": "where the feet point", "knees": "where the knees bend", "travel": "where it goes"}
 
 
@@ -45,7 +46,7 @@ def find_guesses(clip: Clip) -> list[Guess]:
     unit = _UNITS.get(source.unit_m, f"{source.unit_m:.6g} m")
     made = "The clip was made in code" if source.path is None else "The format itself states it"
     return [
-        Guess("up", source.up_axis, why.get("up", made), "--up Y|Z"),
+        Guess("up", source.up_axis, why.get("up", made), "--up Y|Z|-Y|-Z"),
         Guess("unit", source.unit_m, why.get("unit", f"The clip is in {unit}"), "--unit METRES"),
         _rate(clip, support, why.get("fps", made)),
         _rest(clip, anatomy),
@@ -128,7 +129,10 @@ def _feet(clip: Clip, anatomy: Anatomy) -> Guess:
     ends = [f"toes '{names[j]}'" for j in toes] or [
         f"a bone tip of '{names[j]}'" for j in feet if j in tips
     ]
-    why = f"Named so and at the ends of three-joint legs; soles reach to {' and '.join(ends)}"
+    sure = {row.joint: row.confidence for row in find_roles(clip.skeleton).rows}
+    named = all(sure.get(j, 0.0) > BY_PLACE for j in feet)
+    how = "Named so and at" if named else "Not told by their names, but by their place at"
+    why = f"{how} the ends of three-joint legs; soles reach to {' and '.join(ends)}"
     return Guess("feet", ", ".join(names[j] for j in feet), why if ends else why.split(";")[0], override)
 
 

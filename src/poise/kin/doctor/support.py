@@ -12,6 +12,7 @@ from torch import Tensor
 
 from poise.body import Anatomy, BodyTable, find_anatomy, generate_table
 from poise.errors import PoiseError
+from poise.kin.doctor.drift import drift_faults
 from poise.kin.doctor.faults import Fault, spell_faults
 from poise.kin.feet.contact import NEAR_M, soles_of
 from poise.kin.fk import carried
@@ -74,6 +75,14 @@ class Support:
             fit_heights(table, pos, quat, clip.fps),
             table,
         )
+
+    @property
+    def flying(self) -> np.ndarray:
+        """`(T)` bool, where the body falls freely."""
+        out = np.zeros(len(self.sole_low), dtype=bool)
+        for flight in self.fit.flights:
+            out[flight.start : flight.stop + 1] = True
+        return out
 
     @property
     def off_m(self) -> float:
@@ -151,7 +160,8 @@ def _low_points(
 
 def height_faults(clip: Clip, support: Support) -> list[Fault]:
     """Where the body is above or under the floor; the whole clip once, then what differs from it."""
-    out, last, off = [], clip.frames - 1, support.off_m
+    last, off = clip.frames - 1, support.off_m
+    out = drift_faults(support.sole_low, clip.fps, support.flying)
     if off:
         kind = "float" if off > 0 else "penetration"
         where = "above" if off > 0 else "below"

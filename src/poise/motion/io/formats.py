@@ -143,8 +143,8 @@ def read_clip(
 
     Args:
         skeleton: the ASF file of an AMC; by default the one beside it that bears its subject's name.
-        fps, unit_m, up_axis: frames per second, metres per file unit and "Y" or "Z", stated
-            instead of read or guessed.
+        fps, unit_m, up_axis: frames per second, metres per file unit and the vertical ("Y", "Z", "X" or
+            one of them with "-" where it points down), stated instead of read or guessed.
         allow_pickle: reads pickled files too (AIST++, poselib); what they hold is rebuilt as plain
             arrays, and no code of theirs runs.
         smooth_hz: cut-off of a low-pass on keypoints (TRC, C3D, ...), see `FitConfig`; other formats

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,18 +9,35 @@ import numpy as np
 import torch
 
 from poise.errors import PoiseError
-from poise.motion.info import landmarks
 from poise.motion.io.text import listed
 from poise.spatial import quat_angle, quat_conj, quat_mul
+
+UPS = ("Y", "Z", "X", "-Y", "-Z", "-X")
+"""Verticals that a file may have; with "-" the axis points down."""
 
 ASF_UNIT_M = 0.0254 / 0.45
 """Metres in the unit of the CMU library's ASF files (`length 0.45`, inches)."""
 
-UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
-_ALL_UNITS = {**UNITS, "ASF units": ASF_UNIT_M}
-# Rare units must fit clearly better than the common ones (a penalty on the log of the height).
-_RARE = {"inches": 0.25, "ASF units": 0.25}
-_TYPICAL_M = 1.65
+UNITS = {
+    "metres": 1.0,
+    "centimetres": 0.01,
+    "millimetres": 0.001,
+    "inches": 0.0254,
+    "decimetres": 0.1,
+    "feet": 0.3048,
+    "ASF units": ASF_UNIT_M,
+}
+# How usual a unit is in files; those of the Acclaim system are the CMU library's as a rule.
+_USUAL = {"inches": 0.1, "ASF units": 0.03, "decimetres": 0.03, "feet": 0.02}
+_USUAL_ASF = {**_USUAL, "ASF units": 1.0}
+# Densities (per m) of heights in motion files: grown-ups about 1.72 m, some children, few others.
+_GROWN_M, _SPREAD_M = 1.72, 0.12
+_BANDS = (
+    *(((0.75, 1.5), 0.07), ((0.6, 0.75), 0.02), ((0.5, 0.6), 0.004)),
+    *(((2.0, 2.3), 0.004), ((2.3, 3.0), 0.001)),
+)
+# A unit that is so many times likelier than the next one is sure.
+_CLEARLY = 20.0
 _GUESS_BAND = (0.5, 3.0)
 _STATED_BAND = (0.3, 4.0)
 
@@ -42,7 +58,7 @@ def stated_unit(height: float, unit_m: float, path: Path) -> Guess:
     size = height * unit_m
     if _STATED_BAND[0] <= size <= _STATED_BAND[1]:
         return Guess(unit_m)
-    best, metres = _closest(height)
+    best, metres = _ranked(height)[0]
     raise PoiseError(
         f"with {unit_m:g} m per unit the person would be {_size(size)} tall",
         path,
@@ -51,10 +67,12 @@ def stated_unit(height: float, unit_m: float, path: Path) -> Guess:
     )
 
 
-def guess_unit(height: float, how: str, hint: float | None, path: Path) -> Guess:
+def guess_unit(height: float, how: str, hint: float | None, path: Path, form: str = "") -> Guess:
     """Metres per unit from the skeleton's height in file units.
 
-    A unit that the file itself suggests (`hint`) is kept if it makes a plausible person.
+    A unit that the file itself suggests (`hint`) is kept if it makes a plausible person. Otherwise the
+    one that is usual in the format `form` and makes a person of a usual size; one that is about as
+    likely is named.
     """
     if hint is not None and _GUESS_BAND[0] <= height * hint <= _GUESS_BAND[1]:
         return Guess(
@@ -62,7 +80,8 @@ def guess_unit(height: float, how: str, hint: float | None, path: Path) -> Guess
             f"One file unit is taken as {hint:.6g} m by the file's `length` entry: the person is then "
             f"{height * hint:.2f} m tall ({how})",
         )
-    best, metres = _closest(height)
+    ranked = _ranked(height, how, form)
+    best, metres = ranked[0]
     size = height * metres
     if not _GUESS_BAND[0] <= size <= _GUESS_BAND[1]:
         raise PoiseError(
@@ -71,72 +90,36 @@ def guess_unit(height: float, how: str, hint: float | None, path: Path) -> Guess
             path,
             "State the unit with --unit METRES_PER_UNIT",
         )
-    return Guess(
-        metres,
-        f"The file states no unit: {best} taken, which make the person {size:.2f} m tall ({how})",
-    )
+    told = f"The file states no unit: {best} taken, which make the person {size:.2f} m tall ({how})"
+    other, metres_of_other = ranked[1]
+    if _CLEARLY * _likely(height, other, how, form) > _likely(height, best, how, form):
+        told += (
+            f"; uncertain, since {other} would make it {height * metres_of_other:.2f} m "
+            f"(--unit {metres_of_other:.6g})"
+        )
+    return Guess(metres, told)
 
 
-def _closest(height: float) -> tuple[str, float]:
-    """The unit under which a height comes nearest to a typical person's."""
+def _likely(height: float, unit: str, how: str, form: str) -> float:
+    """How likely a unit is for a height in file units: how usual it is, times how many are so tall."""
+    size = height * UNITS[unit]
+    spread = _SPREAD_M if "bones" in how else 2.0 * _SPREAD_M
+    grown = np.exp(-0.5 * ((size - _GROWN_M) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
+    rare = sum(density for (low, high), density in _BANDS if low <= size <= high)
+    if not _GUESS_BAND[0] <= size <= _GUESS_BAND[1]:
+        # Beyond all people the nearest unit is named.
+        return 1e-30 * float(np.exp(-abs(np.log(size / _GROWN_M))))
+    return (_USUAL_ASF if form == "asf-amc" else _USUAL).get(unit, 1.0) * float(grown + rare + 1e-6)
 
-    def misfit(name: str) -> float:
-        return abs(np.log(height * _ALL_UNITS[name] / _TYPICAL_M)) + _RARE.get(name, 0.0)
 
-    best = min(_ALL_UNITS, key=misfit)
-    return best, _ALL_UNITS[best]
+def _ranked(height: float, how: str = "bones", form: str = "") -> list[tuple[str, float]]:
+    """The units with their metres, the likeliest for a height in file units first."""
+    order = sorted(UNITS, key=lambda unit: -_likely(height, unit, how, form))
+    return [(unit, UNITS[unit]) for unit in order]
 
 
 def _size(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 0.1 else f"{metres * 1e3:.3g} mm"
-
-
-def guess_up(names: Sequence[str], positions: np.ndarray, rest: np.ndarray) -> Guess:
-    """The vertical of a file, "Y" or "Z", from sampled poses `(S, J, 3)` and the rest pose `(J, 3)`.
-
-    The body mostly stands along it, in the motion and in the rest pose. Where these two
-    contradict each other (someone lies or crawls), the floor decides: the lowest joint keeps its
-    height better than its place along any other axis.
-    """
-    first = max(1, len(positions) // 10)
-    moving = (_upright(names, positions[:first]) + _upright(names, positions)) / 2
-    resting = _upright(names, rest[None])
-    axes = [_axis(moving, "the body stands along it"), _axis(resting, "the rest pose stands along it")]
-    sure = [a for a in axes if a is not None]
-    if sure and all(a[0] == sure[0][0] for a in sure):
-        axis, why = sure[0]
-        return Guess(axis, f"The file states no vertical: {axis} taken, since {why}")
-    low = positions.min(1)
-    wander = np.percentile(low, 95, axis=0) - np.percentile(low, 5, axis=0)
-    axis = "Y" if wander[1] <= wander[2] else "Z"
-    return Guess(
-        axis,
-        f"The file states no vertical and the body lies along several axes: {axis} taken, since the "
-        "lowest joint keeps its height along it (uncertain; override with --up Y or --up Z)",
-    )
-
-
-def _upright(names: Sequence[str], positions: np.ndarray) -> np.ndarray:
-    """`(3,)` how far the bodies `(S, J, 3)` stand along each axis, 0 to 1.
-
-    The mean direction from ankles to head, or the body's extent where names tell nothing.
-    """
-    heads, necks, ankles = landmarks(names)
-    tops = heads or necks
-    if tops and ankles:
-        way = positions[:, tops[0]] - positions[:, ankles].mean(1)
-        way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
-        return np.abs(way.mean(0))
-    extent = (positions.max(1) - positions.min(1)).mean(0)
-    return extent / max(float(np.linalg.norm(extent)), 1e-12)
-
-
-def _axis(along: np.ndarray, why: str) -> tuple[str, str] | None:
-    """The clearly larger one of Y and Z, None where neither is or where X is larger than both."""
-    y, z = float(along[1]), float(along[2])
-    if min(y, z) > 0.7 * max(y, z) or max(y, z) < 0.5:
-        return None
-    return ("Y" if y > z else "Z"), why
 
 
 def inserted_rest_frames(rot: np.ndarray) -> tuple[int, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from poise.motion.clip import Clip
 from poise.motion.io.angles.opensim import is_opensim, read_loco
 from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header, read_npy
 from poise.motion.io.numpy.kimodo import is_kimodo, read_kimodo
-from poise.motion.io.numpy.pickles import load_restricted, loads_restricted
+from poise.motion.io.numpy.pickles import load_plain, loads_restricted, named_arrays
 from poise.motion.io.numpy.poselib import is_poselib, read_poselib
 from poise.motion.io.numpy.smpl import is_smpl, read_smpl
 from poise.motion.io.numpy.smpl_write import is_amass_clip, write_amass
 from poise.motion.io.own.npz import MARK, read_poise_npz, write_poise_npz
+from poise.motion.io.people import one_of_dicts
 from poise.motion.io.points.arrays import (
     array_points,
     is_joints,
@@ -84,7 +85,14 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
                 refuse_array(header.shape, path)
     if not options.allow_pickle:
         raise PoiseError("this is a pickled file", path, ASK)
-    return _read(load_restricted(path), path, options)
+    value, note = one_of_dicts(load_plain(path), _is_known, options.take, path)
+    clip = _read(named_arrays(value, path), path, replace(options, take=None) if note else options)
+    source = clip.skeleton.source
+    return clip.replaced(skeleton=clip.skeleton.with_source(notes=(*note, *source.notes)))
+
+
+def _is_known(data: Mapping[str, Any]) -> bool:
+    return any(kind.holds(data) for kind in KINDS[:-1])
 
 
 def _read(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:

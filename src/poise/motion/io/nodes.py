@@ -10,9 +10,10 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion.info import body_height, sampled
-from poise.motion.io.guess import guess_unit, guess_up
+from poise.motion.io.guess import guess_unit
 from poise.motion.io.raw import ReadOptions, vectors_from_z_up
 from poise.motion.io.text import shown
+from poise.motion.io.vertical import guess_up
 from poise.motion.skeleton import Skeleton, posed
 from poise.spatial import forward_kinematics, matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
 

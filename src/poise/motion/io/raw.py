@@ -13,14 +13,15 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_frames, check_poses, check_rate
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import (
+    UPS,
     Guess,
     guess_unit,
-    guess_up,
     inserted_rest_frames,
     stated_unit,
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS, shown
+from poise.motion.io.vertical import guess_up, later_frames
 from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
 from poise.spatial import normalize, unwrap_quats
 
@@ -77,14 +78,33 @@ class RawMotion:
     rates: tuple[float, ...] = ()
 
 
+# For each vertical the turn that carries it to Z: the file's axis and its sign behind each of ours.
+# Y and the downward ones are turned about X, so that X stays.
+_TURNS = {
+    "Y": ((0, 1), (2, -1), (1, 1)),
+    "Z": ((0, 1), (1, 1), (2, 1)),
+    "X": ((1, 1), (2, 1), (0, 1)),
+    "-Y": ((0, 1), (2, 1), (1, -1)),
+    "-Z": ((0, 1), (1, -1), (2, -1)),
+    "-X": ((1, 1), (2, -1), (0, -1)),
+}
+
+
 def vectors_to_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
-    """Vectors `(..., 3)` of a file with vertical `up_axis` in Z-up axes (+90 deg about X)."""
-    return v if up_axis == "Z" else np.stack((v[..., 0], -v[..., 2], v[..., 1]), -1)
+    """Vectors `(..., 3)` of a file with vertical `up_axis` (one of `UPS`) in Z-up axes; a pure turn."""
+    if up_axis == "Z":
+        return v
+    return np.stack([v[..., axis] if sign > 0 else -v[..., axis] for axis, sign in _TURNS[up_axis]], -1)
 
 
 def vectors_from_z_up(v: np.ndarray, up_axis: str) -> np.ndarray:
     """The inverse of `vectors_to_z_up`."""
-    return v if up_axis == "Z" else np.stack((v[..., 0], v[..., 2], -v[..., 1]), -1)
+    if up_axis == "Z":
+        return v
+    back = {axis: (k, sign) for k, (axis, sign) in enumerate(_TURNS[up_axis])}
+    return np.stack(
+        [v[..., back[c][0]] if back[c][1] > 0 else -v[..., back[c][0]] for c in range(3)], -1
+    )
 
 
 def quats_to_z_up(q: np.ndarray, up_axis: str) -> np.ndarray:
@@ -105,8 +125,8 @@ def check_options(options: ReadOptions) -> None:
     for name, value in stated:
         if value is not None and not (np.isfinite(value) and value > 0):
             raise PoiseError(f"--{name} must be above 0, got {value}")
-    if options.up_axis is not None and options.up_axis.upper() not in ("Y", "Z"):
-        raise PoiseError(f"--up must be Y or Z, got '{options.up_axis}'")
+    if options.up_axis is not None and options.up_axis.upper() not in UPS:
+        raise PoiseError(f"--up must be one of {', '.join(UPS)}, got '{options.up_axis}'")
 
 
 def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
@@ -230,8 +250,10 @@ def _up_and_unit(raw: RawMotion, rot: np.ndarray, options: ReadOptions) -> tuple
     elif raw.unit_m is not None:
         unit = Guess(raw.unit_m)
     else:
-        unit = guess_unit(height, how, raw.unit_hint, raw.path)
+        unit = guess_unit(height, how, raw.unit_hint, raw.path, raw.format)
     stated = options.up_axis or raw.up_axis
     if stated is not None:
         return Guess(stated.upper()), unit
-    return guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets)), unit
+    after = later_frames(at, options.fps or raw.fps, len(rot))
+    later, _ = posed(raw.parents, raw.offsets, raw.root_pos[after], rot[after])
+    return guess_up(raw.names, pos, rest_positions(raw.parents, raw.offsets), later), unit

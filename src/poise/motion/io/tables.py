@@ -100,5 +100,8 @@ def row_numbers(cells: list[str], column: Callable[[int], str], path: Path, line
         if text.lower() in MISSING:
             out.append(np.nan)
         else:
+            if text.count(",") == 1 and "." not in text:
+                # A decimal comma: no table here separates its cells by commas and holds one in a cell.
+                text = text.replace(",", ".")
             out.append(number(text, f"{at_line(path, line)}, column {k + 1} ({column(k)})"))
     return out

@@ -69,6 +69,13 @@ def _bare(text: str) -> str:
     return re.sub(r"[^a-z0-9]", "", text)
 
 
+def middle_label(label: str) -> bool:
+    """Whether a label names a place in the body's middle (pelvis, spine, neck, head)."""
+    side, core = split_label(label)
+    cores = {core for cores in _MIDDLE.values() for core in cores}
+    return not side and (core in cores or _SPINE.fullmatch(core) is not None)
+
+
 # The labels of surface markers (Plug-in Gait, CMU, OpenCap's "_study" set), known by `markers.py`.
 _MARKERS = (
     "asi psi fwt bwt kne knm mkn knem mkne ank anm mank ankm mma med hee mt1 mt5 sho elb elm melb "

@@ -11,6 +11,7 @@ import torch
 from poise.errors import PoiseError, did_you_mean
 from poise.motion.clip import Clip
 from poise.motion.io.acclaim.asf import ROTATIONS, TRAVEL, AsfFile, fixed_axes_quat, parse_asf
+from poise.motion.io.angle_units import check_radians, few_degrees_note
 from poise.motion.io.raw import UNSTATED, RawMotion, ReadOptions, assemble
 from poise.motion.io.tables import append_numbers, first_bad
 from poise.motion.io.text import CUT_OFF, at_line, decode, listed, read_bytes, shown
@@ -59,6 +60,7 @@ def read_amc(path: Path, options: ReadOptions) -> Clip:
     asf = parse_asf(Path(skeleton))
     frames, degrees, forced = _frames(path, asf, notes)
     names = asf.joints()
+    _check_unit(frames, degrees, path, notes)
     scale = np.pi / 180 if degrees else 1.0
     count = len(next(iter(frames.values())))
     rot = np.zeros((count, len(names), 4))
@@ -78,6 +80,16 @@ def read_amc(path: Path, options: ReadOptions) -> Clip:
     if options.fps is None:
         notes.append(f"AMC files state no frame rate: {DEFAULT_FPS:g} frames per second taken")
     return assemble(_raw(asf, path, names, root_pos, rot, notes), options)
+
+
+def _check_unit(frames: dict[str, np.ndarray], degrees: bool, path: Path, notes: list[str]) -> None:
+    """Refuses angles that cannot be radians, and doubts degrees that look like them."""
+    angles = {name: values for name, values in frames.items() if name != "root"}
+    if degrees:
+        notes += few_degrees_note(angles)
+        return
+    stated = "the file has, since it says no :DEGREES and its skeleton no `angle deg`"
+    check_radians(angles, stated, path, "Write :DEGREES before its first frame")
 
 
 def read_asf(path: Path) -> Clip:

@@ -11,6 +11,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.edits import blended
+from poise.motion.io.angle_units import check_radians
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.text import MAX_JSON_BYTES, MAX_VALUE, json_object, read_bytes
 from poise.motion.skeleton import Channel
@@ -143,6 +144,8 @@ def _rotations(
                 mended.append(("quaternion length", name, *span, float(abs(norm[frame] - 1))))
             out[:, j] = quat / norm[:, None]
         elif size == 1:
+            hint = "Convert the angles to radians"
+            check_radians({name: table[:, column]}, "DeepMimic's files hold", path, hint)
             axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
             out[:, j] = axis_angle_to_quat(axis, torch.tensor(table[:, column])).numpy()
         column += size

@@ -15,6 +15,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_frames
+from poise.motion.io.angle_units import check_radians, few_degrees
 from poise.motion.io.numpy.arrays import numeric, refuse_bad, require
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
 from poise.motion.io.tables import number_table
@@ -107,6 +108,7 @@ def read_mot(path: Path, options: ReadOptions) -> Clip:
     if not (step > 0 and np.abs(steps / step - 1).max() < 0.05):
         raise PoiseError("its times are not evenly spaced", path, "Resample it in OpenSim")
     turns = {k: columns[k] for k in _coordinates() if k in columns}
+    _check_unit(turns, degrees, path)
     for name in turns:
         if degrees and name not in _PELVIS[3:]:
             turns[name] = np.radians(turns[name])
@@ -122,6 +124,8 @@ def read_loco(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
     prefix = "q_" if f"q_{_LEGS[0]}" in data else ""
     require(data, [prefix + k for k in _PELVIS], path, "this OpenSim motion")
     turns = {k: numeric(data, prefix + k, (None,), path) for k in _coordinates() if prefix + k in data}
+    hint = "Convert the angles to radians"
+    check_radians(_joint_angles(turns), "LocoMuJoCo's arrays hold", path, hint)
     notes: list[str] = []
     fps = options.fps or _rate(data, turns, path, notes)
     if np.median(turns["pelvis_ty"]) < 0.4 * _STANDING_M:
@@ -135,6 +139,28 @@ def read_loco(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
         if name in turns:
             turns[name] = -turns[name]
     return _clip(turns, fps, path, options, notes)
+
+
+def _joint_angles(turns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The coordinates that turn one bone against another; a pelvis may turn round and round."""
+    return {name: values for name, values in turns.items() if name not in _PELVIS}
+
+
+def _check_unit(turns: Mapping[str, np.ndarray], degrees: bool, path: Path) -> None:
+    """Refuses angles that cannot be in the unit that the header states."""
+    angles = _joint_angles(turns)
+    if not degrees:
+        stated = "inDegrees=no in the header states"
+        check_radians(angles, stated, path, "Write inDegrees=yes in the header, or convert the table")
+        return
+    found = few_degrees(angles)
+    if found is not None:
+        raise PoiseError(
+            f"no joint turns by more than a few degrees ('{found[0]}' most, to {found[1]:.3g}), the "
+            "unit that inDegrees=yes in the header states: the angles seem to be radians",
+            path,
+            "Write inDegrees=no in the header, or convert the table",
+        )
 
 
 def _coordinates() -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from poise.motion.clip import Clip
+from poise.motion.io.angle_units import few_degrees_note
 from poise.motion.io.bvh.file import POSITIONS, BvhFile, parse_bvh
 from poise.motion.io.nodes import RIGID_SHARE, lifted, travel_note
 from poise.motion.io.raw import BLOCK, RawMotion, ReadOptions, assemble
@@ -29,7 +30,7 @@ def read_bvh(path: Path, options: ReadOptions) -> Clip:
     file = parse_bvh(path)
     joints, rot = file.joints, _rotations(file)
     places = _resolve_places(file, rot)
-    notes = [*file.notes, *places.notes]
+    notes = [*file.notes, *places.notes, *few_degrees_note(_angles(file))]
     flat = [
         joints[j].name
         for j in range(1, len(joints))
@@ -55,6 +56,18 @@ def read_bvh(path: Path, options: ReadOptions) -> Clip:
         extra=tuple(places.extra),
     )
     return assemble(raw, options)
+
+
+def _angles(file: BvhFile) -> dict[str, np.ndarray]:
+    """The rotation channels `(T, C)` of each joint but the root, degrees as the format has them."""
+    out, column = {}, 0
+    for j, joint in enumerate(file.joints):
+        channels = joint.channels or ()
+        turns = [column + i for i, c in enumerate(channels) if c.endswith("rotation")]
+        column += len(channels)
+        if j and turns:
+            out[joint.name] = file.values[:, turns]
+    return out
 
 
 def _rotations(file: BvhFile) -> np.ndarray:

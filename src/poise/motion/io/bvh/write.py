@@ -10,6 +10,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.bvh.file import POSITIONS
+from poise.motion.io.guess import UPS
 from poise.motion.io.nodes import place_of_travel
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
@@ -40,7 +41,7 @@ def write_bvh(
     channels in `order`. The file appears whole or not at all.
 
     Args:
-        unit_m: metres per file unit. up_axis: "Y" or "Z". order: three different axes.
+        unit_m: metres per file unit. up_axis: one of `UPS`. order: three different axes.
 
     Raises:
         PoiseError: bad arguments, or the folder is missing or cannot be written to.
@@ -55,8 +56,8 @@ def write_bvh(
     axis = (up_axis or (source.up_axis if own else "Y")).upper()
     if not (np.isfinite(unit) and unit > 0):
         raise PoiseError(f"the unit must be above 0 metres, got {unit}")
-    if axis not in ("Y", "Z"):
-        raise PoiseError(f"the up axis must be Y or Z, got '{axis}'")
+    if axis not in UPS:
+        raise PoiseError(f"the up axis must be one of {', '.join(UPS)}, got '{axis}'")
     rot = quats_from_z_up(clip.rot, axis)
     moving = bool(np.ptp(clip.root_pos, axis=0).max() > 0)
     channels = _channels(clip.skeleton, rot, moving, own, order)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import sys
 import tokenize
@@ -215,11 +216,19 @@ def numeric(data: Mapping[str, Any], key: str, shape: tuple[int | None, ...], pa
 
 
 def one_number(data: Mapping[str, Any], key: str, path: Path) -> float:
-    """A finite number that stands alone, in an array of any number of axes."""
+    """A finite number that stands alone, in an array of any number of axes or as text ("30 fps")."""
+    if (text := text_of(data[key])) and (rate := rate_in(text)) is not None:
+        return rate
     value = float(numeric({key: np.ravel(np.asarray(data[key]))}, key, (1,), path)[0])
     if not np.isfinite(value):
         raise PoiseError(f"it holds {value}, not a finite number", f"{path}, array {shown(key)}")
     return value
+
+
+def rate_in(text: str) -> float | None:
+    """The number in "30", "29.97 Hz" or "30 fps", None where that is not all."""
+    match = re.fullmatch(r"\s*(\d{1,6}(?:\.\d{0,12})?)\s*(?:fps|hz|frames.*)?\s*", text, re.IGNORECASE)
+    return float(match[1]) if match else None
 
 
 def text_of(value: Any, default: str = "") -> str:

@@ -35,14 +35,14 @@ _DAMAGE = (
 )
 
 
-def load_restricted(path: str | Path) -> dict[str, Any]:
-    """The dict in a pickle (`.pkl`) or in a pickled NumPy file (`.npy` with an object array).
+def load_plain(path: str | Path) -> Any:
+    """What a pickle (`.pkl`) or a pickled NumPy file (`.npy` with an object array) holds.
 
     Values are dicts, lists, tuples, strings, bytes, numbers, None and NumPy arrays of numbers or
     text. The file cannot run code.
 
     Raises:
-        PoiseError: the file names anything but NumPy data, is damaged, or holds no dict.
+        PoiseError: the file names anything but NumPy data, or is damaged.
     """
     path = Path(path)
     data = read_binary(path, MAX_ARRAY_BYTES)
@@ -52,7 +52,11 @@ def load_restricted(path: str | Path) -> dict[str, Any]:
         if not header.dtype.hasobject:
             raise PoiseError("the file holds one array of numbers, not a dict of arrays", path)
         data = data[file.tell() :]
-    value = loads_restricted(data, path)
+    return loads_restricted(data, path)
+
+
+def named_arrays(value: Any, path: Path) -> dict[str, Any]:
+    """The dict with names, from a value or a list with it alone; anything else is refused."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
@@ -61,7 +65,7 @@ def load_restricted(path: str | Path) -> dict[str, Any]:
 
 
 def loads_restricted(data: bytes, where: str | Path) -> Any:
-    """The plain value in a pickle's bytes; see `load_restricted`."""
+    """The plain value in a pickle's bytes; see `load_plain`."""
     try:
         return _plain(_Machine(data, where).load(), {}, 0)
     except _DAMAGE as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +19,28 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_poses
 from poise.motion.info import sampled
-from poise.motion.io.guess import Guess
+from poise.motion.io.angle_units import check_radians
+from poise.motion.io.guess import UPS, Guess
 from poise.motion.io.numpy.arrays import numeric, one_number, refuse_bad, require, text_of
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, Layout, layout_of_width
+from poise.motion.io.people import MOST_PEOPLE, one_person
 from poise.motion.io.raw import (
     RawMotion,
     ReadOptions,
     assemble,
     evidence,
     vectors_from_z_up,
+    vectors_to_z_up,
 )
 from poise.motion.io.text import listed
+from poise.motion.io.vertical import clear_axis, guess_up, later_frames, lean, supports
 from poise.motion.skeleton import Channel, posed
-from poise.spatial import quat_mul, rotvec_to_quat
+from poise.spatial import matrix_to_quat, quat_mul, rotvec_to_quat
 
-_POSES = ("poses", "smpl_poses", "pose_aa", "fullpose")
+_POSES = ("poses", "smpl_poses", "pose_aa", "fullpose", "pose_world")
 _ROOT = ("root_orient", "global_orient")
 _BODY = ("pose_body", "body_pose")
-_TRANS = ("trans", "smpl_trans", "transl")
+_TRANS = ("trans", "smpl_trans", "transl", "trans_world")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "framerate", "fps")
 _JOINTS = ("rest_joints", "J", "joints")
 _UNUSED = ("dmpls", "expression", "pose_est_dmpls")
@@ -43,8 +48,13 @@ _AIST_FPS = 60.0
 _HY_FPS = 30.0
 #: Rates that files without a stated one have, frames/s, the usual one first.
 _UNSTATED = {_AIST_FPS: (60.0, 30.0), _HY_FPS: (30.0, 60.0)}
-Z_TO_Y_UP = (2**-0.5, -(2**-0.5), 0.0, 0.0)
-"""wxyz, the turn of the world from Z up to Y up: -90 degrees about X."""
+_AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
+
+
+def to_y_up(up: str) -> torch.Tensor:
+    """`(4,)` wxyz, the turn of a world with the vertical `up` to Y up."""
+    images = vectors_from_z_up(vectors_to_z_up(np.eye(3), up), "Y")
+    return matrix_to_quat(torch.tensor(images.T))
 
 
 def is_smpl(keys: Mapping[str, Any] | Sequence[str]) -> bool:
@@ -64,6 +74,7 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
     Raises:
         PoiseError: arrays that are missing, of the wrong shape or not finite.
     """
+    data, people = _of_one_person(data, options.take, path)
     poses, layout = _poses(data, path)
     scale, world_unit = _scale(data, path, options)
     trans = numeric(data, _needed(data, _TRANS, path), (None, 3), path)
@@ -71,16 +82,20 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
         raise PoiseError(f"it has {len(poses)} poses but {len(trans)} translations", path)
     refuse_bad(poses, "the rotation", path, layout.names)
     refuse_bad(trans, "the translation", path)
-    notes: list[str] = []
+    # Roots may turn often, and fits of fingers are wild.
+    limbs = {name: poses[:, j] for j, name in enumerate(layout.names[:22]) if j}
+    hint = "Convert the axis-angle vectors to radians"
+    check_radians(limbs, "the SMPL family has", path, hint)
+    notes = people
     pelvis, offsets = _rest(data, path, layout, notes)
     root_pos = trans / scale * world_unit + pelvis
     quat = rotvec_to_quat(torch.tensor(poses))
-    up, up_note = _up(data, options, layout, root_pos, quat)
-    notes += [*up_note, *_told(data)]
-    if up == "Z":
-        quat[:, 0] = quat_mul(torch.tensor(Z_TO_Y_UP, dtype=torch.float64), quat[:, 0])
-        root_pos = vectors_from_z_up(root_pos, "Y")
     fps = options.fps or _fps(data, path, notes)
+    up, up_note = _up(data, options, layout, root_pos, quat, fps)
+    notes += [*up_note, *_told(data)]
+    if up != "Y":
+        quat[:, 0] = quat_mul(to_y_up(up), quat[:, 0])
+        root_pos = vectors_from_z_up(vectors_to_z_up(root_pos, up), "Y")
     raw = RawMotion(
         format="smpl",
         path=path,
@@ -110,6 +125,25 @@ def read_smpl(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip
 
 def _first(keys: Mapping[str, Any] | Sequence[str], names: Sequence[str]) -> str | None:
     return next((n for n in names if n in keys), None)
+
+
+def _of_one_person(
+    data: Mapping[str, Any], take: str | None, path: Path
+) -> tuple[Mapping[str, Any], list[str]]:
+    """The arrays of one person where `trans` is (P, T, 3) or (T, P, 3), and a note about the others."""
+    key = _first(data, _TRANS)
+    trans = np.zeros((0, 3)) if key is None else np.asarray(data[key])
+    if trans.ndim != 3 or min(trans.shape[:2]) > MOST_PEOPLE:
+        return data, []
+    both, notes = trans.shape[:2], one_person(trans, 2, take, path)[1]
+    out: dict[str, Any] = {}
+    for name in data:
+        with suppress(PoiseError):
+            # Pickled arrays beside the motion stay unread.
+            value = np.asarray(data[name])
+            mine = value.ndim > 2 and value.shape[:2] == both
+            out[name] = one_person(value, value.ndim - 1, take, path)[0] if mine else data[name]
+    return out, notes
 
 
 def _needed(data: Mapping[str, Any], names: Sequence[str], path: Path) -> str:
@@ -213,26 +247,46 @@ def _up(
     layout: Layout,
     root_pos: np.ndarray,
     quat: torch.Tensor,
+    fps: float,
 ) -> tuple[str, list[str]]:
-    """The world's vertical: stated, else Z as in AMASS (Y in AIST++) unless the body says otherwise."""
+    """The world's vertical: stated, else Z as in AMASS (Y in AIST++) unless the body says otherwise.
+
+    The keys of AMASS count as a statement: people lie and crawl in it. Only steps that it makes climb
+    by more than half a body overrule them.
+    """
     if options.up_axis is not None:
         return options.up_axis.upper(), []
     stated = text_of(data["up_axis"]).upper() if "up_axis" in data else ""
-    if stated in ("Y", "Z"):
+    if stated in UPS:
         return stated, []
     if "smpl_poses" in data:
         return "Y", ["Y up and metres after division by smpl_scaling, as AIST++ has it"]
     if not len(root_pos):
         return "Z", []
     at = sampled(len(root_pos))
-    pos, _ = posed(layout.parents, layout.offsets, root_pos[at], quat[at].numpy())
-    ankles = [layout.names.index(f"{side}_ankle") for side in ("left", "right")]
-    way = pos[:, layout.names.index("head")] - pos[:, ankles].mean(1)
-    lean = (way / np.linalg.norm(way, axis=-1, keepdims=True)).mean(0)
-    if abs(lean[1]) > 0.7 and abs(lean[2]) < 0.4:
-        head_down = "" if lean[1] > 0 else " with the head down (are these a camera's axes?)"
-        return "Y", [f"The file states no vertical: Y taken, since the body stands along it{head_down}"]
-    return "Z", ["The file states no vertical: Z taken, as AMASS has it"]
+    after = later_frames(at, fps, len(root_pos))
+    pos, later = (
+        posed(layout.parents, layout.offsets, root_pos[k], quat[k].numpy())[0] for k in (at, after)
+    )
+    plain = "The file states no vertical: Z taken, as AMASS has it"
+    if any(key in data for key in _AMASS_RATES):
+        along = clear_axis(lean(layout.names, pos))
+        if along in (None, "Z"):
+            return "Z", [plain]
+        borne = supports(layout.names, pos, later)
+        if borne["Z"].wander > 0.5 and borne[along].cost + 0.5 < borne["Z"].cost:
+            told = f"it would climb and fall along Z, and stands and steps along {along}"
+            return along, [
+                f"The file has the keys of AMASS, which is Z up, but the body does not fit: {told}; "
+                f"{along} taken (uncertain; override with --up Z)"
+            ]
+        return "Z", [
+            f"{plain}; the body lies along {along[-1]} (if it stands there, state --up {along})"
+        ]
+    guess = guess_up(layout.names, pos, None, later)
+    if guess.value in ("Y", "-Y", "Z") and clear_axis(lean(layout.names, pos)) == guess.value != "Z":
+        return str(guess.value), [guess.note]
+    return "Z", [plain]
 
 
 def _fps(data: Mapping[str, Any], path: Path, notes: list[str]) -> float:

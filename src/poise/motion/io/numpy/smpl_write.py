@@ -10,7 +10,7 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.numpy.arrays import npz_bytes
-from poise.motion.io.numpy.smpl import Z_TO_Y_UP
+from poise.motion.io.numpy.smpl import to_y_up
 from poise.motion.io.numpy.smpl_table import LAYOUTS, PELVIS, layout_of_joints
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up, vectors_to_z_up
 from poise.motion.io.text import write_whole
@@ -59,10 +59,9 @@ def write_amass(clip: Clip, path: str | Path) -> None:
     pelvis = _numbers(kept.get("pelvis"), np.array(PELVIS))
     quat = torch.tensor(quats_from_z_up(clip.rot, "Y"))
     root_pos = vectors_from_z_up(clip.root_pos, "Y")
-    if up == "Z":
-        to_z = quat_conj(torch.tensor(Z_TO_Y_UP, dtype=torch.float64))
-        quat[:, 0] = quat_mul(to_z, quat[:, 0])
-        root_pos = vectors_to_z_up(root_pos, "Y")
+    if up != "Y":
+        quat[:, 0] = quat_mul(quat_conj(to_y_up(up)), quat[:, 0])
+        root_pos = vectors_from_z_up(vectors_to_z_up(root_pos, "Y"), up)
     rest = vectors_from_z_up(clip.skeleton.rest_positions(), "Y") + pelvis
     arrays = {
         "poses": quat_to_rotvec(quat).reshape(clip.frames, -1).numpy(),

@@ -11,7 +11,9 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.clip import check_rate
+from poise.motion.io.guess import UPS
 from poise.motion.io.numpy.arrays import numeric, one_number, require, text_of
+from poise.motion.io.people import MOST_PEOPLE, one_person
 from poise.motion.io.points.raw import RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
 from poise.motion.io.refused import FLAT_HINT
@@ -32,8 +34,10 @@ _HANDS = ("left_hand", "right_hand")
 
 
 def is_joints(shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
-    """Whether one array holds the places of SMPL's joints: `(T, 22, 3)`, or `(T, 24, 3)` with hands."""
-    return dtype.kind == "f" and len(shape) == 3 and shape[1:] in ((22, 3), (24, 3))
+    """Whether one array holds the places of SMPL's joints: `(T, 22, 3)`, or `(T, 24, 3)` with hands;
+    of several people `(T, P, 22, 3)`."""
+    one = len(shape) == 3 or (len(shape) == 4 and 0 < shape[1] <= MOST_PEOPLE < shape[0])
+    return dtype.kind == "f" and one and shape[-2:] in ((22, 3), (24, 3))
 
 
 def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
@@ -44,8 +48,9 @@ def joint_points(array: np.ndarray, path: Path, options: ReadOptions = UNSTATED)
     Raises:
         PoiseError: 24 joints without a stated rate.
     """
+    array, people = one_person(array, 3, options.take, path)
     names = HUMANML3D + (_HANDS if array.shape[1] == len(HUMANML3D) + 2 else ())
-    fps, notes = options.fps, []
+    fps, notes = options.fps, people
     if fps is None:
         if len(names) != len(HUMANML3D):
             raise PoiseError("an array of joints states no frame rate", path, "State it with --fps F")
@@ -74,10 +79,13 @@ def named_joint_points(
         PoiseError: another number of joints, names that do not fit them, or what `numeric` refuses.
     """
     if named := next((key for key in _NAMES if key in data), None):
-        own = {key: data[key] for key in ("fps", "confidence", "unit_m", "up_axis") if key in data}
+        own: dict[str, Any] = {
+            key: data[key] for key in ("fps", "confidence", "unit_m", "up_axis") if key in data
+        }
         as_points = {**own, "positions": data["joints"], "names": data[named]}
         return replace(array_points(as_points, path, options), format="joints")
-    joints = numeric(data, "joints", (None, None, 3), path)
+    table, people = one_person(np.asarray(data["joints"]), 3, options.take, path)
+    joints = numeric({"joints": table}, "joints", (None, None, 3), path)
     if not is_joints(joints.shape, joints.dtype):
         raise PoiseError(
             f"its array 'joints' has the shape {joints.shape}", path,
@@ -85,7 +93,8 @@ def named_joint_points(
         )  # fmt: skip
     fps = one_number(data, "fps", path) if options.fps is None else options.fps
     check_rate(fps, path)
-    return joint_points(joints, path, replace(options, fps=fps))
+    points = joint_points(joints, path, replace(options, fps=fps))
+    return replace(points, notes=(*people, *points.notes))
 
 
 def is_points(data: Mapping[str, Any]) -> bool:
@@ -104,7 +113,8 @@ def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNS
     positions = np.asarray(data["positions"])
     if positions.ndim == 3 and positions.shape[-1] == 2:
         raise PoiseError(f"its positions have the shape {positions.shape}: they are 2D", path, FLAT_HINT)
-    positions = numeric(data, "positions", (None, None, 3), path)
+    table, notes = one_person(positions, 3, options.take, path)
+    positions = numeric({"positions": table}, "positions", (None, None, 3), path)
     names = tuple(text_of(x).strip() for x in np.ravel(np.asarray(data["names"])))
     if len(names) != positions.shape[1] or not all(names) or len(names) > MAX_JOINTS:
         raise PoiseError(
@@ -120,10 +130,13 @@ def array_points(data: Mapping[str, Any], path: Path, options: ReadOptions = UNS
     up = text_of(data["up_axis"]).upper() if "up_axis" in data else None
     if unit is not None and not unit > 0:
         raise PoiseError(f"unit_m must be above 0, got {unit:g}", path)
-    if up not in (None, "Y", "Z"):
-        raise PoiseError(f"up_axis must be Y or Z, got {shown(up or '')}", path)
-    scores = numeric(data, "confidence", positions.shape[:2], path) if "confidence" in data else None
-    return RawPoints("keypoints-npz", path, names, positions, fps, unit, up, scores)
+    if up not in (None, *UPS):
+        raise PoiseError(f"up_axis must be one of {', '.join(UPS)}, got {shown(up or '')}", path)
+    scores = None
+    if "confidence" in data:
+        own, _ = one_person(np.asarray(data["confidence"]), 2, options.take, path)
+        scores = numeric({"confidence": own}, "confidence", positions.shape[:2], path)
+    return RawPoints("keypoints-npz", path, names, positions, fps, unit, up, scores, notes=tuple(notes))
 
 
 def is_mdm(data: Mapping[str, Any]) -> bool:

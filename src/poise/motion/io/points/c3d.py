@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.guess import UPS
 from poise.motion.io.limited import read_limited
+from poise.motion.io.people import chosen
 from poise.motion.io.points.raw import UNITS_M, RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
-from poise.motion.io.text import CUT_OFF, check_file, listed, shown
+from poise.motion.io.text import CUT_OFF, check_file, shown
 
 _KEY = 0x50
 _BLOCK = 512
@@ -53,9 +55,7 @@ def c3d_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
         )
     missing = residuals[0, : len(labels)] < 0
     positions = np.where(missing.T[..., None], np.nan, points[:3, : len(labels)].transpose(2, 1, 0))
-    # An untracked marker without residual stands exactly at the origin.
-    positions[(positions == 0).all(-1)] = np.nan
-    keep, notes = _chosen(labels, point)
+    keep, notes = _chosen(labels, point, options.take, path)
     unit_name = _text(point, "UNITS").lower()
     if unit_name not in UNITS_M:
         notes.append(f"The unit {shown(unit_name)} is not known" if unit_name else "No unit is stated")
@@ -112,24 +112,26 @@ def _text(point: dict[str, np.ndarray], key: str) -> str:
 def _vertical(point: dict[str, np.ndarray]) -> str | None:
     """The file's vertical, where it says which axis points up on the screen."""
     axis = _text(point, "Y_SCREEN").upper().lstrip("+")
-    return axis if axis in ("Y", "Z") else None
+    return axis if axis in UPS else None
 
 
-def _chosen(labels: list[str], point: dict[str, np.ndarray]) -> tuple[list[int], list[str]]:
+def _chosen(
+    labels: list[str], point: dict[str, np.ndarray], take: str | None, path: Path
+) -> tuple[list[int], list[str]]:
     """Columns of labelled markers, of one subject, each label once."""
     outputs = {str(x).strip() for key in _NO_PLACES for x in point.get(key, ())}
     subjects = dict.fromkeys(x.rsplit(":", 1)[0] for x in labels if ":" in x and not x.startswith("*"))
     notes: list[str] = []
-    only = next(iter(subjects), None)
+    only = None
     if len(subjects) > 1:
-        notes.append(f"It holds {len(subjects)} subjects ({listed(subjects)}): the first one was read")
+        only, notes = chosen(list(subjects), take, path)
     seen: set[str] = set()
     keep = []
     for k, label in enumerate(labels):
         # Vicon writes unlabelled trajectories as *1, *2, ...
         if not label or label.startswith("*") or label in outputs or label in seen:
             continue
-        if only is not None and len(subjects) > 1 and not label.startswith(only + ":"):
+        if only is not None and not label.startswith(only + ":"):
             continue
         seen.add(label)
         keep.append(k)

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.guess import UPS
 from poise.motion.io.points.raw import UNITS_M, RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
 from poise.motion.io.refused import FLAT_HINT
@@ -49,7 +50,7 @@ def looks_like_points_csv(head: bytes) -> bool:
     ]
     if not lines or "\0" in lines[0]:
         return False
-    columns = [m for cell in _split(lines[0]) if (m := _COLUMN.match(cell.strip()))]
+    columns = [m for cell in _split(lines[0], _mark(lines[0])) if (m := _COLUMN.match(cell.strip()))]
     axes = {(m.group(1).lower(), m.group(2).lower()) for m in columns}
     return sum((name, "y") in axes for name, axis in axes if axis == "x") >= 4
 
@@ -68,8 +69,10 @@ def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
         at += 1
     if at == len(lines):
         raise PoiseError("the table has no header", path, CUT_OFF)
-    layout = _layout(_split(lines[at]), path, at + 1)
-    table = _rows(lines, at + 1, layout, path)
+    # The header tells what stands between cells; rows may hold decimal commas as well.
+    mark = _mark(lines[at])
+    layout = _layout(_split(lines[at], mark), path, at + 1)
+    table = _rows(lines, at + 1, layout, path, mark)
     rate = _rate(table, layout, stated, options, path)
     positions = np.stack([table[:, list(columns)] for columns in layout.points.values()], 1)
     scores = None
@@ -81,15 +84,18 @@ def csv_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
     unit, up = stated.get("unit"), stated.get("up", "").upper()
     if unit is not None and unit not in UNITS_M:
         raise PoiseError(f"the unit {shown(unit)} is not known", path, f"Known: {', '.join(UNITS_M)}")
-    if up not in ("", "Y", "Z"):
-        raise PoiseError(f"up must be Y or Z, got {shown(up)}", path)
+    if up not in ("", *UPS):
+        raise PoiseError(f"up must be one of {', '.join(UPS)}, got {shown(up)}", path)
     return RawPoints(
         "csv", path, tuple(layout.points), positions, rate, UNITS_M.get(unit or ""), up or None, scores
     )
 
 
-def _split(line: str) -> list[str]:
-    mark = max(",;\t", key=line.count)
+def _mark(header: str) -> str:
+    return max(",;\t", key=header.count)
+
+
+def _split(line: str, mark: str) -> list[str]:
     return [cell.strip().strip('"') for cell in line.rstrip("\r\n").split(mark)]
 
 
@@ -129,7 +135,7 @@ def _layout(header: list[str], path: Path, line: int) -> _Layout:
     return _Layout(header, whole, scores, time)
 
 
-def _rows(lines: list[str], first: int, layout: _Layout, path: Path) -> np.ndarray:
+def _rows(lines: list[str], first: int, layout: _Layout, path: Path, mark: str) -> np.ndarray:
     width = len(layout.header)
     out: list[list[float]] = []
     used = {k for columns in layout.points.values() for k in columns} | set(layout.scores.values())
@@ -137,7 +143,7 @@ def _rows(lines: list[str], first: int, layout: _Layout, path: Path) -> np.ndarr
     for i in range(first, len(lines)):
         if not lines[i].strip():
             continue
-        cells = _split(lines[i])
+        cells = _split(lines[i], mark)
         if len(cells) != width:
             raise PoiseError(
                 f"it has {len(cells)} columns and the header names {width}", at_line(path, i + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,22 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_poses, check_rate
-from poise.motion.info import body_height, landmarks, sampled
-from poise.motion.io.guess import Guess, guess_unit, guess_up, stated_unit
+from poise.motion.info import body_height, sampled
+from poise.motion.io.guess import Guess, guess_unit, stated_unit
+from poise.motion.io.people import person_of
+from poise.motion.io.points.gaps import without_zeros
 from poise.motion.io.raw import ReadOptions, evidence, vectors_to_z_up
 from poise.motion.io.refused import FLAT_HINT
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
+from poise.motion.io.vertical import clear_axis, guess_up, later_frames, lean, supports
 from poise.motion.keypoints import Keypoints
 from poise.motion.points import FitConfig, fit_clip
 from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
 from poise.motion.skeleton import Source
 
-UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS_M |= {"ft": 0.3048, "dm": 0.1}
 """Metres in a unit, as tables of points call it."""
 
 
@@ -58,25 +62,23 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
     """Keypoints in metres, Z up, with every guess in the source's notes.
 
     Unit and vertical are guessed as for skeletons (`guess.py`), from the places of a body that the
-    labels name. Points that stand on their head (Y down, as cameras have it) are turned over.
+    labels name. Points that stand on their head (Y down, as cameras have it) are turned over, even where
+    the file states Y up.
 
     Raises:
         PoiseError: too few frames, flat (2D) points, a person of no human size.
     """
+    raw = _of_one_person(raw, options)
     _check(raw)
     check_rate(float(options.fps or raw.fps), raw.path)
     source = Source(format=raw.format, path=str(raw.path))
     probe = Keypoints(raw.names, raw.positions, raw.fps, raw.path.stem, raw.confidence, source)
-    bones = _body(probe)
+    body = _body(probe)
     notes = list(raw.notes)
-    up, unit = _up(bones, options, raw), _unit(bones, options, raw)
+    up, unit = _up(body, options, raw), _unit(body, options, raw)
     notes += [guess.note for guess in (up, unit) if guess.note]
     axis, scale = str(up.value), float(unit.value)
     positions = vectors_to_z_up(probe.positions, axis) * scale
-    if _upside_down(bones, axis):
-        # Half a turn about X keeps left and right, which a mirror would not.
-        positions = positions * (1.0, -1.0, -1.0)
-        notes.append(f"The heads lie below the feet along {axis}: the points were turned over")
     stated = f"The file has {raw.fps:.6g} frames per second"
     rate = next((n for n in raw.notes if "frame rate" in n), stated)
     return Keypoints(
@@ -91,6 +93,15 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
             rates=() if options.fps is not None else raw.rates,
         ),
     )  # fmt: skip
+
+
+def _of_one_person(raw: RawPoints, options: ReadOptions) -> RawPoints:
+    """The points of one person, without those that are 0 0 0 since they were not seen."""
+    keep, names, people = person_of(raw.names, options.take, raw.path)
+    positions, zeros = without_zeros(names, raw.positions[:, keep])
+    scores = None if raw.confidence is None else raw.confidence[:, keep]
+    notes = (*raw.notes, *people, *zeros)
+    return replace(raw, names=names, positions=positions, confidence=scores, notes=notes)
 
 
 def as_clip(points: Callable[..., RawPoints]) -> Callable[..., Clip]:
@@ -137,26 +148,51 @@ def _check(raw: RawPoints) -> None:
         )
 
 
-def _body(points: Keypoints) -> tuple[list[str], list[int], np.ndarray]:
-    """Names, parents and sampled positions `(S, P, 3)` of the places that tell a body's size."""
+@dataclass(frozen=True)
+class _Body:
+    """Places of a body in sampled frames `(S, P, 3)`: what tells its size, and all that it may stand on.
+
+    later: `every`, `LATER_S` later.
+    """
+
+    names: list[str]
+    parents: list[int]
+    pos: np.ndarray
+    every_name: list[str]
+    every: np.ndarray
+    later: np.ndarray
+
+
+def _body(points: Keypoints) -> _Body:
     tracks, _ = places_of(points)
-    seen = ~np.isnan(np.stack([tracks[p][:, 0] for p in NEEDED], -1)).any(-1)
+    seen = np.asarray(~np.isnan(np.stack([tracks[p][:, 0] for p in NEEDED], -1)).any(-1))
     frames = np.flatnonzero(seen)
     if not len(frames):
         raise PoiseError(
             "in no frame are all hips, knees, ankles, shoulders, elbows and wrists seen",
             points.source.path,
         )
-    at = frames[sampled(len(frames))]
-    tracks = {p.replace("_", " "): t[at] for p, t in tracks.items()}
+    after = later_frames(frames, points.fps, len(seen))
+    # Frames with a later one tell what stands still; without any, each is its own later one.
+    both = seen[after]
+    frames, after = (frames[both], after[both]) if both.any() else (frames, frames)
+    at = sampled(len(frames))
+    tracks = {p.replace("_", " "): t for p, t in tracks.items()}
     hips = (tracks["left hip"] + tracks["right hip"]) / 2
     neck = (tracks["left shoulder"] + tracks["right shoulder"]) / 2
-    places = {**tracks, "hips": hips, "neck": neck}
-    if "head" not in places or np.isnan(places["head"]).any():
-        places.pop("head", None)
+    tracks = {**tracks, "hips": hips, "neck": neck}
+    places = {n: t[frames[at]] for n, t in tracks.items() if not np.isnan(t[frames[at]]).any()}
     names = [n for n in _TREE if n in places]
     parents = [-1 if (up := _TREE[n]) is None else names.index(up) for n in names]
-    return names, parents, np.stack([places[n] for n in names], 1)
+    known = [n for n in places if not np.isnan(tracks[n][after[at]]).any()]
+    return _Body(
+        names,
+        parents,
+        np.stack([places[n] for n in names], 1),
+        known,
+        np.stack([places[n] for n in known], 1),
+        np.stack([tracks[n][after[at]] for n in known], 1),
+    )
 
 
 def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
@@ -168,9 +204,8 @@ def _offsets(parents: list[int], pos: np.ndarray) -> np.ndarray:
     return out
 
 
-def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
-    names, parents, pos = bones
-    height, how = body_height(names, parents, _offsets(parents, pos), pos)
+def _unit(body: _Body, options: ReadOptions, raw: RawPoints) -> Guess:
+    height, how = body_height(body.names, body.parents, _offsets(body.parents, body.pos), body.pos)
     if not height > 0:
         raise PoiseError("all keypoints lie in one place", raw.path)
     # A stated unit that makes a giant or a doll is a mistake, the file's too; the sentence tells.
@@ -181,17 +216,20 @@ def _unit(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, 
     return guess_unit(height, how, None, raw.path)
 
 
-def _up(bones: tuple[list[str], list[int], np.ndarray], options: ReadOptions, raw: RawPoints) -> Guess:
-    names, _, pos = bones
-    stated = options.up_axis or raw.up_axis
-    if stated is not None:
-        return Guess(stated.upper())
-    return guess_up(names, pos, np.median(pos - pos[:, :1], axis=0))
-
-
-def _upside_down(bones: tuple[list[str], list[int], np.ndarray], axis: str) -> bool:
-    """Whether the neck is below the ankles in most frames."""
-    names, _, pos = bones
-    _, necks, ankles = landmarks(names)
-    height = pos[:, necks[0]] - pos[:, ankles].mean(1)
-    return bool(np.median(height[:, "XYZ".index(axis)]) < 0)
+def _up(body: _Body, options: ReadOptions, raw: RawPoints) -> Guess:
+    if options.up_axis is not None:
+        return Guess(options.up_axis.upper())
+    if raw.up_axis is None:
+        return guess_up(body.every_name, body.every, None, body.later)
+    axis = raw.up_axis.upper()
+    over = axis[1:] if axis[0] == "-" else f"-{axis}"
+    if clear_axis(lean(body.every_name, body.every)) != over:
+        return Guess(axis)
+    borne = supports(body.every_name, body.every, body.later)
+    if borne[axis].cost < borne[over].cost:
+        # A handstand.
+        return Guess(axis)
+    told = (
+        f"The heads lie below the feet along {axis}, which the file states: the points were turned over"
+    )
+    return Guess(over, f"{told} (override with --up {axis})")

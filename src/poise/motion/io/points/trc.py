@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.motion.io.numpy.arrays import rate_in
 from poise.motion.io.points.raw import UNITS_M, RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
 from poise.motion.io.tables import number, row_numbers
@@ -30,7 +32,10 @@ class _Header:
 
 def looks_like_trc(head: bytes) -> bool:
     """Whether a file's first bytes are a TRC header."""
-    return head[:12].lower() == b"pathfiletype" or b"\ndatarate\t" in head[:2000].lower()
+    return (
+        head[:12].lower() == b"pathfiletype"
+        or re.search(rb"\ndatarate[\t ]", head[:2000].lower()) is not None
+    )
 
 
 def trc_points(path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
@@ -69,12 +74,12 @@ def _header(lines: list[str], path: Path) -> _Header:
     if len(lines) <= _LABEL_LINE:
         raise PoiseError("the file ends within its header", path, CUT_OFF)
     keys, values = (line.rstrip("\t ").split("\t") for line in lines[1:3])
-    if len(values) < len(keys):
+    if len(values) < len(keys) or len(keys) < 2:
         keys, values = lines[1].split(), lines[2].split()
     fields = {k.strip().lower(): v.strip() for k, v in zip(keys, values, strict=False)}
     if "datarate" not in fields:
         raise PoiseError("the TRC header has no DataRate", at_line(path, 2), CUT_OFF)
-    cells = lines[_LABEL_LINE].rstrip("\t ").split("\t")
+    cells = _cells(lines[_LABEL_LINE].rstrip("\t "))
     labels = [c.strip() for c in cells[2:] if c.strip()]
     if len(cells) < 3 or not cells[0].strip().lower().startswith("frame") or not labels:
         raise PoiseError(
@@ -93,6 +98,11 @@ def _header(lines: list[str], path: Path) -> _Header:
     return _Header(fields, tuple(labels), _first_row(lines))
 
 
+def _cells(line: str) -> list[str]:
+    """The cells of a row; files that went through an editor have blanks for tabs."""
+    return line.split("\t") if "\t" in line else line.split()
+
+
 def _first_row(lines: list[str]) -> int:
     """The line after "X1 Y1 Z1 ...", and after a blank one where there is one."""
     at = _LABEL_LINE + 1
@@ -108,9 +118,7 @@ def _rows(lines: list[str], header: _Header, path: Path) -> np.ndarray:
     for i in range(header.first, len(lines)):
         if not lines[i].strip():
             continue
-        cells = lines[i].split("\t")
-        if len(cells) < 3:
-            cells = lines[i].split()
+        cells = _cells(lines[i])
         # Trailing tabs are usual, and trailing blank cells may have been trimmed.
         while len(cells) > width and not cells[-1].strip():
             cells.pop()
@@ -131,7 +139,8 @@ def _rows(lines: list[str], header: _Header, path: Path) -> np.ndarray:
 
 def _rate(header: _Header, times: np.ndarray, path: Path, notes: list[str]) -> float:
     """Frames per second: the header's DataRate, checked with the times."""
-    rate = number(header.fields["datarate"], at_line(path, 3))
+    text = header.fields["datarate"]
+    rate = found if (found := rate_in(text)) is not None else number(text, at_line(path, 3))
     steps = np.diff(times[np.isfinite(times)])
     measured = 1.0 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else None
     if not rate > 0:
