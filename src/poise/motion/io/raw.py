@@ -21,6 +21,7 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS, shown
+from poise.motion.io.travel import beside_note
 from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
 from poise.spatial import normalize, unwrap_quats
 
@@ -48,7 +49,8 @@ class RawMotion:
     offsets `(J, 3)`, ends, root_pos `(T, 3)`: file units. rot: `(T, J, 4)` wxyz, local.
     unit_m, up_axis: what the format itself states, None where it states nothing.
     unit_hint: a unit the file suggests, checked with the person's height.
-    strays: `(joint, largest distance)` of position channels that did not stay constant.
+    strays: `(joint, largest distance)` of position channels that did not stay constant; beside: the
+        same of joints that do not hang on `travel_joint`.
     whole: frame 0 belongs to the motion for certain, so no rest pose is sought there.
     mended: what the reader mended, as in `Source.mended`.
     """
@@ -71,6 +73,7 @@ class RawMotion:
     cyclic: bool = False
     notes: tuple[str, ...] = ()
     strays: tuple[tuple[str, float], ...] = ()
+    beside: tuple[tuple[str, float], ...] = ()
     mended: tuple[tuple[str, str, int, int, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
     whole: bool = False
@@ -129,6 +132,8 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
             "is kept rigid at the median"
         )
         mended.append(("bone drift", name, 0, -1, stray * scale))
+    if raw.beside:
+        notes.append(beside_note(str(raw.travel_joint), raw.beside, scale))
     fps = float(options.fps or raw.fps)
     root_pos = vectors_to_z_up(raw.root_pos, axis) * scale
     notes += teleports(root_pos, fps)

@@ -86,6 +86,7 @@ def _raw_motion(
         [turn[n] for n in joints],
         [scale[n] for n in joints],
         base,
+        len(when),
         notes,
     )
     own = take.extras
@@ -98,7 +99,6 @@ def _raw_motion(
         "scale": [even(scale[n]) for n in joints],
         "rest": tree.turn[joints].tolist(),
         "root": tree.place[joints[0]].tolist(),
-        "still": bones.still,
         "take": take.name,
     }
     unit_m = checked_unit("glTF", 1.0, "Y", names, parents, bones, options, file.path, notes)
@@ -116,11 +116,12 @@ def _raw_motion(
         frame_time=_number_of(own.get("frame_time")),
         unit_m=unit_m,
         up_axis="Y",
-        travel_joint=None if bones.travel is None else names[bones.travel],
+        travel_joint=None if bones.carried.joint is None else names[bones.carried.joint],
         cyclic=own.get("cyclic") is True,
         notes=tuple(notes),
-        strays=bones.strays,
-        extra=(("gltf", json.dumps(kept)), *extra),
+        strays=bones.carried.strays,
+        beside=bones.carried.beside,
+        extra=(("gltf", json.dumps(kept)), *extra, *bones.carried.extra),
         whole="fps" in own,
     )
 

@@ -66,7 +66,7 @@ def raw_of_matrices(
     place, turn, scale = ([p[k] for p in parts] for k in range(3))
     steady = [np.median(s, axis=0) for s in scale]
     base = base_of([(top[0], top[1], top[2])])
-    bones = rigid_bones(names, parents, place, turn, steady, base, notes)
+    bones = rigid_bones(names, parents, place, turn, steady, base, len(local), notes)
     up, unit = str(held["up"]), float(held["unit"])
     return RawMotion(
         format=form.lower(),
@@ -81,10 +81,12 @@ def raw_of_matrices(
         channels=(),
         unit_m=checked_unit(form, unit, up, names, parents, bones, options, path, notes),
         up_axis=up,
-        travel_joint=None if bones.travel is None else names[bones.travel],
+        travel_joint=None if bones.carried.joint is None else names[bones.carried.joint],
         cyclic=bool(held["cyclic"]),
         notes=tuple(notes),
-        strays=bones.strays,
+        strays=bones.carried.strays,
+        beside=bones.carried.beside,
+        extra=bones.carried.extra,
         whole=bool(held["whole"]),
     )
 
