@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,7 +18,6 @@ whatever the unit."""
 _LOOSE_SHARE = 20 * RIGID_SHARE
 #: Bones of a limb are longer than this share of the size, and turn by more than so many radians.
 _BONE_SHARE, _TURNS = 0.05, 0.03
-_NO_FOOT = re.compile(r"(^|[^a-z])(ik|fk|ctrl|control|target|pole|stool|root|roll)([^a-z]|$)", re.I)
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ def _carrier(
         for j in range(len(parents))
     ]
     weight = [1.0 if r else 0.25 for r in rigid]
-    named = _feet(names)
+    named = set(landmarks(names)[2])
     feet = [int(j in named) for j in range(len(parents))]
     children: list[list[int]] = [[] for _ in parents]
     for j in range(len(parents) - 1, 0, -1):
@@ -167,11 +165,6 @@ def _carrier(
         joint = heavy
         if stray.get(joint, 0.0) > (_LOOSE_SHARE if beside else RIGID_SHARE) * size:
             found = joint
-
-
-def _feet(names: Sequence[str]) -> set[int]:
-    """The ankles and feet that names tell, without the targets that control them."""
-    return {j for j in landmarks(names)[2] if not _NO_FOOT.search(names[j])}
 
 
 def _limbs(
@@ -230,7 +223,7 @@ def restored(skeleton: Skeleton, offsets: np.ndarray, root_pos: np.ndarray, rot:
     kept = [float(x) for x in texts.get("beside", "").split()]
     rows = np.array(kept).reshape(-1, 4) if len(kept) % 4 == 0 else np.zeros((0, 4))
     places = {int(j): p for j, *p in rows.tolist() if 0 < j < len(parents)}
-    way = line_to_root(parents, joint)[::-1]
+    way = set(line_to_root(parents, joint))
     made = offsets.copy()
     for j, place in places.items():
         made[j] = place
@@ -245,8 +238,7 @@ def restored(skeleton: Skeleton, offsets: np.ndarray, root_pos: np.ndarray, rot:
     up = parents[joint]
     path = quat_rotate_inv(quat[:, up], pos[:, joint] - (base + zero[:, up])).numpy()
     if not places:
-        beside = set(range(1, len(parents))) - _below(parents, joint) - set(way)
-        for j in beside:
+        for j in set(range(1, len(parents))) - _below(parents, joint) - way:
             if parents[j] in way:
                 at = base + zero[:, parents[j]]
                 made[j] = np.median(quat_rotate_inv(quat[:, parents[j]], pos[:, j] - at).numpy(), axis=0)
