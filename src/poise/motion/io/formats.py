@@ -154,12 +154,15 @@ def read_clip(
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
-    path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
     options = ReadOptions(
         asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz
     )
     check_options(options)
+    return _read(Path(path), options)
+
+
+def _read(path: Path, options: ReadOptions) -> Clip:
     reader = _reader_of(path)
     try:
         return reader.read(path, options)
@@ -171,7 +174,10 @@ def read_clip(
 
 
 def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
-    """A clip that shows a skeleton and how it stands: that of a motion file, or the rest pose of an ASF.
+    """A clip that shows a skeleton and how it stands: that of a motion file, or its rest pose.
+
+    An ASF has a rest pose alone, and so have BVH, glTF, USD and FBX files without an animation: two
+    frames show it.
 
     Args:
         skeleton: the ASF file of an AMC, see `read_clip`.
@@ -181,7 +187,8 @@ def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
     """
     path = Path(path)
     if path.suffix.lower() != ".asf" or path.is_dir():
-        return read_clip(path, skeleton=skeleton)
+        asf = None if skeleton is None else Path(skeleton)
+        return _read(path, ReadOptions(asf, rest=True))
     try:
         return read_asf(path)
     except PoiseError as error:

@@ -12,7 +12,7 @@ from poise.errors import PoiseError
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import guess_unit, guess_up
 from poise.motion.io.raw import ReadOptions, vectors_from_z_up
-from poise.motion.io.text import shown
+from poise.motion.io.text import REST_POSE, shown
 from poise.motion.io.travel import Carried, carried, size_of
 from poise.motion.skeleton import Skeleton, posed
 from poise.spatial import matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
@@ -129,6 +129,9 @@ def rigid_bones(
     rot[:, 0] = quat_mul(torch.tensor(base.turn).expand(frames, 4), torch.tensor(rot[:, 0])).numpy()
     root_pos = base.place + _turned(base.turn, base.factor * base.scale * place[0])
     root_pos = np.array(np.broadcast_to(root_pos, (frames, 3)))
+    moves = [x for x in (root_pos, *paths.values()) if np.ptp(x, axis=0).max() > 0]
+    if not moves and np.abs(rot - rot[:1]).max() < 1e-9 and REST_POSE not in notes:
+        notes.append(f"Nothing moves in it: its {frames} frames show one pose")
     body = carried(names, parents, offsets, paths, root_pos, rot, size_of(offsets), notes)
     return Bones(body.offsets, body.root_pos, rot, body)
 

@@ -28,7 +28,10 @@ from poise.spatial import normalize, unwrap_quats
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the caller states instead of leaving it to a guess; None where it is not stated."""
+    """What the caller states instead of leaving it to a guess; None where it is not stated.
+
+    rest: a file that holds a skeleton and no animation is read as it rests.
+    """
 
     skeleton: Path | None = None
     fps: float | None = None
@@ -37,6 +40,7 @@ class ReadOptions:
     allow_pickle: bool = False
     smooth_hz: float | None = None
     take: str | None = None
+    rest: bool = False
 
 
 UNSTATED = ReadOptions()
