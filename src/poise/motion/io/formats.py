@@ -82,7 +82,10 @@ def _looks_like_gltf(head: bytes) -> bool:
 
 
 def _looks_like_usd(head: bytes) -> bool:
-    return head.startswith((b"PXR-USDC", b"#usda"))
+    # A package begins with the name of its layer.
+    named = head[30 : 30 + int.from_bytes(head[26:28], "little")].lower()
+    packed = head[:4] == b"PK\x03\x04" and named.endswith((b".usda", b".usdc", b".usd"))
+    return packed or head.startswith((b"PXR-USDC", b"#usda"))
 
 
 READERS = (
@@ -90,7 +93,7 @@ READERS = (
     Reader("ASF", (".asf",), looks_like_asf, refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("glTF", (".glb", ".gltf", ".vrm", ".vrma"), _looks_like_gltf, read_gltf),
-    Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
+    Reader("USD", (".usd", ".usda", ".usdc", ".usdz"), _looks_like_usd, read_usd),
     Reader("FBX", (".fbx",), looks_like_fbx, read_fbx),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL, Kimodo, keypoints or Poise", (".npz",), looks_like_npz, read_npz),

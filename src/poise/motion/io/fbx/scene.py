@@ -65,7 +65,7 @@ def read(
         "names": np.array([nodes[k].name.encode("utf-8", "replace").decode() for k in order], dtype=str),
         "parents": np.array(parents),
         "local": local,
-        "above": base,
+        "above": base[None],
         "codes": times,
         "fps": np.array(rate),
         "up": np.array("Y"),
