@@ -16,6 +16,8 @@ _CONTROLS = re.compile(r"(^|[^a-z])(ik|ctrl|control|target|pole)([^a-z]|$)")
 _NOT_JOINTS = ("end", "nub", "top", "tip", "mesh", "index")
 # Ankle to head joint along the bones, and ankle to neck, as shares of a person's height.
 # The way runs through the hip's width, so it is a little longer than the upright distance.
+# Of so many joints all pairs are measured.
+_PAIRWISE = 256
 _HEAD_SHARE, _NECK_SHARE = 0.92, 0.80
 
 
@@ -51,8 +53,20 @@ def body_height(
             return height, f"from the bones between {top} and ankles"
     spread = 0.0
     for pose in positions[:: max(1, len(positions) // 20)]:
-        spread = max(spread, float(np.linalg.norm(pose[:, None] - pose[None], axis=-1).max()))
+        spread = max(spread, _spread(pose))
     return spread, "from the largest distance between two joints"
+
+
+def _spread(places: np.ndarray) -> float:
+    """The largest distance between two of `(J, 3)` places; of very many, by going to the farthest from
+    the farthest, which falls short of it by little."""
+    if len(places) <= _PAIRWISE:
+        return float(np.linalg.norm(places[:, None] - places[None], axis=-1).max())
+    at, out = places.mean(0), 0.0
+    for _ in range(4):
+        far = np.linalg.norm(places - at, axis=-1)
+        at, out = places[far.argmax()], float(far.max())
+    return out
 
 
 def _way(parents: Sequence[int], lengths: np.ndarray, a: int, b: int) -> float:
