@@ -22,8 +22,8 @@ MAX_LINE_BYTES = 4 << 20
 """Longer lines are refused while they are read."""
 MAX_HEADER_WORDS = 1_000_000
 """More words than this before the motion starts are refused."""
-MAX_JOINTS = 2000
-"""Skeletons with more joints are refused."""
+MAX_JOINTS = 1500
+"""Skeletons with more joints are refused: a person with a face of hundreds of bones has some 1200."""
 MAX_NAME = 200
 """Joints and keypoints with longer names are refused."""
 MAX_VALUE = 1e8

@@ -26,7 +26,7 @@ def read_bvh(path: Path, options: ReadOptions) -> Clip:
     its travel becomes the clip's root path and its offset zero, so that every joint from there on moves
     as in the file, see `travel.carried`.
     """
-    file = parse_bvh(path)
+    file = parse_bvh(path, options.rest)
     joints, rot = file.joints, _rotations(file)
     places = _resolve_places(file, rot)
     body = places.body
