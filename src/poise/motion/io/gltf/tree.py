@@ -11,9 +11,9 @@ from poise.errors import PoiseError
 from poise.motion.io.gltf.accessor import index_of
 from poise.motion.io.gltf.file import GltfFile
 from poise.motion.io.nodes import turn_and_scale
-from poise.motion.io.text import MAX_NAME, MAX_VALUE, shown
+from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 
-MAX_DEPTH = 1000
+MAX_DEPTH = 2 * MAX_JOINTS
 """Deeper node trees are refused."""
 
 
