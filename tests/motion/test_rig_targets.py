@@ -10,7 +10,7 @@ import pytest
 from handmade_rigs import bvh_of, fbx_of, gltf_of, skeleton_of, usda_of, walker
 from scipy.spatial.transform import Rotation
 
-from poise.kin import retarget
+from poise.kin import RetargetConfig, retarget
 from poise.motion import read_clip, write_clip
 from poise.motion.io.formats import read_skeleton
 
@@ -35,10 +35,14 @@ def test_a_walk_onto_a_rig(tmp_path: Path, suffix: str) -> None:
         start, end = text.index("AnimationStack:"), text.index("\n}\nConnections")
         path.write_text((text[:start] + text[end:]).replace('C: "OO",3,2\n', ""))
     (tmp_path / "walk.bvh").write_text(bvh_of(walk))
-    made, _ = retarget(read_clip(tmp_path / "walk.bvh"), read_skeleton(path))
+    config = RetargetConfig(contacts=False, clear=False)
+    made, _ = retarget(read_clip(tmp_path / "walk.bvh"), read_skeleton(path), config=config)
     out = tmp_path / f"out.{'bvh' if suffix == 'fbx' else suffix}"
     write_clip(made, out)
     back = read_clip(out)
     got = back.positions()[:, [back.skeleton.index(n) for n in walk.names]]
     want = walk.world()
-    assert got.shape == want.shape and np.abs(got - want).max() < 0.03
+    assert got.shape == want.shape
+    # Seen from the pelvis; how far steps go is a matter of the ground.
+    assert np.abs((got - got[:, :1]) - (want - want[:, :1])).max() < 1e-3
+    assert np.ptp(got[:, 0, 1]) > 0.9 * np.ptp(want[:, 0, 1])
