@@ -43,6 +43,9 @@ def test_a_walk_onto_a_rig(tmp_path: Path, suffix: str) -> None:
     got = back.positions()[:, [back.skeleton.index(n) for n in walk.names]]
     want = walk.world()
     assert got.shape == want.shape
+    # Feet lie on the ground as they can, so the balls do not tell.
+    legs = [k for k, n in enumerate(walk.names) if "ball" not in n]
+    got, want = got[:, legs], want[:, legs]
     # Seen from the pelvis; how far steps go is a matter of the ground.
     assert np.abs((got - got[:, :1]) - (want - want[:, :1])).max() < 1e-3
-    assert np.ptp(got[:, 0, 1]) > 0.9 * np.ptp(want[:, 0, 1])
+    assert np.ptp(got[:, 0, 1]) == pytest.approx(np.ptp(want[:, 0, 1]), rel=0.1)
