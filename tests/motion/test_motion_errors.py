@@ -93,7 +93,7 @@ BVH_CASES = {
     ),
     "second root": (
         bvh_text(header=HEADER.replace("JOINT LeftLeg", "ROOT LeftLeg")),
-        ", line 20: a second ROOT, 'LeftLeg'. Give each body its own file",
+        ", line 20: ROOT 'LeftLeg' stands inside a joint",
     ),
     "channel": (
         bvh_text(header=HEADER.replace("Yrotation Xrotation Zrotation", "Yrotation Xscale Zrotation")),

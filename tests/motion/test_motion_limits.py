@@ -92,7 +92,7 @@ def test_motion_of_too_many_frames_is_refused(tmp_path: Path) -> None:
 def test_tables_of_many_or_long_labels_are_refused_at_once(tmp_path: Path) -> None:
     many = tuple(f"m{k}" for k in range(20_000))
     path = put(tmp_path, "a.trc", trc_text(np.zeros((2, 20_000, 3)), many))
-    assert refusal(path) == ": it has 20000 keypoints, more than the 2000 allowed"
+    assert refusal(path) == ": it has 20000 keypoints, more than the 1500 allowed"
     path = put(tmp_path, "b.trc", trc_text(names=("_" * 20_000, *NAMES[1:])))
     assert refusal(path).endswith("has a name of 20000 characters")
 

@@ -16,6 +16,8 @@ UNEQUAL = 0.15
 ARM_RATIO, LEG_RATIO = 1.27, 1.0
 #: Distance of the hips over the leg's length, and of the shoulders over the arm's, at least.
 HIP_WIDTH, SHOULDER_WIDTH = 0.1, 0.4
+#: A limb is sought among so many joints of a way at most.
+_LIMB_JOINTS = 48
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,15 @@ def find_limbs(skeleton: Skeleton, clips: Sequence[Clip] = ()) -> Limbs | None:
     the first frame of the first clip, else in the rest pose. Left and right follow from the toes.
     """
     pose = trim(clips[0], 0, 2).positions()[0] if clips else skeleton.rest_positions()
-    lines = {j: _line(skeleton, j) for j in range(len(skeleton))}
+    lines = _Lines(skeleton)
     pairs = []
     for parent in range(len(skeleton)):
-        for a, b in itertools.combinations(skeleton.children(parent), 2):
+        long = [j for j in skeleton.children(parent) if lines.joints(j) > 2]
+        for a, b in itertools.combinations(long, 2):
+            if lines.joints(a) != lines.joints(b):
+                continue
             one, two = _bones(skeleton, lines[a]), _bones(skeleton, lines[b])
-            if len(one) == len(two) >= 2 and np.abs(one - two).max() <= UNEQUAL * one.sum():
+            if np.abs(one - two).max() <= UNEQUAL * one.sum():
                 pairs.append((float(one.sum()), a, b))
     pairs.sort(reverse=True)
     tops = {j for _, *both in pairs for j in both}
@@ -98,8 +103,9 @@ def head_line(skeleton: Skeleton, chest: int, limbs: Sequence[int], pose: np.nda
     """The joints from above the chest to the head: the central branch with the highest end."""
     taken = set(limbs)
     best: list[int] = []
+    lines = _Lines(skeleton)
     for child in skeleton.children(chest):
-        line = _line(skeleton, child)
+        line = lines[child]
         if taken.isdisjoint(subtree(skeleton, child)):
             top = [j for j in line if pose[j, 2] > pose[chest, 2]]
             if top and (not best or pose[top[-1], 2] > pose[best[-1], 2]):
@@ -121,17 +127,30 @@ def _bones(skeleton: Skeleton, line: Sequence[int]) -> np.ndarray:
     return np.linalg.norm(skeleton.offsets[list(line[1:])], axis=-1)
 
 
-def _line(skeleton: Skeleton, joint: int) -> list[int]:
-    """The longest way (m) down from a joint, itself first."""
-    below = [_line(skeleton, c) for c in skeleton.children(joint)]
-    if not below:
-        return [joint]
-    # The number of joints counts where skin meshes of no length hang beside the end.
-    return [joint, *max(below, key=lambda w: (round(_reach(skeleton, w), 6), len(w)))]
+class _Lines(dict[int, list[int]]):
+    """The longest way (m) down from each joint, itself first, made when it is asked for."""
 
+    def __init__(self, skeleton: Skeleton):
+        super().__init__()
+        bones = np.linalg.norm(skeleton.offsets, axis=-1).tolist()
+        # From the tips up: how long a joint's way is, of how many joints, and the best child. The number
+        # of joints counts where skin meshes of no length hang beside the end.
+        self._best: list[tuple[float, int, int]] = [(0.0, 0, -1)] * len(skeleton)
+        for j in reversed(range(len(skeleton))):
+            ways = [(*self._best[c][:2], c) for c in skeleton.children(j)]
+            far, count, child = max(ways, key=lambda w: (round(w[0], 6), w[1]), default=(0.0, 0, -1))
+            self._best[j] = (far + bones[j], count + 1, child)
 
-def _reach(skeleton: Skeleton, line: Sequence[int]) -> float:
-    return float(np.linalg.norm(skeleton.offsets[line[0]]) + _bones(skeleton, line).sum())
+    def joints(self, joint: int) -> int:
+        """How many joints the way down has."""
+        return self._best[joint][1]
+
+    def __missing__(self, joint: int) -> list[int]:
+        out = [joint]
+        while (below := self._best[out[-1]][2]) >= 0:
+            out.append(below)
+        self[joint] = out
+        return out
 
 
 def _limb(
@@ -163,7 +182,10 @@ def _limb(
             out += 2.0 if apart < width * (upper + lower) else 0.0
         return out
 
-    best = min(itertools.combinations(range(len(lines[0])), 3), key=cost)
+    # Of ways with more joints than limbs have, joints at even places.
+    count = len(lines[0])
+    usable = np.unique(np.linspace(0, count - 1, min(count, _LIMB_JOINTS)).round().astype(int)).tolist()
+    best = min(itertools.combinations(usable, 3), key=cost)
     return [(line[best[0]], line[best[1]], line[best[2]]) for line in lines]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,16 +11,20 @@ import numpy as np
 from poise.motion.clip import Clip
 from poise.motion.skeleton import line_to_root
 
+#: Words of bones that control others, such as "ik_foot_l", and are no joints of a body.
+_CONTROLS = re.compile(r"(^|[^a-z])(ik|ctrl|control|target|pole)([^a-z]|$)")
 _NOT_JOINTS = ("end", "nub", "top", "tip", "mesh", "index")
 # Ankle to head joint along the bones, and ankle to neck, as shares of a person's height.
 # The way runs through the hip's width, so it is a little longer than the upright distance.
+# Of so many joints all pairs are measured.
+_PAIRWISE = 256
 _HEAD_SHARE, _NECK_SHARE = 0.92, 0.80
 
 
 def landmarks(names: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
     """Indices of the joints that their names tell to be head, neck and ankles."""
     low = [n.lower().rsplit(":", 1)[-1] for n in names]
-    usable = [not any(word in n for word in _NOT_JOINTS) for n in low]
+    usable = [not any(word in n for word in _NOT_JOINTS) and not _CONTROLS.search(n) for n in low]
 
     def named(*words: str) -> list[int]:
         return [j for j, n in enumerate(low) if usable[j] and any(w in n for w in words)]
@@ -48,8 +53,20 @@ def body_height(
             return height, f"from the bones between {top} and ankles"
     spread = 0.0
     for pose in positions[:: max(1, len(positions) // 20)]:
-        spread = max(spread, float(np.linalg.norm(pose[:, None] - pose[None], axis=-1).max()))
+        spread = max(spread, _spread(pose))
     return spread, "from the largest distance between two joints"
+
+
+def _spread(places: np.ndarray) -> float:
+    """The largest distance between two of `(J, 3)` places; of very many, by going to the farthest from
+    the farthest, which falls short of it by little."""
+    if len(places) <= _PAIRWISE:
+        return float(np.linalg.norm(places[:, None] - places[None], axis=-1).max())
+    at, out = places.mean(0), 0.0
+    for _ in range(4):
+        far = np.linalg.norm(places - at, axis=-1)
+        at, out = places[far.argmax()], float(far.max())
+    return out
 
 
 def _way(parents: Sequence[int], lengths: np.ndarray, a: int, b: int) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -150,7 +151,15 @@ class Skeleton:
 
     def children(self, joint: int) -> tuple[int, ...]:
         """Indices of the joints with the parent `joint`."""
-        return tuple(j for j, p in enumerate(self.parents) if p == joint)
+        return self._below[joint]
+
+    @cached_property
+    def _below(self) -> tuple[tuple[int, ...], ...]:
+        out: list[list[int]] = [[] for _ in self.parents]
+        for j, parent in enumerate(self.parents):
+            if parent >= 0:
+                out[parent].append(j)
+        return tuple(map(tuple, out))
 
     def ancestors(self, joint: int) -> tuple[int, ...]:
         """Indices of the joints above `joint`, its parent first."""

@@ -101,8 +101,10 @@ def ik_body(table: BodyTable, skeleton: Skeleton) -> IkBody:
     def attached(i: int) -> tuple[int, ...]:
         """Points that move rigidly with row i: its children, and theirs where they have no hinge."""
         out: list[int] = []
-        for c in children.get(i, ()):
-            out += [c, *(attached(c) if not rows[c].order else ())]
+        todo = list(reversed(children.get(i, ())))
+        while todo:
+            out.append(todo.pop())
+            todo += reversed(children.get(out[-1], ()) if not rows[out[-1]].order else ())
         return tuple(out)
 
     heads = {i: children[i][0] for i, r in enumerate(rows) if r.kind == "neck" and i in children}

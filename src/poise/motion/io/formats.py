@@ -82,7 +82,10 @@ def _looks_like_gltf(head: bytes) -> bool:
 
 
 def _looks_like_usd(head: bytes) -> bool:
-    return head.startswith((b"PXR-USDC", b"#usda"))
+    # A package begins with the name of its layer.
+    named = head[30 : 30 + int.from_bytes(head[26:28], "little")].lower()
+    packed = head[:4] == b"PK\x03\x04" and named.endswith((b".usda", b".usdc", b".usd"))
+    return packed or head.startswith((b"PXR-USDC", b"#usda"))
 
 
 READERS = (
@@ -90,7 +93,7 @@ READERS = (
     Reader("ASF", (".asf",), looks_like_asf, refuse_asf),
     Reader("AMC with ASF", (".amc",), _looks_like_amc, read_amc),
     Reader("glTF", (".glb", ".gltf", ".vrm", ".vrma"), _looks_like_gltf, read_gltf),
-    Reader("USD", (".usd", ".usda", ".usdc"), _looks_like_usd, read_usd),
+    Reader("USD", (".usd", ".usda", ".usdc", ".usdz"), _looks_like_usd, read_usd),
     Reader("FBX", (".fbx",), looks_like_fbx, read_fbx),
     Reader("DeepMimic", (".txt", ".json"), _looks_like_json, read_deepmimic),
     Reader("npz of AMASS, SMPL, Kimodo, keypoints or Poise", (".npz",), looks_like_npz, read_npz),
@@ -154,12 +157,15 @@ def read_clip(
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
-    path = Path(path)
     asf = None if skeleton is None else Path(skeleton)
     options = ReadOptions(
         asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz
     )
     check_options(options)
+    return _read(Path(path), options)
+
+
+def _read(path: Path, options: ReadOptions) -> Clip:
     reader = _reader_of(path)
     try:
         return reader.read(path, options)
@@ -171,7 +177,10 @@ def read_clip(
 
 
 def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
-    """A clip that shows a skeleton and how it stands: that of a motion file, or the rest pose of an ASF.
+    """A clip that shows a skeleton and how it stands: that of a motion file, or its rest pose.
+
+    An ASF has a rest pose alone, and so have BVH, glTF, USD and FBX files without an animation: two
+    frames show it.
 
     Args:
         skeleton: the ASF file of an AMC, see `read_clip`.
@@ -181,7 +190,8 @@ def read_skeleton(path: str | Path, skeleton: str | Path | None = None) -> Clip:
     """
     path = Path(path)
     if path.suffix.lower() != ".asf" or path.is_dir():
-        return read_clip(path, skeleton=skeleton)
+        asf = None if skeleton is None else Path(skeleton)
+        return _read(path, ReadOptions(asf, rest=True))
     try:
         return read_asf(path)
     except PoiseError as error:

@@ -12,17 +12,16 @@ from poise.errors import PoiseError
 from poise.motion.info import body_height, sampled
 from poise.motion.io.guess import guess_unit
 from poise.motion.io.raw import ReadOptions, vectors_from_z_up
-from poise.motion.io.text import shown
+from poise.motion.io.text import REST_POSE, shown
+from poise.motion.io.travel import Carried, carried, size_of
 from poise.motion.io.vertical import guess_up
 from poise.motion.skeleton import Skeleton, posed
-from poise.spatial import forward_kinematics, matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
+from poise.spatial import matrix_to_quat, quat_mul, quat_rotate, quat_rotate_inv
 
-RIGID_SHARE = 6e-4
-"""A joint is rigid if its place stays within this share of the skeleton's size: about 1 mm on a person,
-whatever the unit."""
-_TRAVEL_SHARE = 20 * RIGID_SHARE
 _HUMAN_M = (0.3, 4.0)
 _SHEAR = 1e-3
+#: So many joints with a name that was taken are told one by one.
+_RENAMED = 5
 
 
 @dataclass(frozen=True)
@@ -48,16 +47,13 @@ class Base:
 class Bones:
     """Rigid bones in the file's units: offsets `(J, 3)`, root_pos `(T, 3)`, rot `(T, J, 4)` wxyz.
 
-    travel: the joint that carries the travel instead of the root, or with it. still: the root's place
-    where it stands still. strays: `(joint, largest distance)` of bones that did not stay rigid.
+    carried: which joint carries the body, and what did not stay rigid.
     """
 
     offsets: np.ndarray
     root_pos: np.ndarray
     rot: np.ndarray
-    travel: int | None
-    still: list[float] | None
-    strays: tuple[tuple[str, float], ...]
+    carried: Carried
 
 
 def even(scale: np.ndarray) -> float:
@@ -114,15 +110,15 @@ def rigid_bones(
     turn: Sequence[np.ndarray],
     scale: Sequence[np.ndarray],
     base: Base,
+    frames: int,
     notes: list[str],
 ) -> Bones:
     """Bones of constant length from joints' local transforms.
 
     Args:
         place, turn: per joint `(T, 3)` and `(T, 4)` wxyz, or one row where it is constant.
-        scale: `(3,)` per joint, constant. base: what lies above the root.
+        scale: `(3,)` per joint, constant. base: what lies above the root. frames: T.
     """
-    frames = max(len(x) for x in (*place, *turn))
     factor = [base.below()]
     offsets = np.zeros((len(parents), 3))
     paths: dict[int, np.ndarray] = {}
@@ -134,98 +130,35 @@ def rigid_bones(
     rot[:, 0] = quat_mul(torch.tensor(base.turn).expand(frames, 4), torch.tensor(rot[:, 0])).numpy()
     root_pos = base.place + _turned(base.turn, base.factor * base.scale * place[0])
     root_pos = np.array(np.broadcast_to(root_pos, (frames, 3)))
-    size = float(np.linalg.norm(offsets[1:], axis=-1).sum()) / 4 + 1e-12
-    travel = _travel_joint(parents, offsets, paths, root_pos, size)
-    still = None
-    if travel is not None:
-        moves = np.abs(root_pos - root_pos[0]).max() > RIGID_SHARE * size
-        still = None if moves else root_pos[0].tolist()
-        notes.append(travel_note(names[0], names[travel], bool(moves)))
-        offsets[travel] = 0.0
-        root_pos = lifted(parents, offsets, root_pos, rot, travel, paths.pop(travel))
-    strays = ((j, float(np.linalg.norm(p - offsets[j], axis=-1).max())) for j, p in paths.items())
-    loose = tuple((names[j], stray) for j, stray in strays if stray > RIGID_SHARE * size)
-    return Bones(offsets, root_pos, rot, travel, still, loose)
-
-
-def _travel_joint(
-    parents: Sequence[int],
-    offsets: np.ndarray,
-    paths: dict[int, np.ndarray],
-    root_pos: np.ndarray,
-    size: float,
-) -> int | None:
-    """The joint near the root that moves against its parent and carries more than half of all joints.
-
-    Below a root that moves itself, it is sought only as long as joints have a single child; further
-    bones stay rigid and what moves is told as a stray.
-    """
-    weight = [1] * len(parents)
-    for j in range(len(parents) - 1, 0, -1):
-        weight[parents[j]] += weight[j]
-    still = np.abs(root_pos - root_pos[0]).max() <= RIGID_SHARE * size
-    joint, only = 0, True
-    while True:
-        heavy = [j for j, p in enumerate(parents) if p == joint and 2 * weight[j] > weight[0]]
-        only = only and parents.count(joint) == 1
-        if not heavy or not (only or still):
-            return None
-        joint = heavy[0]
-        slack = (RIGID_SHARE if only else _TRAVEL_SHARE) * size
-        if np.linalg.norm(paths[joint] - offsets[joint], axis=-1).max() > slack:
-            return joint
-
-
-def travel_note(root: str, joint: str, both: bool) -> str:
-    """The sentence about the joint that carries the travel instead of the root, or together with it."""
-    if both:
-        return f"Both the root '{root}' and '{joint}' travel; the path of both became the root's"
-    return f"The root '{root}' stands still: the travel of '{joint}' became the root's path"
-
-
-def lifted(
-    parents: Sequence[int],
-    offsets: np.ndarray,
-    root_pos: np.ndarray,
-    rot: np.ndarray,
-    joint: int,
-    path: np.ndarray,
-) -> np.ndarray:
-    """The root's path with a joint's own travel added: p_root + R_parent p_joint(t)."""
-    above = torch.tensor(posed(parents, offsets, root_pos, rot)[1][:, parents[joint]])
-    moved = quat_rotate(above, torch.tensor(path).expand(len(rot), 3))
-    return root_pos + moved.numpy()
-
-
-def place_of_travel(
-    skeleton: Skeleton, offsets: np.ndarray, root_pos: np.ndarray, rot: torch.Tensor, still: np.ndarray
-) -> dict[int, np.ndarray]:
-    """Local paths on the way back: the root where it stood, and the joint that travels in its stead."""
-    travel = skeleton.names.index(str(skeleton.source.travel_joint))
-    stays = torch.tensor(still).expand(len(rot), 3)
-    bones = torch.tensor(offsets)
-    base, quat = forward_kinematics(skeleton.parents, bones, stays, rot)
-    pos, _ = forward_kinematics(skeleton.parents, bones, torch.tensor(root_pos), rot)
-    up = skeleton.parents[travel]
-    # p_travel = R_parent^-1 (x_travel - x_parent), with the parent where a still root puts it.
-    path = quat_rotate_inv(quat[:, up], pos[:, travel] - base[:, up])
-    return {0: stays.numpy().copy(), travel: path.numpy()}
+    moves = [x for x in (root_pos, *paths.values()) if np.ptp(x, axis=0).max() > 0]
+    if not moves and np.abs(rot - rot[:1]).max() < 1e-9 and REST_POSE not in notes:
+        notes.append(f"Nothing moves in it: its {frames} frames show one pose")
+    body = carried(names, parents, offsets, paths, root_pos, rot, size_of(offsets), notes)
+    return Bones(body.offsets, body.root_pos, rot, body)
 
 
 def unique_names(names: Sequence[str], notes: list[str]) -> tuple[str, ...]:
     """The names, with a number added to those that appear again."""
-    out: list[str] = []
-    seen: set[str] = set()
+    taken, seen, out = set(names), set[str](), list[str]()
+    nexts: dict[str, int] = {}
+    renamed: list[tuple[str, str]] = []
     for name in names:
-        made, k = name, 2
-        while made in seen or (made != name and made in names):
-            made, k = f"{name}_{k}", k + 1
-        if made != name:
-            notes.append(
-                f"The joint name {shown(name)} appears twice; the later one is called {shown(made)}"
-            )
+        made = name
+        if name in seen:
+            k = nexts.get(name, 2)
+            while (made := f"{name}_{k}") in taken:
+                k += 1
+            nexts[name] = k + 1
+            renamed.append((name, made))
         seen.add(made)
+        taken.add(made)
         out.append(made)
+    for name, made in renamed[:_RENAMED]:
+        notes.append(
+            f"The joint name {shown(name)} appears twice; the later one is called {shown(made)}"
+        )
+    if len(renamed) > _RENAMED:
+        notes.append(f"{len(renamed) - _RENAMED} more joints got another name, since theirs was taken")
     return tuple(out)
 
 

@@ -21,6 +21,7 @@ from poise.motion.io.guess import (
     teleports,
 )
 from poise.motion.io.text import MAX_JOINTS, shown
+from poise.motion.io.travel import beside_note
 from poise.motion.io.vertical import guess_up, later_frames
 from poise.motion.skeleton import Channel, Skeleton, Source, posed, rest_positions, triple
 from poise.spatial import normalize, unwrap_quats
@@ -28,7 +29,10 @@ from poise.spatial import normalize, unwrap_quats
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the caller states instead of leaving it to a guess; None where it is not stated."""
+    """What the caller states instead of leaving it to a guess; None where it is not stated.
+
+    rest: a file that holds a skeleton and no animation is read as it rests.
+    """
 
     skeleton: Path | None = None
     fps: float | None = None
@@ -37,6 +41,7 @@ class ReadOptions:
     allow_pickle: bool = False
     smooth_hz: float | None = None
     take: str | None = None
+    rest: bool = False
 
 
 UNSTATED = ReadOptions()
@@ -49,7 +54,8 @@ class RawMotion:
     offsets `(J, 3)`, ends, root_pos `(T, 3)`: file units. rot: `(T, J, 4)` wxyz, local.
     unit_m, up_axis: what the format itself states, None where it states nothing.
     unit_hint: a unit the file suggests, checked with the person's height.
-    strays: `(joint, largest distance)` of position channels that did not stay constant.
+    strays: `(joint, largest distance)` of position channels that did not stay constant; beside: the
+        same of joints that do not hang on `travel_joint`.
     whole: frame 0 belongs to the motion for certain, so no rest pose is sought there.
     mended, rates: as in `Source`.
     """
@@ -72,6 +78,7 @@ class RawMotion:
     cyclic: bool = False
     notes: tuple[str, ...] = ()
     strays: tuple[tuple[str, float], ...] = ()
+    beside: tuple[tuple[str, float], ...] = ()
     mended: tuple[tuple[str, str, int, int, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
     whole: bool = False
@@ -150,6 +157,8 @@ def assemble(raw: RawMotion, options: ReadOptions) -> Clip:
             "is kept rigid at the median"
         )
         mended.append(("bone drift", name, 0, -1, stray * scale))
+    if raw.beside:
+        notes.append(beside_note(str(raw.travel_joint), raw.beside, scale))
     fps = float(options.fps or raw.fps)
     root_pos = vectors_to_z_up(raw.root_pos, axis) * scale
     notes += teleports(root_pos, fps)

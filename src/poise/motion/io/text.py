@@ -6,7 +6,7 @@ import json
 import os
 import secrets
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,8 @@ MAX_LINE_BYTES = 4 << 20
 """Longer lines are refused while they are read."""
 MAX_HEADER_WORDS = 1_000_000
 """More words than this before the motion starts are refused."""
-MAX_JOINTS = 2000
-"""Skeletons with more joints are refused."""
+MAX_JOINTS = 1500
+"""Skeletons with more joints are refused: a person with a face of hundreds of bones has some 1200."""
 MAX_NAME = 200
 """Joints and keypoints with longer names are refused."""
 MAX_VALUE = 1e8
@@ -34,6 +34,10 @@ MAX_CONTAINERS = 2_000_000
 """JSON with more objects and lists is refused: a short one takes up to 250 bytes in memory."""
 MAX_ITEMS = 20_000_000
 """The same for items in them, at some 40 bytes each (44 numbers at 60 Hz: two hours)."""
+NO_ANIMATION = "Export it with its animation; as it rests it serves `poise retarget --onto` alone"
+"""The hint of errors about files with a skeleton that does not move."""
+REST_POSE = "The file holds no animation: it is read as it rests, in one pose"
+"""The note of such files where a rest pose is enough."""
 CUT_OFF = "The file seems cut off"
 """The hint of errors about files that end too early."""
 
@@ -200,6 +204,16 @@ def listed(items: Iterable[object], limit: int = 8) -> str:
     all_items = [str(i) for i in items]
     more = len(all_items) - limit
     return ", ".join(all_items[:limit]) + (f" and {more} more" if more > 0 else "")
+
+
+def others_note(name: str, joints: int, others: Sequence[tuple[str, int]]) -> str:
+    """The sentence about bodies of a file beside the one that is read: the root and joints of each."""
+    more = listed((f"{shown(n)} ({count} joints)" for n, count in others), 4)
+    left = "the other one was left out" if len(others) == 1 else "the others were left out"
+    return (
+        f"The file holds {len(others) + 1} bodies: {shown(name)} ({joints} joints) was read, and "
+        f"{left}: {more}; to read another, export it alone"
+    )
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,11 @@ from poise.motion.io.text import (
     MAX_JOINTS,
     MAX_NAME,
     MAX_VALUE,
+    NO_ANIMATION,
+    REST_POSE,
     at_line,
     decode,
+    others_note,
     read_bytes,
     shown,
 )
@@ -109,14 +113,36 @@ class _Tokens:
         return name
 
 
-def parse_bvh(path: Path) -> BvhFile:
-    """Reads a BVH file's hierarchy and motion; every refusal names the line."""
+def parse_bvh(path: Path, rest: bool = False) -> BvhFile:
+    """Reads a BVH file's hierarchy and motion; every refusal names the line.
+
+    rest: a file without a frame, or that ends before MOTION, is two frames of its rest pose.
+    """
     lines = read_bytes(path).splitlines()
     tokens = _Tokens(lines, path)
-    joints = _Hierarchy(tokens).read()
+    hierarchy = _Hierarchy(tokens)
+    joints = hierarchy.read()
+    if tokens.motion_line is None and rest:
+        return _one_body(_rested(joints, sum(len(j.channels or ()) for j in joints)), hierarchy.roots)
     if tokens.motion_line is None:
         raise PoiseError("the file ends before MOTION", path, CUT_OFF)
-    return _motion(lines, tokens.motion_line + 1, joints, path)
+    return _one_body(_motion(lines, tokens.motion_line + 1, joints, path, rest), hierarchy.roots)
+
+
+def _one_body(file: BvhFile, roots: list[int]) -> BvhFile:
+    """The body with most joints where the file has several ROOTs; the others are named."""
+    if len(roots) == 1:
+        return file
+    spans = list(pairwise((*roots, len(file.joints))))
+    best = max(spans, key=lambda span: span[1] - span[0])
+    widths = [len(j.channels or ()) for j in file.joints]
+    first, last = (sum(widths[:k]) for k in best)
+    joints = file.joints[best[0] : best[1]]
+    for joint in joints:
+        joint.parent = max(-1, joint.parent - best[0])
+    others = [(file.joints[a].name, b - a) for a, b in spans if (a, b) != best]
+    note = others_note(joints[0].name, len(joints), others)
+    return BvhFile(joints, file.values[:, first:last], file.frame_time, (*file.notes, note))
 
 
 class _Hierarchy:
@@ -126,6 +152,7 @@ class _Hierarchy:
         self.tokens, self.place = tokens, ""
         self.joints: list[BvhJoint] = []
         self.known: dict[str, int] = {}
+        self.roots = [0]
         self.stack: list[int] = []
 
     def read(self) -> list[BvhJoint]:
@@ -166,10 +193,14 @@ class _Hierarchy:
     def _open_joint(self, word: str) -> None:
         line = self.tokens.words[self.tokens.at - 1][1]
         name = self.tokens.name()
-        if word == "ROOT" and self.joints:
-            raise PoiseError(f"a second ROOT, '{name}'", self.place, "Give each body its own file")
         if word == "JOINT":
             self._need_joint(f"joint '{name}' stands outside any other joint")
+        if word == "ROOT" and self.stack:
+            raise PoiseError(f"ROOT '{name}' stands inside a joint", self.place)
+        if word == "ROOT" and self.joints:
+            # A second body may have the names of the first.
+            self.roots.append(len(self.joints))
+            self.known.clear()
         if name in self.known:
             raise PoiseError(
                 f"joint name '{name}' appears twice (first in line {self.known[name]})",
@@ -229,7 +260,7 @@ class _Hierarchy:
                     raise PoiseError(f"joint '{joint.name}' has no {what}", where)
 
 
-def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) -> BvhFile:
+def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path, rest: bool) -> BvhFile:
     """The frames: count, time, and the rows with exactly one number per channel."""
     width = sum(len(j.channels or ()) for j in joints)
     rows = ((i + 1, line.split()) for i, line in enumerate(lines[start:], start) if line.strip())
@@ -241,12 +272,16 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) 
         )
     # More digits than this cannot be met by any file within the size limit.
     stated = int(count_text[:12])
+    if not stated and rest:
+        return _rested(joints, width)
     time_line, time_text = _entry(rows, b"Frame Time:", path, len(lines))
     frame_time = number(time_text, at_line(path, time_line))
     if frame_time <= 0:
         raise PoiseError(
             f"the frame time is {frame_time:g} s, which must be above 0", at_line(path, time_line)
         )
+    if not stated:
+        raise PoiseError("the file has no frame of motion", at_line(path, count_line), NO_ANIMATION)
     if width == 0:
         raise PoiseError("no joint has any channel, so nothing moves", path)
     values: array[float] = array("d")
@@ -270,10 +305,25 @@ def _motion(lines: list[bytes], start: int, joints: list[BvhJoint], path: Path) 
             CUT_OFF,
         )
     table = np.frombuffer(values).reshape(-1, width)
+    if rest and stated == 1:
+        table = np.repeat(table, 2, axis=0)
+        numbers *= 2
     _check_values(table, joints, numbers, path)
     rows_more = f"{extra} row{'s' if extra > 1 else ''}"
     notes = (f"{rows_more} after the stated {stated} frames were left out",) if extra else ()
     return BvhFile(joints, table, frame_time, notes)
+
+
+def _rested(joints: list[BvhJoint], width: int) -> BvhFile:
+    """Two frames of the rest pose: position channels hold the OFFSETs."""
+    values = np.zeros((2, width))
+    column = 0
+    for joint in joints:
+        for channel in joint.channels or ():
+            if channel in POSITIONS:
+                values[:, column] = (joint.offset or (0.0, 0.0, 0.0))[POSITIONS.index(channel)]
+            column += 1
+    return BvhFile(joints, values, 1 / 30, (REST_POSE,))
 
 
 def _entry(rows, key: bytes, path: Path, end: int) -> tuple[int, bytes]:  # type: ignore[no-untyped-def]

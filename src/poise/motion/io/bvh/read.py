@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,9 @@ import torch
 from poise.motion.clip import Clip
 from poise.motion.io.angle_units import few_degrees_note
 from poise.motion.io.bvh.file import POSITIONS, BvhFile, parse_bvh
-from poise.motion.io.nodes import RIGID_SHARE, lifted, travel_note
 from poise.motion.io.raw import BLOCK, RawMotion, ReadOptions, assemble
 from poise.motion.io.text import listed
+from poise.motion.io.travel import RIGID_SHARE, Carried, carried, size_of, text_of
 from poise.motion.skeleton import Channel
 from poise.spatial import euler_to_quat, quat_mul, quat_rotate, quat_rotate_inv
 
@@ -23,18 +23,17 @@ def read_bvh(path: Path, options: ReadOptions) -> Clip:
     """A BVH clip.
 
     A joint's position channels replace its OFFSET, the root's too (LAFAN1 writes the first
-    position into both). Where the root stands still and a joint below it carries the travel
-    (Bandai: Hips), the travel becomes the clip's root path and that joint's offset zero, so that
-    every joint from there on moves as in the file.
+    position into both). Where a joint below the root carries the body (Bandai: Hips, Unreal: pelvis),
+    its travel becomes the clip's root path and its offset zero, so that every joint from there on moves
+    as in the file, see `travel.carried`.
     """
-    file = parse_bvh(path)
+    file = parse_bvh(path, options.rest)
     joints, rot = file.joints, _rotations(file)
     places = _resolve_places(file, rot)
+    body = places.body
     notes = [*file.notes, *places.notes, *few_degrees_note(_angles(file))]
     flat = [
-        joints[j].name
-        for j in range(1, len(joints))
-        if not places.offsets[j].any() and j != places.travel
+        joints[j].name for j in range(1, len(joints)) if not body.offsets[j].any() and j != body.joint
     ]
     if flat:
         notes.append(f"Bones of no length lead to {listed(flat)}")
@@ -43,16 +42,17 @@ def read_bvh(path: Path, options: ReadOptions) -> Clip:
         path=path,
         names=tuple(j.name for j in joints),
         parents=tuple(j.parent for j in joints),
-        offsets=places.offsets,
+        offsets=body.offsets,
         ends=tuple((i, tip) for i, j in enumerate(joints) for tip in j.tips),
-        root_pos=places.root_pos,
+        root_pos=body.root_pos,
         rot=rot,
         fps=1.0 / file.frame_time,
         channels=tuple(Channel(order=j.channels or ()) for j in joints),
         frame_time=file.frame_time,
-        travel_joint=None if places.travel is None else joints[places.travel].name,
+        travel_joint=None if body.joint is None else joints[body.joint].name,
         notes=tuple(notes),
-        strays=tuple(places.strays),
+        strays=body.strays,
+        beside=body.beside,
         extra=tuple(places.extra),
     )
     return assemble(raw, options)
@@ -91,21 +91,17 @@ def _rotations(file: BvhFile) -> np.ndarray:
     return out
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Places:
     """What the position channels amount to, in file units.
 
-    offsets `(J, 3)`: one rigid offset per joint. root_pos `(T, 3)`. travel: the joint with the
-    channels that carry the travel, or None. strays: `(joint, largest distance)` from the offset.
-    extra: what a writer must know to restore the channels.
+    body: rigid offsets, one root path, and what did not stay rigid. notes; extra: what a writer must
+    know to restore the channels.
     """
 
-    offsets: np.ndarray
-    root_pos: np.ndarray
-    travel: int | None = None
-    notes: list[str] = field(default_factory=list)
-    strays: list[tuple[str, float]] = field(default_factory=list)
-    extra: list[tuple[str, str]] = field(default_factory=list)
+    body: Carried
+    notes: list[str]
+    extra: list[tuple[str, str]]
 
 
 def _resolve_places(file: BvhFile, rot: np.ndarray) -> _Places:
@@ -120,32 +116,34 @@ def _resolve_places(file: BvhFile, rot: np.ndarray) -> _Places:
     parents = [j.parent for j in joints]
     offsets = np.array([j.offset for j in joints], dtype=float)
     moves = _moves(file)
-    size = float(np.linalg.norm(offsets[1:], axis=-1).sum()) / 4 + 1e-12
+    size = size_of(offsets)
     tolerance = RIGID_SHARE * size
-    out = _Places(offsets, moves.pop(0, np.tile(offsets[0], (len(rot), 1))))
-    out.extra.append(("offset:0", _text(offsets[0])))
+    root_pos = moves.pop(0, np.tile(offsets[0], (len(rot), 1)))
+    notes: list[str] = []
+    extra = [("offset:0", text_of(offsets[0]))]
     if offsets[0].any() and any(c in POSITIONS for c in joints[0].channels or ()):
-        out.notes.append("The root's OFFSET is not added to its position channels")
+        notes.append("The root's OFFSET is not added to its position channels")
     offsets[0] = 0.0
-    travel = out.travel = _travel_joint(parents, moves, tolerance)
-    path = np.zeros(0) if travel is None else moves.pop(travel)
-    if travel is not None:
-        both = not _still(out.root_pos, tolerance)
-        out.notes.append(travel_note(names[0], names[travel], both))
     loose = any(np.abs(m - np.median(m, axis=0)).max() > tolerance for m in moves.values())
-    world = _from_world(parents, offsets, out.root_pos, rot, moves, tolerance) if loose else []
+    world = _from_world(parents, offsets, root_pos, rot, moves, tolerance) if loose else []
     if world:
-        out.extra.append(("world_positions", " ".join(map(str, world))))
-        these = ", ".join(f"'{names[j]}'" for j in world)
-        out.notes.append(f"The position channels of {these} hold places in the world")
+        extra.append(("world_positions", " ".join(map(str, world))))
+        notes.append(
+            f"The position channels of {listed(repr(names[j]) for j in world)} hold places in the world"
+        )
+    own = offsets.copy()
     for j, places in moves.items():
-        _keep_rigid(out, j, names[j], places, tolerance)
-    if travel is not None:
-        out.extra.append((f"offset:{travel}", _text(offsets[travel])))
-        out.extra.append(("root_position", _text(out.root_pos[0])))
-        offsets[travel] = 0.0
-        out.root_pos = lifted(parents, offsets, out.root_pos, rot, travel, path)
-    return out
+        offsets[j] = np.median(places, axis=0)
+    body = carried(names, parents, offsets, moves, root_pos, rot, size, notes)
+    told = {name for name, _ in (*body.strays, *body.beside)}
+    for j in moves:
+        if np.array_equal(offsets[j], own[j]):
+            continue
+        extra.append((f"offset:{j}", text_of(own[j])))
+        far = np.linalg.norm(offsets[j] - own[j]) > tolerance
+        if far and names[j] not in told and j != body.joint:
+            notes.append(f"The position channels of joint '{names[j]}' replace its OFFSET")
+    return _Places(body, notes, [*extra, *body.extra])
 
 
 def _moves(file: BvhFile) -> dict[int, np.ndarray]:
@@ -162,29 +160,6 @@ def _moves(file: BvhFile) -> dict[int, np.ndarray]:
             out[j] = place
         column += len(channels)
     return out
-
-
-def _text(v: np.ndarray) -> str:
-    return " ".join(repr(float(x)) for x in v)
-
-
-def _still(path: np.ndarray, tolerance: float) -> bool:
-    return bool(np.abs(path - path[0]).max() <= tolerance)
-
-
-def _travel_joint(parents: Sequence[int], moves: dict[int, np.ndarray], tolerance: float) -> int | None:
-    """The joint that carries the travel instead of the root, or together with it.
-
-    It is sought down from the root as long as each joint is the only child of its parent.
-    """
-    joint = 0
-    while True:
-        children = [i for i, parent in enumerate(parents) if parent == joint]
-        if len(children) != 1:
-            return None
-        joint = children[0]
-        if joint in moves and not _still(moves[joint], tolerance):
-            return joint
 
 
 def _from_world(
@@ -215,16 +190,3 @@ def _from_world(
 
 def _stray(path: np.ndarray) -> float:
     return float(np.linalg.norm(path - np.median(path, axis=0), axis=-1).max())
-
-
-def _keep_rigid(out: _Places, j: int, name: str, path: np.ndarray, tolerance: float) -> None:
-    """Gives joint `j` the median of its position channels as its offset, and tells about it."""
-    middle = np.median(path, axis=0)
-    stray = _stray(path)
-    if stray > tolerance:
-        out.strays.append((name, stray))
-    elif np.linalg.norm(middle - out.offsets[j]) > tolerance:
-        out.notes.append(f"The position channels of joint '{name}' replace its OFFSET")
-    if not np.array_equal(middle, out.offsets[j]):
-        out.extra.append((f"offset:{j}", _text(out.offsets[j])))
-    out.offsets[j] = middle

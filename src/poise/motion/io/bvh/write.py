@@ -11,9 +11,9 @@ from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.bvh.file import POSITIONS
 from poise.motion.io.guess import UPS
-from poise.motion.io.nodes import place_of_travel
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
+from poise.motion.io.travel import Restored, restored
 from poise.motion.skeleton import Skeleton
 from poise.spatial import (
     euler_to_quat,
@@ -59,24 +59,24 @@ def write_bvh(
     if axis not in UPS:
         raise PoiseError(f"the up axis must be one of {', '.join(UPS)}, got '{axis}'")
     rot = quats_from_z_up(clip.rot, axis)
-    moving = bool(np.ptp(clip.root_pos, axis=0).max() > 0)
-    channels = _channels(clip.skeleton, rot, moving, own, order)
     offsets = vectors_from_z_up(clip.skeleton.offsets, axis) / unit
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
     kept = {k: np.array([float(x) for x in v.split()]) for k, v in source.extra} if own else {}
     if own and (unit != source.unit_m or axis != source.up_axis):
         # Remembered file values hold in the file's own unit and axes only.
         kept = {}
+    places, stand = _places(clip.skeleton, offsets, root_pos, rot, kept)
+    moving = bool(np.ptp(places[0], axis=0).max() > 0)
+    channels = _channels(clip.skeleton, rot, moving, own, order)
     if not any(c in POSITIONS for c in channels[0]):
         # Without position channels the root stands at its OFFSET.
-        kept["offset:0"] = root_pos[0]
-    places = _places(clip.skeleton, offsets, root_pos, rot, kept)
-    lines, written = _hierarchy(clip.skeleton, offsets, channels, kept, axis, unit, own)
+        kept["offset:0"] = places[0][0]
+    lines, written = _hierarchy(clip.skeleton, stand, channels, kept, axis, unit, own)
     step = 1.0 / clip.fps
     if own and source.frame_time and abs(source.frame_time * clip.fps - 1.0) < 1e-9:
         step = source.frame_time
     lines += ["MOTION", f"Frames: {clip.frames}", f"Frame Time: {step!r}"]
-    lines += _rows(rot, channels, places, offsets, written)
+    lines += _rows(rot, channels, places, stand, written)
     write_whole(path, "\n".join(lines) + "\n")
 
 
@@ -116,18 +116,14 @@ def _places(
     root_pos: np.ndarray,
     rot: np.ndarray,
     kept: dict[str, np.ndarray],
-) -> dict[int, np.ndarray]:
+) -> tuple[dict[int, np.ndarray], np.ndarray]:
     """`(T, 3)` position channels of the root, of the joint that carries the travel, and of joints
-    with channels that hold world positions."""
+    with channels that hold world positions; and `(J, 3)` offsets of the others."""
     parents, turns, bones = skeleton.parents, torch.tensor(rot), torch.tensor(offsets)
-    out = {0: root_pos}
+    back = restored(skeleton, offsets, root_pos, rot) if kept else Restored({0: root_pos}, offsets)
+    world = kept.get("world_positions", np.zeros(0)).astype(int)
     pos, _ = forward_kinematics(parents, bones, torch.tensor(root_pos), turns)
-    for j in kept.get("world_positions", np.zeros(0)).astype(int):
-        out[int(j)] = pos[:, int(j)].numpy()
-    name = skeleton.source.travel_joint
-    if name is None or name not in skeleton.names or "root_position" not in kept:
-        return out
-    return out | place_of_travel(skeleton, offsets, root_pos, turns, kept["root_position"])
+    return {int(j): pos[:, int(j)].numpy() for j in world} | back.paths, back.offsets
 
 
 def _hierarchy(

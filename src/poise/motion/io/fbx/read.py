@@ -33,5 +33,6 @@ def read_fbx(path: Path, options: ReadOptions) -> Clip:
         raise PoiseError("FBX files need the package ufbx", path, _MISSING)
     size = check_file(path)
     limits = {"joints": MAX_JOINTS, "poses": MAX_POSES, "value": MAX_VALUE}
-    held = read_limited(_SCRIPT, path, size, "FBX file", **limits, fps=options.fps, take=options.take)
+    stated = {"fps": options.fps, "take": options.take, "rest": options.rest}
+    held = read_limited(_SCRIPT, path, size, "FBX file", **limits, **stated)
     return assemble(raw_of_matrices(held, "FBX", path, options), options)

@@ -10,9 +10,10 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip, check_poses
+from poise.motion.io.gltf.bodies import choose_joints
 from poise.motion.io.gltf.file import GltfFile, load_gltf
 from poise.motion.io.gltf.tracks import Take, Track, choose_take
-from poise.motion.io.gltf.tree import Tree, choose_joints, read_tree
+from poise.motion.io.gltf.tree import Tree, read_tree
 from poise.motion.io.gltf.vrm import humanoid_of
 from poise.motion.io.nodes import base_of, checked_unit, even, rigid_bones, unique_names
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
@@ -41,7 +42,7 @@ def read_gltf(path: Path, options: ReadOptions) -> Clip:
     file = load_gltf(path)
     tree = read_tree(file)
     notes: list[str] = []
-    take = choose_take(file, tree, options.take, notes)
+    take = choose_take(file, tree, options.take, options.rest, notes)
     targeted = take.nodes("translation", "rotation")
     moving = take.nodes("translation", "rotation", varying=True)
     joints = choose_joints(tree, file, targeted, moving, notes)
@@ -86,6 +87,7 @@ def _raw_motion(
         [turn[n] for n in joints],
         [scale[n] for n in joints],
         base,
+        len(when),
         notes,
     )
     own = take.extras
@@ -98,7 +100,6 @@ def _raw_motion(
         "scale": [even(scale[n]) for n in joints],
         "rest": tree.turn[joints].tolist(),
         "root": tree.place[joints[0]].tolist(),
-        "still": bones.still,
         "take": take.name,
     }
     unit_m = checked_unit("glTF", 1.0, "Y", names, parents, bones, options, file.path, notes)
@@ -116,11 +117,12 @@ def _raw_motion(
         frame_time=_number_of(own.get("frame_time")),
         unit_m=unit_m,
         up_axis="Y",
-        travel_joint=None if bones.travel is None else names[bones.travel],
+        travel_joint=None if bones.carried.joint is None else names[bones.carried.joint],
         cyclic=own.get("cyclic") is True,
         notes=tuple(notes),
-        strays=bones.strays,
-        extra=(("gltf", json.dumps(kept)), *extra),
+        strays=bones.carried.strays,
+        beside=bones.carried.beside,
+        extra=(("gltf", json.dumps(kept)), *extra, *bones.carried.extra),
         whole="fps" in own,
     )
 
@@ -171,12 +173,15 @@ def _clock(
     The rate is the stated one, that which Poise wrote beside the keys, or the most common spacing
     of the keys. Times that are a key up to float32 noise become that key exactly.
     """
-    if not tracks:
+    if not tracks and take.tracks:
         raise PoiseError("the animation moves no joint of the figure", file.path)
+    if not tracks:
+        return np.zeros(2), fps or _USUAL_HZ
     inputs = {id(t.times): t.times for t in tracks}.values()
     start, end = min(t[0] for t in inputs), max(t[-1] for t in inputs)
     if end <= start:
-        raise PoiseError("the animation has a single key, which is no motion", file.path)
+        # One pose, which stands for two frames.
+        return np.full(2, start), fps or _USUAL_HZ
     own = _number_of(take.extras.get("fps"))
     if fps is not None:
         rate = fps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -13,11 +14,15 @@ from poise.errors import PoiseError
 from poise.motion.io.gltf.accessor import index_of, read_accessor
 from poise.motion.io.gltf.file import GltfFile
 from poise.motion.io.gltf.tree import Tree
-from poise.motion.io.text import MAX_VALUE, listed, shown
+from poise.motion.io.text import MAX_VALUE, NO_ANIMATION, REST_POSE, listed, shown
 from poise.spatial import normalize, slerp
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 _MODES = ("LINEAR", "STEP", "CUBICSPLINE")
+#: Ends of one span differ by less than this share of it.
+_ONE_SPAN = 0.02
+#: Words for a kind of channel in the names of animations.
+_KIND = re.compile(r"(?i)(rotation|translation|location|position|scale|quaternion|rot|loc|pos)")
 
 
 @dataclass(frozen=True)
@@ -87,36 +92,102 @@ class Take:
         }
 
 
-def choose_take(file: GltfFile, tree: Tree, wanted: str | None, notes: list[str]) -> Take:
-    """The animation of that name or number (from 0), or else the longest that moves nodes."""
+def choose_take(file: GltfFile, tree: Tree, wanted: str | None, rest: bool, notes: list[str]) -> Take:
+    """The animation of that name or number (from 0), or else the longest that moves nodes.
+
+    Animations that move different nodes over one span are one, see `_parts_of_one`.
+
+    Args:
+        rest: a file without animation is taken as it rests, without a track.
+    """
     animations = file.doc["animations"]
     names = [str(a.get("name") or f"animation {i}") for i, a in enumerate(animations)]
     numbered = [f"{i} {shown(name)}" for i, name in enumerate(names)]
-    if not animations:
-        raise PoiseError("the file holds no animation", file.path, "Export it with its animation")
+    if not animations and not (rest and wanted is None):
+        raise PoiseError("the file holds no animation", file.path, NO_ANIMATION)
+    if wanted is not None and not (wanted in names or wanted in map(str, range(len(names)))):
+        raise PoiseError(
+            f"it has no animation {shown(wanted)}",
+            file.path,
+            f"Known, by number or name: {listed(numbered, 20)}",
+        )
+    groups = _parts_of_one(file, tree, names)
     if wanted is not None:
-        picked = [i for i, n in enumerate(names) if n == wanted] or [
-            i for i in range(len(names)) if str(i) == wanted
-        ]
-        if not picked:
-            raise PoiseError(
-                f"it has no animation {shown(wanted)}",
-                file.path,
-                f"Known, by number or name: {listed(numbered, 20)}",
-            )
-        return _take(file, tree, picked[0], names[picked[0]])
-    times: dict[int, np.ndarray] = {}
-    spans = [_span(file, tree, i, times) for i in range(len(names))]
-    best = int(np.argmax(spans))
-    if spans[best] < 0:
-        raise PoiseError("no animation of the file moves or turns a node", file.path)
-    if len(names) > 1:
-        others = listed((n for i, n in enumerate(numbered) if i != best), 6)
+        at = names.index(wanted) if wanted in names else int(wanted)
+        best = next(g for g in groups if at in g.members)
+    else:
+        best = max(groups, key=lambda g: g.seconds, default=_Group([], set(), 0.0, -1.0, "", False))
+        if best.seconds < 0 and rest:
+            notes.append(REST_POSE)
+            return Take("", {}, {})
+        if best.seconds < 0:
+            raise PoiseError("no animation of the file moves or turns a node", file.path)
+    first = best.members[0]
+    if len(best.members) > 1:
         notes.append(
-            f"Of {len(names)} animations the longest, {numbered[best]} ({spans[best]:.2f} s), was "
+            f"{len(best.members)} animations, from {numbered[first]} on, move different nodes over one "
+            "span; they were read as one"
+        )
+    if wanted is None and len(groups) > 1:
+        others = listed((numbered[g.members[0]] for g in groups if g is not best), 6)
+        notes.append(
+            f"Of {len(groups)} animations the longest, {numbered[first]} ({best.seconds:.2f} s), was "
             f"taken; the others are {others}"
         )
-    return _take(file, tree, best, names[best])
+    return _take(file, tree, best.members, names[first])
+
+
+@dataclass
+class _Group:
+    """Animations that are one: their numbers, what they move, their span in s, a name they share, and
+    whether each moves a single node."""
+
+    members: list[int]
+    moved: set[tuple[int, str]]
+    start: float
+    end: float
+    tag: str
+    alone: bool
+
+    @property
+    def seconds(self) -> float:
+        """From the first key to the last, negative where nothing moves or turns."""
+        return self.end - self.start
+
+
+def _parts_of_one(file: GltfFile, tree: Tree, names: list[str]) -> list[_Group]:
+    """The animations, put together where exporters wrote one for each bone or each kind of channel.
+
+    Those are one that move or turn different nodes over one span: both have the same, or one of them
+    moves a single node within that of the other. Where their names hold the names of nodes, what is
+    left must be the same.
+    """
+    times: dict[int, np.ndarray] = {}
+    groups: list[_Group] = []
+    for i, name in enumerate(names):
+        moved, start, end = _span(file, tree, i, times)
+        nodes = {n for n, _ in moved}
+        node = tree.names[next(iter(nodes))] if len(nodes) == 1 else ""
+        tag = _KIND.sub("", name.replace(node, "")).strip(" _.|:-") if node and node in name else ""
+        alone = len(nodes) == 1
+        found = None
+        for group in groups if moved else ():
+            slack = _ONE_SPAN * max(group.seconds, end - start)
+            same = abs(group.start - start) <= slack and abs(group.end - end) <= slack
+            inside = alone and group.start - slack <= start and end <= group.end + slack
+            around = group.alone and start - slack <= group.start and group.end <= end + slack
+            fits = same or inside or around
+            if fits and group.tag == tag and group.moved and not group.moved & moved:
+                found = group
+                break
+        if found is None:
+            groups.append(_Group([i], moved, start, end, tag, alone))
+        else:
+            found.members.append(i)
+            found.moved |= moved
+            found.start, found.end = min(found.start, start), max(found.end, end)
+            found.alone &= alone
+    return groups
 
 
 def _channels(file: GltfFile, tree: Tree, index: int) -> Iterator[tuple[str, int, str, Any]]:
@@ -134,20 +205,25 @@ def _channels(file: GltfFile, tree: Tree, index: int) -> Iterator[tuple[str, int
         yield what, node, path, samplers[index_of(channel.get("sampler"), samplers, what, file)]
 
 
-def _span(file: GltfFile, tree: Tree, index: int, known: dict[int, np.ndarray]) -> float:
-    """Seconds from the first to the last key, -1 where the animation moves and turns nothing."""
-    first, last = np.inf, -1.0
-    for what, _, path, sampler in _channels(file, tree, index):
+def _span(
+    file: GltfFile, tree: Tree, index: int, known: dict[int, np.ndarray]
+) -> tuple[set[tuple[int, str]], float, float]:
+    """What the animation moves and turns, and its first and last key in s; 0 and -1 without one."""
+    moved: set[tuple[int, str]] = set()
+    first, last = np.inf, -np.inf
+    for what, node, path, sampler in _channels(file, tree, index):
         if path != "scale":
             times = _key_times(file, sampler.get("input"), what, known)
-            first, last = min(first, times[0]), max(last, times[-1])
-    return float(last - first) if last >= first else -1.0
+            first, last = min(first, float(times[0])), max(last, float(times[-1]))
+            moved.add((node, path))
+    return moved, *((first, last) if moved else (0.0, -1.0))
 
 
-def _take(file: GltfFile, tree: Tree, index: int, name: str) -> Take:
+def _take(file: GltfFile, tree: Tree, members: list[int], name: str) -> Take:
     tracks: dict[tuple[int, str], Track] = {}
     known: dict[int, np.ndarray] = {}
-    for what, node, path, sampler in _channels(file, tree, index):
+    channels = (c for index in members for c in _channels(file, tree, index))
+    for what, node, path, sampler in channels:
         mode = sampler.get("interpolation") or "LINEAR"
         if mode not in _MODES:
             raise PoiseError(f"{what} has the unknown interpolation {shown(mode)}", file.path)
@@ -159,7 +235,7 @@ def _take(file: GltfFile, tree: Tree, index: int, name: str) -> Take:
         if (node, path) in tracks:
             raise PoiseError(f"{what} moves the {path} of node '{tree.names[node]}' again", file.path)
         tracks[node, path] = Track(times, values, mode)
-    extras = file.doc["animations"][index].get("extras")
+    extras = file.doc["animations"][members[0]].get("extras")
     own = extras.get("poise") if isinstance(extras, dict) else None
     return Take(name, tracks, own if isinstance(own, dict) else {})
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from poise.motion.io.gltf.file import GltfFile
 from poise.motion.io.nodes import turn_and_scale
 from poise.motion.io.text import MAX_JOINTS, MAX_NAME, MAX_VALUE, shown
 
-MAX_DEPTH = 1000
+MAX_DEPTH = 2 * MAX_JOINTS
 """Deeper node trees are refused."""
 
 
@@ -136,106 +135,3 @@ def _decomposed(m: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, np.n
     matrix = m.reshape(4, 4).T
     turn, scale = turn_and_scale(matrix[:3, :3], "matrix", where, "Apply the transform before exporting")
     return matrix[:3, 3], turn, scale
-
-
-def choose_joints(
-    tree: Tree, file: GltfFile, targeted: set[int], moving: set[int], notes: list[str]
-) -> list[int]:
-    """The nodes that become joints, parents first.
-
-    The joints of the skin that the animation moves (and of the skins that share joints with it);
-    without a skin, the animated nodes and what hangs on them. Nodes between joints and moving
-    nodes above them belong to the joints.
-
-    Args:
-        targeted: nodes with translation or rotation channels.
-        moving: those with channels that vary.
-    """
-    skin = _skin_joints(tree, file, targeted)
-    wanted = set(skin) if skin else _biggest_tree(tree, targeted)
-    if not skin and wanted != targeted:
-        others = sorted(tree.names[n] for n in targeted - wanted)
-        notes.append(
-            f"{len(others)} animated nodes outside the figure were left out, such as '{others[0]}'"
-        )
-    _check_count(len(wanted), file)
-    for node in list(wanted):
-        above = tree.line(node)[:-1]
-        first = next((a for a in above if a in moving), None)
-        if first is not None:
-            wanted.add(first)
-    best = _biggest_tree(tree, wanted)
-    if best != wanted:
-        notes.append(f"{len(wanted - best)} joints that hang on no common node were left out")
-    lines = [tree.line(node) for node in best]
-    depth = _shared_depth(lines)
-    joints = {node for line in lines for node in line[depth - 1 :]}
-    root = lines[0][depth - 1]
-    if not skin:
-        joints |= _hanging_on(tree, joints)
-    _check_count(len(joints), file)
-    order = [j for j in skin if j in joints]
-    if len(order) == len(joints) and _parents_first(tree, order, root):
-        return order
-    return [node for node in tree.below(root) if node in joints]
-
-
-def _check_count(count: int, file: GltfFile) -> None:
-    if count > MAX_JOINTS:
-        raise PoiseError(f"it has {count} joints, more than the {MAX_JOINTS} allowed", file.path)
-
-
-def _skin_joints(tree: Tree, file: GltfFile, targeted: set[int]) -> list[int]:
-    """The joints of the most animated skin, then those of the skins that share joints with it."""
-    skins: list[list[int]] = []
-    for i, skin in enumerate(file.doc["skins"]):
-        joints = skin.get("joints", [])
-        if not isinstance(joints, list):
-            raise PoiseError(f"the joints of skin {i} are no list", file.path)
-        skins.append([index_of(j, tree.names, f"a joint of skin {i}", file) for j in joints])
-    if not skins:
-        return []
-    out = max(skins, key=lambda joints: (len(targeted & set(joints)), len(joints)))
-    if not targeted & set(out):
-        return []
-    out, known = list(dict.fromkeys(out)), set(out)
-    for joints in skins:
-        if known & set(joints):
-            out += [j for j in dict.fromkeys(joints) if j not in known]
-            known |= set(joints)
-    return out
-
-
-def _biggest_tree(tree: Tree, nodes: set[int]) -> set[int]:
-    """Those of the nodes under the scene root that has most of them (cameras have their own)."""
-    groups: dict[int, set[int]] = {}
-    for node in nodes:
-        groups.setdefault(tree.tops[node], set()).add(node)
-    return max(groups.values(), key=len)
-
-
-def _shared_depth(lines: Sequence[list[int]]) -> int:
-    """How many nodes, from the scene's root down, all lines share."""
-    depth = 0
-    for level in zip(*lines, strict=False):
-        if len(set(level)) > 1:
-            break
-        depth += 1
-    return depth
-
-
-def _hanging_on(tree: Tree, joints: Iterable[int]) -> set[int]:
-    """What hangs on the joints, down to nodes that carry a mesh or a camera."""
-    out: set[int] = set()
-    stack = [child for joint in joints for child in tree.children[joint]]
-    while stack:
-        node = stack.pop()
-        if node not in out and not tree.solid[node]:
-            out.add(node)
-            stack += tree.children[node]
-    return out
-
-
-def _parents_first(tree: Tree, order: Sequence[int], root: int) -> bool:
-    place = {node: i for i, node in enumerate(order)}
-    return all(n == root or place.get(tree.parents[n], len(order)) < i for i, n in enumerate(order))

@@ -17,9 +17,10 @@ from poise.motion.clip import Clip
 from poise.motion.io.figure import bone_figure
 from poise.motion.io.gltf.boxes import SceneBox, box_mesh
 from poise.motion.io.gltf.file import BIN_CHUNK, JSON_CHUNK, MAGIC
-from poise.motion.io.nodes import base_of, place_of_travel, tips_from_z_up
+from poise.motion.io.nodes import base_of, tips_from_z_up
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
+from poise.motion.io.travel import Restored, restored
 from poise.spatial import (
     normalize,
     quat_conj,
@@ -95,9 +96,9 @@ def _plan(clip: Clip) -> _Plan:
     above = [(n, np.array(p), np.array(q), np.array(s)) for n, p, q, s in kept.get("above", [])]
     scale = np.array(kept.get("scale", np.ones(count)))
     base = base_of([(p, q, s) for _, p, q, s in above])
-    paths = {0: root_pos}
-    if kept.get("still") is not None and source.travel_joint in skeleton.names:
-        paths = place_of_travel(skeleton, offsets, root_pos, rot, np.array(kept["still"]))
+    own = Restored({0: root_pos}, offsets)
+    back = restored(skeleton, offsets, root_pos, rot.numpy()) if kept else own
+    paths, offsets = back.paths, back.offsets
     paths[0] = base.down(paths[0])
     rot[:, 0] = quat_mul(quat_conj(torch.tensor(base.turn)).expand(len(rot), 4), rot[:, 0])
     factor = np.full(count, base.below())

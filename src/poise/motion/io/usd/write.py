@@ -13,9 +13,10 @@ import torch
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.figure import bone_figure
-from poise.motion.io.nodes import tips_from_z_up
+from poise.motion.io.nodes import tips_from_z_up, unique_names
 from poise.motion.io.raw import quats_from_z_up, vectors_from_z_up
 from poise.motion.io.text import write_whole
+from poise.motion.io.travel import Restored, restored
 from poise.motion.io.usd.read import pxr_package
 from poise.spatial import normalize, unwrap_quats
 
@@ -59,6 +60,7 @@ def _fill(pxr: Any, stage: Any, clip: Clip) -> None:
     offsets = vectors_from_z_up(skeleton.offsets, axis) / unit
     root_pos = vectors_from_z_up(clip.root_pos, axis) / unit
     rot = unwrap_quats(normalize(torch.tensor(quats_from_z_up(clip.rot, axis)))).numpy()
+    back = restored(skeleton, offsets, root_pos, rot) if own else Restored({0: root_pos}, offsets)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y if axis == "Y" else UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, unit)
     stage.SetTimeCodesPerSecond(clip.fps)
@@ -70,8 +72,9 @@ def _fill(pxr: Any, stage: Any, clip: Clip) -> None:
     rig = UsdSkel.Skeleton.Define(stage, "/Figure/Skeleton")
     motion = UsdSkel.Animation.Define(stage, "/Figure/Skeleton/Motion")
     joints = Vt.TokenArray(_joint_paths(pxr, skeleton.names, skeleton.parents))
-    rest = offsets.copy()
-    rest[0] = root_pos[0]
+    rest = back.offsets.copy()
+    for j, moves in back.paths.items():
+        rest[j] = moves[0]
     world = rest.copy()
     for j, parent in enumerate(skeleton.parents):
         world[j] += world[parent] if parent >= 0 else 0.0
@@ -92,7 +95,8 @@ def _fill(pxr: Any, stage: Any, clip: Clip) -> None:
     motion.CreateScalesAttr(Vt.Vec3hArray(len(skeleton), Gf.Vec3h(1, 1, 1)))
     place, turn = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
     for t in range(clip.frames):
-        rest[0] = root_pos[t]
+        for j, moves in back.paths.items():
+            rest[j] = moves[t]
         place.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rest, dtype=np.float32)), t)
         # Arrays of quaternions are given to USD as xyzw.
         xyzw = np.ascontiguousarray(rot[t][:, [1, 2, 3, 0]], dtype=np.float32)
@@ -104,13 +108,7 @@ def _fill(pxr: Any, stage: Any, clip: Clip) -> None:
 
 def _joint_paths(pxr: Any, names: tuple[str, ...], parents: tuple[int, ...]) -> list[str]:
     """Paths such as "Hips/Spine/Head" of letters, digits and underscores."""
-    safe: list[str] = []
-    for name in names:
-        made = base = pxr.Tf.MakeValidIdentifier(name)
-        k = 2
-        while made in safe:
-            made, k = f"{base}_{k}", k + 1
-        safe.append(made)
+    safe = unique_names([pxr.Tf.MakeValidIdentifier(name) for name in names], [])
     out: list[str] = []
     for j, parent in enumerate(parents):
         out.append(safe[j] if parent < 0 else f"{out[parent]}/{safe[j]}")
