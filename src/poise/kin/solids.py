@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
+from poise.kin.fk import carried
 from poise.metrics import KINDS, Shapes, geom_heights
 from poise.metrics import centre_of_mass as geoms_centre
 from poise.motion import Clip
@@ -47,3 +51,24 @@ def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
 def centre_of_mass(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
     """`(..., 3)` m from world body poses; a body's mass sits in the middle of its shapes."""
     return geoms_centre(pos, quat, shapes_of(table))
+
+
+def extreme_points(
+    table: BodyTable, pos: Tensor, quat: Tensor, rows: Sequence[int] | None = None
+) -> Tensor:
+    """`(T, P, 3)` m, the ends and corners of all shapes, lowered by their radius; or of those of `rows`."""
+    out = []
+    for i in range(len(table.rows)) if rows is None else rows:
+        row = table.rows[i]
+        for geom in row.geoms:
+            size, turn = geom.size, torch.tensor(geom.quat, dtype=pos.dtype)
+            ends, radius = [(0.0, 0.0, 0.0)], size[0]
+            if geom.kind == "capsule":
+                ends = [(0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]
+            elif geom.kind == "box":
+                ends, radius = list(itertools.product(*((-x, x) for x in size))), 0.0
+            down = torch.tensor([0.0, 0.0, radius], dtype=pos.dtype)
+            for end in ends:
+                local = carried(torch.tensor(geom.pos, dtype=pos.dtype), turn, end)
+                out.append(carried(pos[:, i], quat[:, i], local) - down)
+    return torch.stack(out, 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +12,10 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.fk import carried
 from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
 from poise.kin.series import find_runs, gaussian
-from poise.kin.solids import centre_of_mass, poses_of
+from poise.kin.solids import centre_of_mass, extreme_points, poses_of
 from poise.metrics.shapes import PIECE
 from poise.motion import Clip
 from poise.spatial import GRAVITY
@@ -133,24 +131,6 @@ def longest_alone(clip: Clip, found: Sequence[NotAlone]) -> tuple[int, int]:
         bad[max(f.start - f.lead - edge, 0) : f.stop + f.trail + 1 + edge] = True
     free = [(a, b + 1) for a, b in find_runs(~bad, 0)]
     return max(free, key=lambda s: s[1] - s[0], default=(0, 0))
-
-
-def extreme_points(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
-    """`(T, P, 3)` m, the ends and corners of all shapes, lowered by their radius."""
-    out = []
-    for i, row in enumerate(table.rows):
-        for geom in row.geoms:
-            size, turn = geom.size, torch.tensor(geom.quat, dtype=pos.dtype)
-            ends, radius = [(0.0, 0.0, 0.0)], size[0]
-            if geom.kind == "capsule":
-                ends = [(0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]
-            elif geom.kind == "box":
-                ends, radius = list(itertools.product(*((-x, x) for x in size))), 0.0
-            down = torch.tensor([0.0, 0.0, radius], dtype=pos.dtype)
-            for end in ends:
-                local = carried(torch.tensor(geom.pos, dtype=pos.dtype), turn, end)
-                out.append(carried(pos[:, i], quat[:, i], local) - down)
-    return torch.stack(out, 1)
 
 
 def balance_point(com: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
