@@ -30,6 +30,8 @@ BEARS = ("foot", "hand", "shin")
 #: A point bears up to this height (m) over the lowest of its frame, and leaves or lands where it rises or
 #: falls faster than the first (m/s) and this share of its own speed.
 WITH_M, RISE_SPEED, RISE_SHARE = 0.03, 0.2, 0.25
+#: Soles that come to rest this much (m) higher than others have a floor of their own.
+OWN_FLOOR_M = 0.015
 #: Slowest travel (m/s, at the limbs that bear) and turn (rad/s) that are told from slides.
 SLOWEST, SLOWEST_TURN = 0.2, 0.3
 #: Slowest rise (m/s) and least slope of stairs; share of the time in which limbs sink or rise with it.
@@ -38,16 +40,17 @@ SLOWEST_RISE, SLOPE, RISING = 0.1, 0.15, 0.8
 #: share of the time is.
 STEADY, STEADY_SHARE, STEADY_TIME = 0.12, 0.25, 0.8
 #: Share of their way that limbs go along the travel: all of them, and each.
-ALONG, ALONG_EACH = 0.8, 0.7
+ALONG, ALONG_EACH = 0.8, 0.6
 #: Share of the bearing time in which a limb may stand still, slower than this share of the travel.
 STANDS, STILL = 0.3, 0.3
 #: The limb that bears second most does so for this share of the other's time, and goes as fast within
 #: this ratio.
-BOTH, ALIKE = 0.4, 2.0
+BOTH, ALIKE = 0.35, 2.0
 #: A turn must leave less than this share of the velocities that a travel without it leaves.
 TURN_GAIN = 0.6
-#: What the root may do: stray (m), and end elsewhere or turned by this share of the travel.
-STRAYS_M, STAYS = 0.6, 0.15
+#: What the root may do: stray (m); end elsewhere, or turned, by this share of the travel; and turn (rad)
+#: between two steps.
+STRAYS_M, STAYS, TURNED = 0.6, 0.15, math.radians(45.0)
 #: Rounds in which limbs that skim the floor in their swing are told from those that bear.
 ROUNDS = 8
 #: Deviation (s) of the Gaussian over which an unsteady travel is smoothed.
@@ -162,16 +165,22 @@ class Fit(NamedTuple):
 
 def _bearing(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float) -> Bearing:
     """A point bears the more surely the lower it is: in its frame, and over the floor of the clip."""
-    weights, velocities, places, lows = [], [], [], []
+    weights, velocities, places = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     rows = [i for i, r in enumerate(table.rows) if r.kind in BEARS]
     limbs = [extreme_points(table, pos, quat, [i]).numpy() for i in rows]
     middles = [0.5 * (p[1:] + p[:-1]) for p in limbs]
-    lows = np.min([m[..., 2].min(-1) for m in middles], axis=0)
-    floor = float(np.quantile(lows, 0.05))
-    for points, middle in zip(limbs, middles, strict=True):
-        u, z = np.diff(points, axis=0) * fps, middle[..., 2]
+    floors = [float(np.quantile(m[..., 2].min(-1), 0.05)) for m in middles]
+    floor = min(floors, default=0.0)
+    # Soles of a measured body differ by a centimetre or two; a limb that comes as low has its own.
+    heights = [
+        m[..., 2] - (own if own - floor < OWN_FLOOR_M else floor)
+        for m, own in zip(middles, floors, strict=True)
+    ]
+    lows = np.min([h.min(-1) for h in heights], axis=0)
+    for points, middle, z in zip(limbs, middles, heights, strict=True):
+        u = np.diff(points, axis=0) * fps
         leaves = np.abs(u[..., 2]) > RISE_SPEED + RISE_SHARE * np.linalg.norm(u[..., :2], axis=-1)
-        sure = np.clip(1 - (z - floor) / NEAR_M, 0, 1) * np.clip(1 - (z - lows[:, None]) / WITH_M, 0, 1)
+        sure = np.clip(1 - z / NEAR_M, 0, 1) * np.clip(1 - (z - lows[:, None]) / WITH_M, 0, 1)
         sure[leaves] = 0.0
         share = (sure / np.maximum(sure.sum(-1, keepdims=True), 1e-9))[..., None]
         weights.append(sure.max(-1))
@@ -260,7 +269,7 @@ def _stays(fit: Fit, root: np.ndarray, quat: torch.Tensor, seconds: float) -> bo
     heading = np.unwrap(2 * np.arctan2(turned[:, 3].numpy(), turned[:, 0].numpy()))
     turns = abs(fit.twist[2]) * seconds
     # A heading that turns alone means a path that bends, of which the speed alone was taken out.
-    return abs(float(heading[-1] - heading[0])) <= max(STAYS * turns, math.radians(20.0))
+    return abs(float(heading[-1] - heading[0])) <= max(STAYS * turns, TURNED)
 
 
 def _described(fit: Fit, bearing: Bearing, centre: np.ndarray, fps: float) -> Travel:
@@ -305,7 +314,7 @@ def _unsteady(weight: np.ndarray, u: np.ndarray, fps: float) -> np.ndarray:
 
 def travelled(clip: Clip, travel: Travel) -> Clip:
     """The clip with the travel that was taken out of it; of a repeated clip of as many as it fits."""
-    return _moved(clip, *_path(travel, clip.frames, clip.fps))
+    return moved_by(clip, *_path(travel, clip.frames, clip.fps))
 
 
 def in_place(clip: Clip, travel: Travel) -> Clip:
@@ -313,7 +322,7 @@ def in_place(clip: Clip, travel: Travel) -> Clip:
     place, angle = _path(travel, clip.frames, clip.fps)
     turn = np.stack((np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)), -1)
     back = -np.einsum("tij,ti->tj", turn.reshape(-1, 2, 2), place[:, :2])
-    return _moved(clip, np.concatenate((back, -place[:, 2:]), -1), -angle)
+    return moved_by(clip, np.concatenate((back, -place[:, 2:]), -1), -angle)
 
 
 def _path(travel: Travel, frames: int, fps: float) -> tuple[np.ndarray, np.ndarray]:
@@ -335,7 +344,7 @@ def _path(travel: Travel, frames: int, fps: float) -> tuple[np.ndarray, np.ndarr
     return np.concatenate((np.zeros((1, 3)), np.cumsum(step, axis=0))), angle
 
 
-def _moved(clip: Clip, place: np.ndarray, angle: np.ndarray) -> Clip:
+def moved_by(clip: Clip, place: np.ndarray, angle: np.ndarray) -> Clip:
     """Every frame turned by `angle (T)` about the world's vertical, then moved by `place (T, 3)`."""
     c, s = np.cos(angle), np.sin(angle)
     x, y, z = clip.root_pos.T
