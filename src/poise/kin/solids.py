@@ -56,7 +56,7 @@ def centre_of_mass(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
 def extreme_points(
     table: BodyTable, pos: Tensor, quat: Tensor, rows: Sequence[int] | None = None
 ) -> Tensor:
-    """`(T, P, 3)` m, the ends and corners of all shapes, lowered by their radius; or of those of `rows`."""
+    """`(T, P, 3)` m, the ends and corners of all shapes, or those of `rows`, lowered by their radius."""
     out = []
     for i in range(len(table.rows)) if rows is None else rows:
         row = table.rows[i]

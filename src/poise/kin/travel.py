@@ -11,7 +11,7 @@ so that the twist xi = (v, w) is fitted to the velocities p' of points that bear
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +27,8 @@ from poise.spatial import axis_angle_to_quat, heading_quat, quat_conj, quat_mul
 
 #: Limbs that may bear: a crawl's hands and knees count as feet do.
 BEARS = ("foot", "hand", "shin")
-#: A point bears up to this height (m) over the lowest of its frame, and leaves or lands where it rises or
-#: falls faster than the first (m/s) and this share of its own speed.
+#: A point bears up to this height (m) over the lowest of its frame, and leaves or lands where it rises
+#: or falls faster than the first (m/s) and this share of its own speed.
 WITH_M, RISE_SPEED, RISE_SHARE = 0.03, 0.2, 0.25
 #: Soles that come to rest this much (m) higher than others have a floor of their own.
 OWN_FLOOR_M = 0.015
@@ -79,6 +79,14 @@ class Travel:
     def speed(self) -> float:
         """Horizontal speed, m/s."""
         return math.hypot(*self.velocity[:2])
+
+    def scaled(self, scale: float, about: np.ndarray) -> Travel:
+        """The travel of a body that is `scale` times as large, about the place `about (2,)` m."""
+        if scale == 1.0:
+            return self
+        x, y = (float(a + scale * (c - a)) for a, c in zip(about, self.centre, strict=True))
+        fast = tuple(scale * v for v in self.velocity)
+        return replace(self, velocity=fast, centre=(x, y), steps=scale * self.steps)
 
     def words(self) -> str:
         """What the clip does, without a subject: "walks in place at 1.1 m/s"."""
@@ -307,25 +315,27 @@ def _unsteady(weight: np.ndarray, u: np.ndarray, fps: float) -> np.ndarray:
     out = np.zeros((len(u), 3))
     for k in range(2):
         path = np.interp(frames, at, mean[:, k], period=len(u))
-        padded = np.pad(path, reach, mode="wrap") if reach <= len(u) else np.pad(path, reach, mode="edge")
+        padded = (
+            np.pad(path, reach, mode="wrap") if reach <= len(u) else np.pad(path, reach, mode="edge")
+        )
         out[:, k] = np.convolve(padded, kernel, "valid")
     return out
 
 
 def travelled(clip: Clip, travel: Travel) -> Clip:
     """The clip with the travel that was taken out of it; of a repeated clip of as many as it fits."""
-    return moved_by(clip, *_path(travel, clip.frames, clip.fps))
+    return moved_by(clip, *path_of(travel, clip.frames, clip.fps))
 
 
 def in_place(clip: Clip, travel: Travel) -> Clip:
     """A clip with the travel, or what a body made of it, without it again: the inverse of `travelled`."""
-    place, angle = _path(travel, clip.frames, clip.fps)
+    place, angle = path_of(travel, clip.frames, clip.fps)
     turn = np.stack((np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)), -1)
     back = -np.einsum("tij,ti->tj", turn.reshape(-1, 2, 2), place[:, :2])
     return moved_by(clip, np.concatenate((back, -place[:, 2:]), -1), -angle)
 
 
-def _path(travel: Travel, frames: int, fps: float) -> tuple[np.ndarray, np.ndarray]:
+def path_of(travel: Travel, frames: int, fps: float) -> tuple[np.ndarray, np.ndarray]:
     """G(t) of every frame: a place `(T, 3)` m and an angle `(T)` rad about the vertical.
 
     Of clips of several periods the steps are repeated.
