@@ -88,6 +88,12 @@ class Travel:
         fast = tuple(scale * v for v in self.velocity)
         return replace(self, velocity=fast, centre=(x, y), steps=scale * self.steps)
 
+    @property
+    def level(self) -> Travel:
+        """The travel without its rise: what is judged on the floor of the clip."""
+        steps = self.steps * np.array([1.0, 1.0, 0.0])
+        return replace(self, velocity=(*self.velocity[:2], 0.0), steps=steps)
+
     def words(self) -> str:
         """What the clip does, without a subject: "walks in place at 1.1 m/s"."""
         turns = f"turns in place at {math.degrees(abs(self.turning)):.0f} degrees/s"
@@ -328,7 +334,7 @@ def travelled(clip: Clip, travel: Travel) -> Clip:
 
 
 def in_place(clip: Clip, travel: Travel) -> Clip:
-    """A clip with the travel, or what a body made of it, without it again: the inverse of `travelled`."""
+    """What a body made of a clip with the travel, without it again: the inverse of `travelled`."""
     place, angle = path_of(travel, clip.frames, clip.fps)
     turn = np.stack((np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)), -1)
     back = -np.einsum("tij,ti->tj", turn.reshape(-1, 2, 2), place[:, :2])

@@ -12,6 +12,7 @@ from poise.kin.doctor.flips import Flip, out_of_reach, unflip
 from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds, without_rougher
 from poise.kin.flight import likely_rate, rate_sentence
 from poise.kin.ground import clip_flights
+from poise.kin.travel import Travel, find_travel
 from poise.motion import Clip
 
 
@@ -94,19 +95,22 @@ def clean_clip(
 @dataclass(frozen=True)
 class Faults:
     """What a clip's fit will repair or doubt: in words, and as numbers (`CleanReport.to_dict` and
-    `likely_fps`, the frame rate that gravity vouches for where it is far from the file's)."""
+    `likely_fps`, the frame rate that gravity vouches for where it is far from the file's); and what was
+    taken out of a clip in place."""
 
     sentences: tuple[str, ...]
     numbers: dict[str, Any]
+    travel: Travel | None = None
 
 
 def find_faults(clip: Clip) -> Faults | None:
     """The faults of a clip, before a body is fitted; None where its joints are no human's."""
     try:
         cleaned, report = clean_clip(clip)
-        flights = clip_flights(cleaned, generate_table(cleaned.skeleton, None, [cleaned]))
+        table = generate_table(cleaned.skeleton, None, [cleaned])
+        flights = clip_flights(cleaned, table)
     except PoiseError:
         return None
     doubt = rate_sentence(flights, clip.fps)
     numbers = {**report.to_dict(), "likely_fps": likely_rate(flights, clip.fps)}
-    return Faults((*([doubt] if doubt else []), *report.sentences()), numbers)
+    return Faults((*([doubt] if doubt else []), *report.sentences()), numbers, find_travel(clip, table))
