@@ -70,8 +70,8 @@ def loops_of(data: Path) -> list[tuple[Path, str, bool]]:
 
 
 def true_speed(clip: Clip) -> float:
-    """m/s at which the lowest end of a sole goes over the floor, by plain differences: the mean of a
-    walk, which always stands on a foot; of a run the median, since in flight a foot is the lowest, too."""
+    """m/s at which the lowest end of a sole goes over the floor, by plain differences: of a walk, which
+    always stands on a foot, the mean; of a run the median, since in flight a foot is the lowest, too."""
     table = generate_table(clip.skeleton, None, [clip])
     pos, quat = (torch.tensor(x[:, [r.joint for r in table.rows]]) for x in clip.world())
     soles = torch.cat([s.ends for s in soles_of(table, pos, quat).values()], 1).numpy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,7 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
     from poise.jobs.open import open_run
     from poise.jobs.run_file import RUN_FILE, learning_curve
     from poise.jobs.track import write
+    from poise.jobs.track.in_place import with_travel
     from poise.jobs.track.learning import from_every_start, learn
     from poise.jobs.track.placement import place
     from poise.learn import Until
@@ -55,7 +57,11 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
         return None
     with claimed(job.out):
         first = None if held else first_result(job, tracker, clip, motion, hold)
-        placed = first.placed if first else place(clip, tracker)
+        travel = first.travel if first else with_travel(clip, job.in_place)
+        source = clip if travel is None else travel.clip
+        if travel is not None and first is None:
+            tell(travel.sentence(), "yellow")
+        placed = first.placed if first else place(source, tracker)
         with showing("training") as bar:
 
             def show(p: Progress) -> None:
@@ -75,7 +81,7 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
         if result.interrupted:
             return stopped(job.run, job.again)
         with working("simulating every start frame"):
-            tracked = from_every_start(learned, clip, t.device)
+            tracked = replace(from_every_start(learned, source, t.device), travel=travel)
         if first is not None and tracked.failures and not first.failures:
             say("The policy still loses the motion from its first frame: what was found first stays.")
             say(again(job))
@@ -92,7 +98,7 @@ def first_result(job: Job, tracker: Tracker, clip: Clip, motion: Path | None, ho
     """The motion by lookahead, or as it is searched, written before anything is learned."""
     from poise.jobs.track import TrackConfig, write
 
-    config = TrackConfig(seed=job.config.seed, threads=job.training.threads)
+    config = TrackConfig(seed=job.config.seed, threads=job.training.threads, in_place=job.in_place)
     first = follow(tracker, [clip], config, [])
     paths = write(first, job.out, motion, hold).paths
     tell(f"First result: {outcome(first, False)} See {paths['report']}")

@@ -11,7 +11,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
 from poise.jobs.track import Tracked, write
+from poise.jobs.track.in_place import InPlace, Mode, with_travel
 from poise.jobs.track.learning import from_every_start, learn
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
@@ -88,10 +89,13 @@ class Imitated(Result):
         own = [n for clip in self.task.library for n in clip.skeleton.source.notes]
         if self.tracked is not None:
             own += self.tracked.notes
+            own += [] if self.tracked.travel is None else [self.tracked.travel.sentence()]
         return (*own, *self.task.report.sentences(), *self._finished.notes)
 
     def _shown(self) -> Shown:
         source = self.tracked.placed.source if self.tracked else self.task.library.clips[0]
+        if self.tracked is not None and self.tracked.travel is not None:
+            source = self.tracked.travel.beside
         return Shown(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
@@ -118,6 +122,7 @@ def imitate(
     device: str = "cpu",
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     callbacks: TrainingCallbacks | None = None,
+    in_place: Mode = "auto",
     **settings: Any,
 ) -> Imitated:
     """Trains a policy on a motion, simulates it from every start frame, and scores it.
@@ -139,6 +144,8 @@ def imitate(
         device: "cpu" or "cuda".
         on_iteration: is called after each iteration; returning False ends the training.
         callbacks: are told what happens before PPO begins, where nothing is there to begin with.
+        in_place: what becomes of a clip whose travel was taken out, see `track.in_place`; what is
+            learned from nothing keeps its travel.
 
     Raises:
         PoiseError: a motion that cannot be read or has no human body, an unknown setting, a folder that
@@ -156,9 +163,12 @@ def imitate(
     try:
         tracker = None if stated or len(several) > 1 else _tracker(policy, library.clips[0])
         if tracker is not None:
-            how = (run, until, config.seed, threads, device, on_iteration)
+            travel = with_travel(library.clips[0], in_place)
+            how = (run, until, config.seed, threads, device, on_iteration, travel)
             return _kept(_practised(library.clips[0], tracker, *how), folder)
-        task = begin(run, library, config, device)
+        travels = [with_travel(c, in_place, repeats=False, returns=False) for c in library]
+        moving = [c if t is None else t.clip for c, t in zip(library, travels, strict=True)]
+        task = begin(run, ClipLibrary.of(moving), config, device)
         done = train(task, run, until, on_iteration, threads, False, beginning=callbacks, device=device)
         learned, meta = trained_policy(run, task)
         scored = evaluate(task, learned, meta, device=device)
@@ -199,15 +209,17 @@ def _practised(
     threads: int,
     device: str,
     on_iteration: Callable[[IterationStats], bool | None] | None,
+    travel: InPlace | None,
 ) -> Imitated:
     """What came of a policy that learned a motion on its own joints with the bones of the clip."""
 
     def tell(p: Progress) -> bool | None:
         return None if on_iteration is None else on_iteration(p.stats)
 
-    placed = place(clip, tracker)
+    source = clip if travel is None else travel.clip
+    placed = place(source, tracker)
     learned, result = learn(tracker, placed, run, until, tell, threads, seed, STARTS, device)
-    done = from_every_start(learned, clip, device)
+    done = replace(from_every_start(learned, source, device), travel=travel)
     task, evaluation = done.imitation, done.evaluation
     return Imitated(task, learned.policy, evaluation, run, result.interrupted, done)
 

@@ -12,49 +12,44 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
 from poise.body import BodyTable, generate_table
 from poise.errors import PoiseError
-from poise.kin.feet.contact import NEAR_M
+from poise.kin.bearing import (
+    SLOWEST,
+    Bearing,
+    Fit,
+    along_of,
+    bearing_of,
+    fit_of,
+    flat_speed,
+    is_clear,
+    solved,
+    weighted_median,
+)
 from poise.kin.series import gaussian
-from poise.kin.solids import extreme_points
 from poise.motion import Clip
 from poise.spatial import axis_angle_to_quat, heading_quat, quat_conj, quat_mul
 
-#: Limbs that may bear: a crawl's hands and knees count as feet do.
-BEARS = ("foot", "hand", "shin")
-#: A point bears up to this height (m) over the lowest of its frame, and leaves or lands where it rises
-#: or falls faster than the first (m/s) and this share of its own speed.
-WITH_M, RISE_SPEED, RISE_SHARE = 0.03, 0.2, 0.25
-#: Soles that come to rest this much (m) higher than others have a floor of their own.
-OWN_FLOOR_M = 0.015
-#: Slowest travel (m/s, at the limbs that bear) and turn (rad/s) that are told from slides.
-SLOWEST, SLOWEST_TURN = 0.2, 0.3
+#: Slowest turn (rad/s) that is told.
+SLOWEST_TURN = 0.4
 #: Slowest rise (m/s) and least slope of stairs; share of the time in which limbs sink or rise with it.
 SLOWEST_RISE, SLOPE, RISING = 0.1, 0.15, 0.8
-#: Velocities this near to the travel's (m/s, and share of its speed) are steady; it is steady where this
-#: share of the time is.
-STEADY, STEADY_SHARE, STEADY_TIME = 0.12, 0.25, 0.8
-#: Share of their way that limbs go along the travel: all of them, and each.
-ALONG, ALONG_EACH = 0.8, 0.6
-#: Share of the bearing time in which a limb may stand still, slower than this share of the travel.
-STANDS, STILL = 0.3, 0.3
-#: The limb that bears second most does so for this share of the other's time, and goes as fast within
-#: this ratio.
-BOTH, ALIKE = 0.35, 2.0
+#: A travel is steady where what bears is for this share of the time.
+STEADY_TIME = 0.8
 #: A turn must leave less than this share of the velocities that a travel without it leaves.
 TURN_GAIN = 0.6
 #: What the root may do: stray (m); end elsewhere, or turned, by this share of the travel; and turn (rad)
 #: between two steps.
 STRAYS_M, STAYS, TURNED = 0.6, 0.15, math.radians(45.0)
-#: Rounds in which limbs that skim the floor in their swing are told from those that bear.
-ROUNDS = 8
 #: Deviation (s) of the Gaussian over which an unsteady travel is smoothed.
 SMOOTH_S = 0.08
+#: Speed (m/s) beyond which it is said to run.
+RUNS = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +91,14 @@ class Travel:
 
     def words(self) -> str:
         """What the clip does, without a subject: "walks in place at 1.1 m/s"."""
-        turns = f"turns in place at {math.degrees(abs(self.turning)):.0f} degrees/s"
+        turns = f"at {math.degrees(abs(self.turning)):.0f} degrees/s"
         if self.speed < SLOWEST:
-            return turns
-        told = f"{'runs' if self.speed > 2.5 else 'walks'} in place at {self.speed:.2g} m/s"
+            return f"turns in place {turns}"
+        told = f"{'runs' if self.speed > RUNS else 'walks'} in place at {_figure(self.speed)} m/s"
         if self.velocity[2]:
             way = "up" if self.velocity[2] > 0 else "down"
-            told += f" and {abs(self.velocity[2]):.2g} m/s {way}"
-        return f"{told}, and {turns}" if self.turning else told
+            told += f" and {_figure(abs(self.velocity[2]))} m/s {way}"
+        return f"{told}, turning {turns}" if self.turning else told
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -111,6 +106,10 @@ class Travel:
             "velocity_m_per_s": list(self.velocity), "speed_m_per_s": self.speed,
             "turning_rad_per_s": self.turning, "share": self.share, "said": self.words(),
         }  # fmt: skip
+
+
+def _figure(speed: float) -> str:
+    return f"{speed:.1f}" if speed >= 1.0 else f"{speed:.2f}"
 
 
 def find_travel(clip: Clip, table: BodyTable | None = None) -> Travel | None:
@@ -137,141 +136,17 @@ def told_by(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float)
     root = pos[:, 0, :2].numpy()
     if len(root) < 4 or np.ptp(root, axis=0).max() > STRAYS_M:
         return None
-    bearing = _bearing(table, pos, quat, fps)
+    bearing = bearing_of(table, pos, quat, fps)
     centre = root.mean(0)
     if bearing.weight.sum() < 1e-6:
         return None
-    straight, turned = (_fit(bearing, centre, turn) for turn in (False, True))
+    straight, turned = (fit_of(bearing, centre, turn) for turn in (False, True))
     turns = abs(turned.twist[2]) >= SLOWEST_TURN and turned.left < TURN_GAIN * straight.left
-    best = turned if turns and _clear(turned, bearing) else straight
+    best = turned if turns and is_clear(turned, bearing) else straight
     seconds = (len(root) - 1) / fps
-    if not _clear(best, bearing) or not _stays(best, root, quat[:, 0], seconds):
+    if not is_clear(best, bearing) or not _stays(best, root, quat[:, 0], seconds):
         return None
     return _described(best, bearing, centre, fps)
-
-
-class Bearing(NamedTuple):
-    """What limbs do from frame to frame while they bear.
-
-    weight: `(T - 1, L)`, how surely each bears, 0 to 1. velocity, place: `(T - 1, L, 3)` m/s and m, of
-    its points that bear.
-    """
-
-    weight: np.ndarray
-    velocity: np.ndarray
-    place: np.ndarray
-
-
-class Fit(NamedTuple):
-    """A travel fitted to what limbs do.
-
-    twist: v_x, v_y m/s of a body at the centre, and w rad/s. going: `(T - 1, L, 2)` m/s, how it lets
-    limbs go that bear. weight: `(T - 1, L)`, those that bear, at most 1 a frame. off: `(T - 1, L)`, how
-    far each is from `going`, 1 where it is no longer steady. left: m/s, rms of what is not explained.
-    """
-
-    twist: np.ndarray
-    going: np.ndarray
-    weight: np.ndarray
-    off: np.ndarray
-    left: float
-
-
-def _bearing(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float) -> Bearing:
-    """A point bears the more surely the lower it is: in its frame, and over the floor of the clip."""
-    weights, velocities, places = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    rows = [i for i, r in enumerate(table.rows) if r.kind in BEARS]
-    limbs = [extreme_points(table, pos, quat, [i]).numpy() for i in rows]
-    middles = [0.5 * (p[1:] + p[:-1]) for p in limbs]
-    floors = [float(np.quantile(m[..., 2].min(-1), 0.05)) for m in middles]
-    floor = min(floors, default=0.0)
-    # Soles of a measured body differ by a centimetre or two; a limb that comes as low has its own.
-    heights = [
-        m[..., 2] - (own if own - floor < OWN_FLOOR_M else floor)
-        for m, own in zip(middles, floors, strict=True)
-    ]
-    lows = np.min([h.min(-1) for h in heights], axis=0)
-    for points, middle, z in zip(limbs, middles, heights, strict=True):
-        u = np.diff(points, axis=0) * fps
-        leaves = np.abs(u[..., 2]) > RISE_SPEED + RISE_SHARE * np.linalg.norm(u[..., :2], axis=-1)
-        sure = np.clip(1 - z / NEAR_M, 0, 1) * np.clip(1 - (z - lows[:, None]) / WITH_M, 0, 1)
-        sure[leaves] = 0.0
-        share = (sure / np.maximum(sure.sum(-1, keepdims=True), 1e-9))[..., None]
-        weights.append(sure.max(-1))
-        velocities.append((share * u).sum(1))
-        places.append((share * middle).sum(1))
-    return Bearing(*(np.stack(x, 1) for x in (weights, velocities, places)))
-
-
-def _fit(bearing: Bearing, centre: np.ndarray, turn: bool) -> Fit:
-    """Robust least squares. In every frame the limb that agrees best bears, another where it agrees as
-    well: feet that are led low over the floor in their swing look like feet that bear."""
-    u, arm = bearing.velocity[..., :2], bearing.place[..., :2] - centre
-    weight = _shared(bearing.weight)
-    twist = np.array([-_median(u[..., k], weight) for k in range(2)] + [0.0])
-    if turn:
-        twist = _solved(weight, u, arm, turn)
-    for _ in range(ROUNDS):
-        going, off = _off(twist, u, arm)
-        off = np.where(bearing.weight > 0, off, np.inf)
-        bears = off <= np.maximum(off.min(1, keepdims=True), 1.0)
-        weight = _shared(np.where(bears, bearing.weight, 0.0))
-        twist = _solved(weight / np.maximum(off, 1.0), u, arm, turn)
-    going, off = _off(twist, u, arm)
-    wide = np.linalg.norm(going, axis=-1) * STEADY_SHARE + STEADY
-    left = math.sqrt(float((weight * (np.minimum(off, 2.0) * wide) ** 2).sum() / weight.sum()))
-    return Fit(twist, going, weight, off, left)
-
-
-def _off(twist: np.ndarray, u: np.ndarray, arm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    going = -np.stack((twist[0] - twist[2] * arm[..., 1], twist[1] + twist[2] * arm[..., 0]), -1)
-    wide = STEADY + STEADY_SHARE * np.linalg.norm(going, axis=-1)
-    return going, np.linalg.norm(u - going, axis=-1) / wide
-
-
-def _shared(weight: np.ndarray) -> np.ndarray:
-    """Weights that sum to at most 1 in every frame."""
-    return weight / np.maximum(weight.sum(1, keepdims=True), 1.0)
-
-
-def _median(values: np.ndarray, weight: np.ndarray) -> float:
-    order = np.argsort(values, axis=None)
-    total = np.cumsum(weight.ravel()[order])
-    return float(values.ravel()[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def _solved(weight: np.ndarray, u: np.ndarray, arm: np.ndarray, turn: bool) -> np.ndarray:
-    """v_x, v_y, w that minimise sum weight |v + w z x arm + u|^2; w = 0 without a turn."""
-    total = max(float(weight.sum()), 1e-9)
-    w = (weight / total)[..., None]
-    mean_u, mean_arm, spin = (w * u).sum((0, 1)), (w * arm).sum((0, 1)), 0.0
-    if turn:
-        du, da = u - mean_u, arm - mean_arm
-        inertia = float((w * da**2).sum())
-        spin = -float((w[..., 0] * (da[..., 0] * du[..., 1] - da[..., 1] * du[..., 0])).sum())
-        spin /= max(inertia, 1e-9)
-    return np.array([spin * mean_arm[1] - mean_u[0], -spin * mean_arm[0] - mean_u[1], spin])
-
-
-def _clear(fit: Fit, bearing: Bearing) -> bool:
-    """Whether what bears goes along the travel, at least two limbs do, and none stands still."""
-    u = bearing.velocity[..., :2]
-    size, speed = np.linalg.norm(fit.going, axis=-1), np.linalg.norm(u, axis=-1)
-    along = fit.weight * (u * fit.going).sum(-1) / np.maximum(size, 1e-9)
-    total = float(fit.weight.sum())
-    if float((fit.weight * size).sum()) < SLOWEST * total:
-        return False
-    way = fit.weight * speed
-    stands = float(bearing.weight[speed < STILL * size].sum() / bearing.weight.sum())
-    if along.sum() < ALONG * way.sum() or stands > STANDS:
-        return False
-    bears = fit.weight.sum(0)
-    most = np.argsort(-bears)[:2]
-    if len(most) < 2 or bears[most[1]] < BOTH * bears[most[0]]:
-        return False
-    each = [along[:, k].sum() / max((fit.weight * size)[:, k].sum(), 1e-9) for k in most]
-    steady = all(along[:, k].sum() >= ALONG_EACH * way[:, k].sum() for k in most)
-    return bool(steady and min(each) > 0 and max(each) <= ALIKE * min(each))
 
 
 def _stays(fit: Fit, root: np.ndarray, quat: torch.Tensor, seconds: float) -> bool:
@@ -289,20 +164,18 @@ def _stays(fit: Fit, root: np.ndarray, quat: torch.Tensor, seconds: float) -> bo
 def _described(fit: Fit, bearing: Bearing, centre: np.ndarray, fps: float) -> Travel:
     u, steady = bearing.velocity, np.where(fit.off <= 1.0, fit.weight, 0.0)
     even = float(steady.sum()) >= STEADY_TIME * float(fit.weight.sum())
-    size = np.linalg.norm(fit.going, axis=-1)
-    along = float((fit.weight * (u[..., :2] * fit.going).sum(-1) / np.maximum(size, 1e-9)).sum())
-    share = along / float((fit.weight * np.linalg.norm(u[..., :2], axis=-1)).sum())
     turning = float(fit.twist[2])
+    speed = bearing.speed if turning else flat_speed(bearing)
+    share = float(along_of(fit, bearing).sum() / (fit.weight * speed).sum())
     frames = len(u)
     if even or turning:
-        arm = bearing.place[..., :2] - centre
-        v = _solved(steady if even else fit.weight, u[..., :2], arm, bool(turning))
+        v = solved(steady if even else fit.weight, bearing, centre, bool(turning))
         steps = np.tile((v[0], v[1], 0.0), (frames, 1))
         turning = float(v[2])
     else:
         steps = _unsteady(fit.weight, u, fps)
     speed = math.hypot(*steps[:, :2].mean(0))
-    rise = -_median(u[..., 2], fit.weight)
+    rise = -weighted_median(u[..., 2], fit.weight)
     same = float(fit.weight[np.sign(u[..., 2]) == -math.copysign(1, rise)].sum() / fit.weight.sum())
     if same >= RISING and abs(rise) >= max(SLOWEST_RISE, SLOPE * speed):
         steps[:, 2] = rise

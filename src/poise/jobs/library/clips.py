@@ -18,6 +18,7 @@ from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
 from poise.kin.doctor.clean import clean_clip
 from poise.kin.flight import rate_sentence
 from poise.kin.place import OnBody
+from poise.kin.travel import find_travel, travelled
 from poise.motion import Clip, Skeleton, read_clip, resample, shifted, trim
 from poise.motion.io import read_skeleton
 
@@ -147,6 +148,8 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
         note = replace(note, seconds=clip.seconds, notes=clip.skeleton.source.notes)
         rule = "not human"
         cleaned, report = clean_clip(clip)
+        travel = find_travel(cleaned)
+        cleaned = cleaned if travel is None else travelled(cleaned, travel)
         rule = "short"
         resampled = resample(cleaned, fps).replaced(name=file.name)
     except PoiseError as problem:
@@ -159,7 +162,8 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
     word = _telling_word(file.name, config.words)
     if word and not matches(config.keep, file.name, file.subject):
         return replace(note, rule="word", reason=f"its name says '{word}'")
-    return Taken(file, resampled, clip.fps, tuple(report.sentences()))
+    said = [] if travel is None else [f"It {travel.words()}, and was given that travel."]
+    return Taken(file, resampled, clip.fps, (*said, *report.sentences()))
 
 
 def _stated(pairs: Sequence[tuple[str, _T]], name: str) -> _T | None:
