@@ -109,7 +109,7 @@ class Travel:
 
 
 def _figure(speed: float) -> str:
-    return f"{speed:.1f}" if speed >= 1.0 else f"{speed:.2f}"
+    return f"{speed:.1f}" if speed >= 0.95 else f"{speed:.2f}"
 
 
 def find_travel(clip: Clip, table: BodyTable | None = None) -> Travel | None:
