@@ -192,7 +192,7 @@ def track_rows(data: Path, names: tuple[str, ...], keep: Path | None) -> list[tu
 
 def main() -> None:
     """Measures the parts that were asked for and adds their rows to the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument(
         "--parts", nargs="+", choices=("told", "real", "track"), default=("told", "real")
@@ -217,15 +217,11 @@ def write(path: Path, rows: list[tuple[str, str, float]], parts: list[str]) -> N
     new = {(s, m) for s, m, _ in rows}
     kept = [r for r in old if (r["subject"], r["metric"]) not in new]
     command = f"python benchmarks/in_place.py --data FOLDER --parts {' '.join(parts)} -o {path}"
-    made = [
-        dict(zip(COLUMNS, (s, m, f"{v:.4g}", "", 1, 0, "", commit, command), strict=True))
-        for s, m, v in rows
-    ]
+    made = [(s, m, f"{v:.4g}", "", "1", "0", "", commit, command) for s, m, v in rows]
     path.parent.mkdir(exist_ok=True)
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([*kept, *made])
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([COLUMNS, *([r[c] for c in COLUMNS] for r in kept), *made])
     Path(file.name).replace(path)
 
 

@@ -75,3 +75,13 @@ def test_even_drift_is_taken_off_evenly() -> None:
     made = best_period(long.replaced(root_pos=long.root_pos + way), 60, 1)
     moved = made.root_pos - one.root_pos
     np.testing.assert_allclose(moved, np.broadcast_to(moved[:1], moved.shape), atol=1e-9)
+
+
+def test_no_period_is_taken_from_where_the_motion_is_lost() -> None:
+    one = walker(1.0, fps=60.0)
+    long = repeated(one, 1, 5)
+    root = np.array(long.root_pos)
+    # It sinks from 3.2 s on.
+    root[192:, 2] -= 0.5
+    made = best_period(long.replaced(root_pos=root), 60, 1, stop=192)
+    np.testing.assert_allclose(made.root_pos, one.root_pos, atol=1e-9)

@@ -41,7 +41,7 @@ def repeated(clip: Clip, overlap: int, periods: int) -> Clip:
     return clip.replaced(root_pos=clip.root_pos[at], rot=clip.rot[at], cyclic=False)
 
 
-def best_period(clip: Clip, period: int, overlap: int, first: int = 2) -> Clip:
+def best_period(clip: Clip, period: int, overlap: int, first: int = 2, stop: int | None = None) -> Clip:
     """The period that closes best of a motion of several, its ends made to meet.
 
     Frame i of period k is x_k(i). What is given is (1 - s) x_k(i) + s x_{k-1}(i), with s from 0 to 1 as
@@ -51,15 +51,16 @@ def best_period(clip: Clip, period: int, overlap: int, first: int = 2) -> Clip:
 
     Args:
         period: frames P. overlap: see `overlap_of`. first: periods before it are not asked, if there
-            are others, since the motion begins there.
+            are others, since the motion begins there. stop: frame from which the motion is lost.
     """
     count = (clip.frames - 1) // period
-    stop = period + overlap
+    end = period + overlap
     if count < 2:
-        return clip.replaced(root_pos=clip.root_pos[:stop], rot=clip.rot[:stop])
+        return clip.replaced(root_pos=clip.root_pos[:end], rot=clip.rot[:end])
     pos = clip.positions()
     pos = pos - pos[:, :1] * np.array([1.0, 1.0, 0.0])
-    asked = range(min(first, count - 1), count)
+    whole = count if stop is None else min(count, max(2, stop // period))
+    asked = range(min(first, whole - 1), whole)
 
     def apart(k: int) -> float:
         here, before = (pos[j * period : (j + 1) * period + 1] for j in (k, k - 1))
@@ -76,7 +77,7 @@ def best_period(clip: Clip, period: int, overlap: int, first: int = 2) -> Clip:
         torch.tensor(even.rot[before]),
         torch.tensor(share)[:, None].expand(-1, even.rot.shape[1]),
     )
-    return clip.replaced(root_pos=root[:stop], rot=rot.numpy()[:stop])
+    return clip.replaced(root_pos=root[:end], rot=rot.numpy()[:end])
 
 
 def _even(clip: Clip, k: int, period: int) -> Clip:

@@ -42,16 +42,19 @@ class InPlace:
         """Frames of one period of a loop."""
         return self.source.frames - (self.overlap or 0)
 
-    def written(self, motion: Clip, scale: float = 1.0) -> Clip:
+    def written(self, motion: Clip, scale: float = 1.0, lost_s: float | None = None) -> Clip:
         """A simulated motion of `clip` as it is written: one period of a loop, in place or travelling.
 
-        scale: of the body in size to the skeleton that came in, about the root's first place.
+        scale: of the body in size to the skeleton that came in, about the root's first place. lost_s:
+            when the character failed; of a loop a period before that is taken if there is one.
         """
         about = self.clip.root_pos[0, :2]
         travel = self.travel.scaled(scale, about)
         if self.overlap is None:
             return motion if self.travels else in_place(motion, travel)
-        one = best_period(in_place(motion, travel), self.period, self.overlap)
+        one = in_place(motion, travel)
+        stop = None if lost_s is None else int(lost_s * motion.fps)
+        one = best_period(one, self.period, self.overlap, stop=stop)
         return travelled(one, travel) if self.travels else one
 
     @property

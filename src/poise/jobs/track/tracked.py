@@ -103,19 +103,18 @@ class Tracked(Result):
     @cached_property
     def finished(self) -> Delivery:
         """What is written, standing feet held: made once, for the card and for the files."""
-        return self._finished(True)
+        return self.as_written(True)
 
-    def _finished(self, hold: bool) -> Delivery:
+    def as_written(self, hold: bool) -> Delivery:
+        """What is written, a clip in place as it came. hold: standing feet are held."""
         source, before = self.placed.source, self.undirected
         done = finished(self.imitation, self.evaluation, hold, source, self.at_home, before)
         if self.travel is None:
             return done
-        moved = self.placed.moved
-        body = {
-            name: self.travel.written(clip, moved.scale if moved else 1.0)
-            for name, clip in done.clips.items()
-        }
-        home = {name: self.travel.written(clip) for name, clip in done.home.items()}
+        moved, lost = self.placed.moved, min(self.failed_s, default=None)
+        scale = moved.scale if moved else 1.0
+        body = {name: self.travel.written(clip, scale, lost) for name, clip in done.clips.items()}
+        home = {name: self.travel.written(clip, 1.0, lost) for name, clip in done.home.items()}
         return replace(done, clips=body, home=home)
 
     @property
@@ -129,7 +128,8 @@ class Tracked(Result):
         if hold:
             return tuple(self.finished.home.values())[character]
         motion = self.at_home(as_high_as_source(self.motion(character), self.imitation), False)
-        return motion if self.travel is None else self.travel.written(motion)
+        lost = min(self.failed_s, default=None)
+        return motion if self.travel is None else self.travel.written(motion, 1.0, lost)
 
     def at_home(self, motion: Clip, hold: bool) -> Clip:
         """A motion of the body on the skeleton that came in. hold: limbs that stay put are led
@@ -200,7 +200,7 @@ def write(
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(
         t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s,
-        t.at_home, t.finished if hold else t._finished(False),
+        t.at_home, t.finished if hold else t.as_written(False),
     )  # fmt: skip
     (out / FILE).unlink(missing_ok=True)
     if t.simulation is not None:
