@@ -30,7 +30,7 @@ T = TypeVar("T")
 #: A switch; its help states no default, which the sentence tells.
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
-#: What becomes of a clip whose travel was taken out.
+#: What becomes of a clip in place.
 InPlace = Literal["auto", "keep", "travel"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 

@@ -144,7 +144,7 @@ def imitate(
         device: "cpu" or "cuda".
         on_iteration: is called after each iteration; returning False ends the training.
         callbacks: are told what happens before PPO begins, where nothing is there to begin with.
-        in_place: what becomes of a clip whose travel was taken out, see `track.in_place`; what is
+        in_place: what becomes of a clip in place, see `track.in_place`; what is
             learned from nothing keeps its travel.
 
     Raises:

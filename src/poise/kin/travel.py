@@ -1,6 +1,6 @@
 """Motion in place: the travel that was taken out of a clip, told by the limbs that bear it.
 
-A foot that bears stands still in the world. In a clip whose travel was taken out it goes backwards
+A foot that bears stands still in the world. In a clip in place it goes backwards
 instead, with all other feet that bear, and the root stays where it is. The motion in the world is
 
     x_world = G(t) x,    G' = G xi,    xi p = v + w z x p = -p'    for every point p that bears,
@@ -132,7 +132,7 @@ def find_travel(clip: Clip, table: BodyTable | None = None) -> Travel | None:
 
 
 def told_by(table: BodyTable, pos: torch.Tensor, quat: torch.Tensor, fps: float) -> Travel | None:
-    """`find_travel` of a body whose rows have the world poses `pos (T, B, 3)` m, `quat (T, B, 4)`."""
+    """`find_travel` of a body with rows in the world poses `pos (T, B, 3)` m, `quat (T, B, 4)`."""
     root = pos[:, 0, :2].numpy()
     if len(root) < 4 or np.ptp(root, axis=0).max() > STRAYS_M:
         return None

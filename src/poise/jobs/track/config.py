@@ -47,7 +47,7 @@ class TrackConfig:
             single clip.
         push: a push in it, to which the character gives way; for one character and a single clip, which
             no search looks for.
-        in_place: what becomes of a clip whose travel was taken out, see `track.in_place`.
+        in_place: what becomes of a clip in place, see `track.in_place`.
     """
 
     noise: tuple[Noise, ...] = ()

@@ -12,7 +12,7 @@ from poise.kin.loops import best_period, overlap_of, repeated
 from poise.kin.travel import Travel, find_travel, in_place, path_of, travelled
 from poise.motion import Clip
 
-#: What becomes of a clip whose travel was taken out: "keep" simulates it as it is, "travel" writes it
+#: What becomes of a clip in place: "keep" simulates it as it is, "travel" writes it
 #: with its travel, "auto" writes it in place again.
 Mode = Literal["auto", "keep", "travel"]
 #: A loop is simulated for this long (s), as at least and at most so many periods.
@@ -91,7 +91,7 @@ class InPlace:
 def with_travel(
     clip: Clip, mode: Mode = "auto", *, repeats: bool = True, returns: bool = True
 ) -> InPlace | None:
-    """A clip whose travel was taken out, with it; None where none was, or that is to be kept.
+    """A clip in place, with it; None where none was, or that is to be kept.
 
     Args:
         repeats: a loop is simulated as several periods.
