@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from poise.cli.answer import LOST, Answer
 from poise.cli.console import print_card, say, table, tell
 from poise.cli.inbetween import frames_of
-from poise.cli.options import Flag, Reading, check_range
+from poise.cli.options import Flag, InPlace, Reading, check_range
 from poise.cli.output import places
 from poise.cli.progress import staged, working
 from poise.errors import PoiseError
@@ -74,6 +74,9 @@ class Options:
     """Seed of all draws."""
     threads: Annotated[int, arg(metavar="N")] = 0
     """Cores for lookahead and search; 0 is all."""
+    in_place: InPlace = "auto"
+    """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
+    place again; travel writes it with its travel; keep simulates it as it is."""
     hold_feet: Flag = True
     """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     force: Flag = False
@@ -115,6 +118,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     config = TrackConfig(
         seed=o.seed, controller=o.controller, lookahead=ahead, threads=o.threads,
         direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
+        in_place=o.in_place,
     )  # fmt: skip
     times, partial = None if o.times is None else times_of(o.times), partials_of(o.partial)
     clip = o.reading.read(o.clip)

@@ -96,6 +96,8 @@ def run_on(path: Path, options: Options) -> Answer:
 def _show(title: str, found: Examination) -> None:
     if not found.judged:
         say("No human body is told by the joints' names, so feet and floor were not judged.")
+    if found.travel is not None:
+        say(f"{title} {found.travel.words()}: its feet are judged with that travel.")
     if not found.faults:
         say(f"{title}: nothing wrong was found.")
         return

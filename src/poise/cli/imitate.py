@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import Answer
 from poise.cli.console import launched, print_card
-from poise.cli.options import Body, Chosen, Flag, Reading, Training, printed
+from poise.cli.options import Body, Chosen, Flag, InPlace, Reading, Training, printed
 from poise.cli.output import places
 from poise.cli.progress import working
 from poise.cli.settings import given
@@ -45,6 +45,10 @@ class Options:
     )
     """The policy that begins, a file or a run; by default the one that comes with Poise. none trains
     from nothing."""
+    in_place: InPlace = "auto"
+    """A clip that walks in place is learned with the travel that its feet tell. auto writes it in place
+    again, a loop as a loop; travel writes it with its travel; keep takes it as it is. What is learned
+    from nothing is written with its travel."""
     hold_feet: Flag = True
     """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     force: Flag = False
@@ -108,7 +112,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     # A run that is not resumed is refused by `Job`, with or without --force: training takes hours.
     held = (out / "run" / RUN_FILE).exists()
     may_deliver(out, motion, o.force or held, o.clip)
-    job = Job((o.clip,), out, out / "run", o.training, config, o.reading, again)
+    job = Job((o.clip,), out, out / "run", o.training, config, o.reading, again, o.in_place)
     if not from_nothing(o, out / "run"):
         from poise.cli.practice import practise
 

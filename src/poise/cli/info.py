@@ -18,7 +18,7 @@ from poise.errors import PoiseError
 #: The keys of a clip in the result, which programs rely on.
 KEYS = (
     *("format", "joints", "fps", "frames", "seconds", "unit_m", "up_axis", "height_m", "warnings"),
-    *("repairs", "guesses"),
+    *("repairs", "guesses", "in_place"),
 )
 
 
@@ -52,10 +52,14 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     facts, faults = [describe(clip) for clip in clips], [find_faults(clip) for clip in clips]
     for fact, fault in zip(facts, faults, strict=True):
         fact["repairs"] = None if fault is None else fault.numbers
+        travel = None if fault is None else fault.travel
+        fact["in_place"] = None if travel is None else travel.to_dict()
     for clip, fact in zip(clips, facts, strict=True):
         fact["guesses"] = [g.to_dict() for g in find_guesses(clip)]
     for path, fact, fault in zip(options.clips, facts, faults, strict=True):
         table(str(path), ("", ""), _rows(fact), left=2)
+        if fact["in_place"]:
+            say(f"It {fact['in_place']['said']}; a body is given that travel, see --in-place.")
         say("Guessed, and how to state it instead:")
         notes([_guess(g) for g in fact["guesses"]], 40)
         told = " ".join(g["evidence"] for g in fact["guesses"])

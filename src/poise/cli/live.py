@@ -82,6 +82,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     if o.clips and live_in:
         raise PoiseError("files and a live stream were both given", hint="Leave one of them out")
     from poise.jobs.open import open_run
+    from poise.kin.travel import find_travel, travelled
     from poise.live.config import LiveConfig
     from poise.live.page.guard import LOOPBACK
     from poise.live.session import Session, Wanted
@@ -89,6 +90,10 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     with working("opening the policy"):
         paths = () if live_in else o.clips or (Path(__file__).parents[1] / "data" / "walk.bvh",)
         clips = {f"{k + 1} {p.stem}"[:64]: o.reading.read(p) for k, p in enumerate(paths)}
+        for name, clip in clips.items():
+            if (travel := find_travel(clip)) is not None:
+                tell(f"{clip.name} {travel.words()}: a character is given that travel.", "yellow")
+                clips[name] = travelled(clip, travel)
         count = o.characters or max(1, len(clips))
         config = LiveConfig(count, o.buffer, o.lookahead, o.noise, o.seed)
         token = None if o.host in LOOPBACK else secrets.token_urlsafe(24)

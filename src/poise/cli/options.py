@@ -32,6 +32,8 @@ Flag = Annotated[bool, arg(help_behavior_hint="")]
 Device = Annotated[str, arg(metavar="cpu|cuda")]
 #: `motion.io.guess.UPS`; stated here since motion is imported only when a verb reads.
 Up = Literal["Y", "Z", "X", "-Y", "-Z", "-X"]
+#: What becomes of a clip in place.
+InPlace = Literal["auto", "keep", "travel"]
 Rule = Literal["phc", "phc_strict", "any_25cm", "rfc_height", "s2h_root"]
 
 

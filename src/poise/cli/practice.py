@@ -62,7 +62,9 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
             first = First(job.out, motion, hold)
             told = Watching(shown.follow, first, lambda s: tell(s, "yellow"), shown.iteration)
             try:
-                made = practised(clip, tracker, job.run, until, seed, t.threads, t.device, told)
+                made = practised(
+                    clip, tracker, job.run, until, seed, t.threads, t.device, told, True, job.in_place
+                )
             except KeyboardInterrupt:
                 # A second Ctrl-C ends the present iteration too; what is in the last checkpoint stays.
                 return stopped(job.run, job.again)

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from poise.cli.answer import LOST, Answer
 from poise.cli.console import print_card, say
-from poise.cli.options import Flag, Reading, check_range
+from poise.cli.options import Flag, InPlace, Reading, check_range
 from poise.cli.output import places
 from poise.cli.progress import working
 from poise.errors import PoiseError
@@ -63,6 +63,9 @@ class Options:
     """Cores for lookahead; 0 is all."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of what lookahead draws."""
+    in_place: InPlace = "auto"
+    """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
+    place again; travel writes it with its travel; keep simulates it as it is."""
     hold_feet: Flag = True
     """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     overwrite: Flag = False
@@ -87,7 +90,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
 
     config = TrackConfig(
         seed=o.seed, controller=o.controller, threads=o.threads, body=o.body, push=push,
-        smooth_hz=o.reading.smooth,
+        smooth_hz=o.reading.smooth, in_place=o.in_place,
     )  # fmt: skip
     clip = o.reading.read(o.clip)
     with working("opening the policy"):

@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from poise.cli.answer import INTERRUPTED, LOST, Answer
 from poise.cli.console import print_card, say, tell
 from poise.cli.folder import each
-from poise.cli.options import Flag, Reading, check_range
+from poise.cli.options import Flag, InPlace, Reading, check_range
 from poise.cli.output import places
 from poise.cli.progress import clock, showing, staged, working
 from poise.errors import PoiseError
@@ -89,6 +89,9 @@ class Options:
     """Errors of a pose estimator on the input, such as jitter:1 or video:0.5."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise, and of what lookahead, search and --learn draw."""
+    in_place: InPlace = "auto"
+    """A clip that walks in place is simulated with the travel that its feet tell. auto writes it in
+    place again, a loop as a loop; travel writes it with its travel; keep simulates it as it is."""
     hold_feet: Flag = True
     """Leave feet as simulated; by default standing feet are held to the spot in the written motion."""
     save_policy: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -176,6 +179,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         smooth_hz=o.reading.smooth, count=o.count, controller=o.controller, lookahead=ahead,
         search=search, threads=o.threads, body=o.body, supports=stands,
         direction=direction_of(o.weight, o.pin, o.touch), retake=retake_of(o.span, o.earlier),
+        in_place=o.in_place,
     )  # fmt: skip
     config.check(len(o.clips))
     given = [read(clip, o.reading) for clip in o.clips]
@@ -216,6 +220,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
         "sentence": told.sentence,
         "failures": failures,
         "supports": [s.to_dict() for s in tracked.supports],
+        "in_place": tracked.travel and tracked.travel.to_dict(),
         "clips": [asdict(part) | {"done": part.done} for part in tracked.parts],
         "score": done.card.to_dict(),
     }

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 from poise.cli import progress
 from poise.cli.answer import INTERRUPTED, Answer
 from poise.cli.console import launched, notes, say, tell
-from poise.cli.options import Reading, Training
+from poise.cli.options import InPlace, Reading, Training
 from poise.cli.progress import clock, left
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed
@@ -45,6 +45,7 @@ class Job:
     reading: Reading
     again: str
     """The command line that goes on with it."""
+    in_place: InPlace = "auto"
 
     def start(self, comm: Comm) -> Imitation:
         """The task on every process: rank 0 begins the run, the others open its folder."""
@@ -78,12 +79,16 @@ class Job:
 
     def read(self) -> ClipLibrary:
         """All clips, each with a name of its own."""
+        from poise.jobs.track.in_place import with_travel
         from poise.motion import ClipLibrary
 
         seen: dict[str, int] = {}
         clips = []
         for path in self.clips:
             clip = self.reading.read(path)
+            if (travel := with_travel(clip, self.in_place, repeats=False, returns=False)) is not None:
+                tell(travel.sentence(), "yellow")
+                clip = travel.clip
             seen[clip.name] = seen.get(clip.name, 0) + 1
             count = seen[clip.name]
             clips.append(clip if count == 1 else clip.replaced(name=f"{clip.name}-{count}"))

@@ -23,6 +23,7 @@ from poise.jobs.stages import Stage, key_errors, stage_of
 from poise.jobs.track import TrackConfig, Tracked, track, write
 from poise.jobs.track.best import Merit
 from poise.jobs.track.direction import Weight
+from poise.jobs.track.in_place import InPlace, with_travel
 from poise.jobs.track.story import story
 from poise.jobs.tracker import Tracker
 from poise.kin.rate.judge import judge_rate
@@ -104,7 +105,9 @@ class Completed(Result):
         return f"{told}, which is missed: more keyframes, --retime or --controller search may help."
 
     def _shown(self) -> Shown:
-        return Shown(self.clip, self.filled.clip, self.card, self.notes, self.at)
+        travel, filled = self.tracked.travel, self.filled.clip
+        filled = filled if travel is None else travel.written(filled)
+        return Shown(self.clip, filled, self.card, self.notes, self.at)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         return self.write(folder).paths
@@ -114,8 +117,9 @@ class Completed(Result):
         as `filled.bvh`, or in the format of the source."""
         said = (self.sentence, *(s.sentence() for s in self.stages))
         done = write(self.tracked, out, motion, hold, keys=self.at, said=said)
-        filled = out / f"filled{home_suffix(self.filled.clip)}"
-        write_clip(self.filled.clip, filled)
+        filled, clip = out / f"filled{home_suffix(self.filled.clip)}", self.filled.clip
+        travel = self.tracked.travel
+        write_clip(clip if travel is None else travel.written(clip), filled)
         return replace(done, paths={**done.paths, "filled": filled})
 
 
@@ -161,6 +165,13 @@ def complete(
     if retime and config.retake is not None:
         raise PoiseError("a range has the times of the earlier result", hint="Leave --retime out")
     source = clip_of(clip)
+    # What is filled or retimed keeps the clip's time only where neither is asked for.
+    timed_anew = retime or times is not None
+    travel = with_travel(source, config.in_place, repeats=False, returns=not timed_anew)
+    source = source if travel is None else travel.clip
+    config = replace(config, in_place="keep")
+    if travel is not None:
+        config = replace(config, direction=travel.moved(config.direction))
     doubt = judge_rate(source).sentence()
     if doubt is not None and warn is not None:
         warn(doubt)
@@ -206,7 +217,13 @@ def complete(
             break
         factors = np.where(slow, LONGER * factors, factors)
     assert best is not None
-    return best[1]
+    return best[1] if travel is None else _as_it_came(best[1], travel)
+
+
+def _as_it_came(done: Completed, travel: InPlace) -> Completed:
+    """What came of a clip in place, written as it came."""
+    tracked = replace(done.tracked, travel=travel, notes=(travel.sentence(), *done.tracked.notes))
+    return replace(done, tracked=tracked)
 
 
 def _completed(

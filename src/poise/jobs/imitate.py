@@ -26,6 +26,7 @@ from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
 from poise.jobs.track import Tracked, write
+from poise.jobs.track.in_place import Mode, with_travel
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, PolicyBundle, Until
@@ -88,10 +89,14 @@ class Imitated(Result):
         own = [n for clip in self.task.library for n in clip.skeleton.source.notes]
         if self.tracked is not None:
             own += [*self.sentences, *self.tracked.notes]
+            travel = self.tracked.travel
+            own += [] if travel is None or travel.sentence() in own else [travel.sentence()]
         return (*own, *self.task.report.sentences(), *self._finished.notes)
 
     def _shown(self) -> Shown:
         source = self.tracked.placed.source if self.tracked else self.task.library.clips[0]
+        if self.tracked is not None and self.tracked.travel is not None:
+            source = self.tracked.travel.beside
         return Shown(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
@@ -118,6 +123,7 @@ def imitate(
     device: str = "cpu",
     on_iteration: Callable[[IterationStats], bool | None] | None = None,
     callbacks: TrainingCallbacks | None = None,
+    in_place: Mode = "auto",
     **settings: Any,
 ) -> Imitated:
     """Trains a policy on a motion, simulates it from every start frame, and scores it.
@@ -140,6 +146,8 @@ def imitate(
         device: "cpu" or "cuda".
         on_iteration: is called after each iteration; returning False ends the training.
         callbacks: are told what happens before PPO begins, where nothing is there to begin with.
+        in_place: what becomes of a clip in place, see `track.in_place`; what is
+            learned from nothing keeps its travel.
 
     Raises:
         PoiseError: a motion that cannot be read or has no human body, an unknown setting, a folder that
@@ -157,9 +165,11 @@ def imitate(
     try:
         tracker = None if stated or len(several) > 1 else _tracker(policy, library.clips[0])
         if tracker is not None:
-            how = (run, until, config.seed, threads, device, on_iteration)
+            how = (run, until, config.seed, threads, device, on_iteration, in_place)
             return _kept(_practised(library.clips[0], tracker, *how), folder)
-        task = begin(run, library, config, device)
+        travels = [with_travel(c, in_place, repeats=False, returns=False) for c in library]
+        moving = [c if t is None else t.clip for c, t in zip(library, travels, strict=True)]
+        task = begin(run, ClipLibrary.of(moving), config, device)
         done = train(task, run, until, on_iteration, threads, False, beginning=callbacks, device=device)
         learned, meta = trained_policy(run, task)
         scored = evaluate(task, learned, meta, device=device)
@@ -200,13 +210,16 @@ def _practised(
     threads: int,
     device: str,
     on_iteration: Callable[[IterationStats], bool | None] | None,
+    in_place: Mode,
 ) -> Imitated:
     """What came of a policy that learned a motion on its own joints with the bones of the clip."""
 
     def tell(p: Progress) -> bool | None:
         return None if on_iteration is None else on_iteration(p.stats)
 
-    made = practise(clip, tracker, run, until, seed, threads, device, Watching(iteration=tell), False)
+    made = practise(
+        clip, tracker, run, until, seed, threads, device, Watching(iteration=tell), False, in_place
+    )
     done, learned = made.tracked, made.learned
     assert done is not None
     task, evaluation = done.imitation, done.evaluation

@@ -25,6 +25,7 @@ from poise.jobs.run_file import RUN_FILE
 from poise.jobs.track import TrackConfig, Tracked, track
 from poise.jobs.track.best import LOST, TRACKED
 from poise.jobs.track.helping import GRAVITY, SHARES
+from poise.jobs.track.in_place import InPlace, Mode, with_travel
 from poise.jobs.track.learning import Learned, from_every_start, help_of, help_wanted, learn, with_help
 from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
@@ -80,6 +81,7 @@ def practise(
     device: str = "cpu",
     watching: Watching | None = None,
     stop: bool = True,
+    in_place: Mode = "auto",
 ) -> Practised:
     """Does what this module says.
 
@@ -88,18 +90,23 @@ def practise(
         run: the folder of the run, which goes on if it is there.
         until: of all that comes before the last evaluation; training has half of the minutes at least.
         stop: a training that was interrupted is not evaluated.
+        in_place: what becomes of a clip in place, see `track.in_place`.
 
     Raises:
         PoiseError: see `learn`.
     """
-    told, config = watching or Watching(), TrackConfig(seed=seed, threads=threads)
+    told = watching or Watching()
+    config = TrackConfig(seed=seed, threads=threads, in_place=in_place)
     began, first, newtons = time.monotonic(), None, 0.0
     if (run / RUN_FILE).exists():
-        placed, newtons = place(clip, tracker), help_of(run)
+        travel = with_travel(clip, in_place)
+        if travel is not None:
+            told.say(travel.sentence())
+        placed, newtons = place(_moving(clip, travel), tracker), help_of(run)
     else:
         first = told.follow(tracker, clip, config)
         told.first(first)
-        placed = first.placed
+        placed, travel = first.placed, first.travel
         if first.merit.ended != TRACKED:
             for doubt in first.doubts:
                 told.say(doubt)
@@ -113,7 +120,12 @@ def practise(
     )
     if learned.result.interrupted and stop:
         return Practised(None, learned, first)
-    return _best(clip, tracker, learned, first, newtons, config, device, told)
+    return _best(clip, tracker, learned, first, newtons, config, device, told, travel)
+
+
+def _moving(clip: Clip, travel: InPlace | None) -> Clip:
+    """What is simulated of a clip."""
+    return clip if travel is None else travel.clip
 
 
 def _help(
@@ -150,9 +162,11 @@ def _best(
     config: TrackConfig,
     device: str,
     told: Watching,
+    travel: InPlace | None,
 ) -> Practised:
     """What is kept of all that was tried, and why."""
-    own, said = from_every_start(learned.tracker, clip, device), list[str]()
+    moving, said = _moving(clip, travel), list[str]()
+    own = replace(from_every_start(learned.tracker, moving, device), travel=travel)
     if newtons:
         said.append(
             f"A residual force of at first up to {_newtons(newtons, learned.tracker)} helped while it "
@@ -168,9 +182,9 @@ def _best(
         first = told.follow(tracker, clip, config)
     if first is not None:
         kept = max(kept, first, key=lambda t: t.merit)
-    aided = with_help(learned.tracker, clip, device) if newtons and kept.merit.ended == LOST else None
+    aided = with_help(learned.tracker, moving, device) if newtons and kept.merit.ended == LOST else None
     if aided is not None and aided.merit > kept.merit:
-        kept, most = aided, _newtons(float(aided.card.help.limit_n), tracker)
+        kept, most = replace(aided, travel=travel), _newtons(float(aided.card.help.limit_n), tracker)
         said.append(f"Without help it is still lost; with up to {most} it is done.")
     elif newtons:
         said.append("It has ended: nothing helps in what is written.")

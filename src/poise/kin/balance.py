@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from typing import TypeAlias
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from poise.body import BodyTable
-from poise.kin.fk import carried
 from poise.kin.series import gaussian
 from poise.metrics.shapes import PIECE
 from poise.spatial import GRAVITY
@@ -22,34 +16,8 @@ SMOOTH_S = 0.1
 LEAST_WEIGHT = 0.5
 #: Directions in which the support is measured; between two of them it is 0.5 % off.
 DIRECTIONS = 32
-_Three: TypeAlias = tuple[float, float, float]
 _ANGLES = 2 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS
 _WAYS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)))
-
-
-def extreme_points(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
-    """`(T, P, 3)` m, the ends and corners of all shapes, lowered by their radius."""
-    rows: list[int] = []
-    middles, ends = list[_Three](), list[_Three]()
-    turns, radii = list[tuple[float, ...]](), list[float]()
-    for i, row in enumerate(table.rows):
-        for geom in row.geoms:
-            size = geom.size
-            own, radius = [(0.0, 0.0, 0.0)], size[0]
-            if geom.kind == "capsule":
-                own = [(0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]
-            elif geom.kind == "box":
-                own, radius = list(itertools.product(*((-x, x) for x in size))), 0.0
-            count = len(own)
-            rows += [i] * count
-            middles += [geom.pos] * count
-            turns += [geom.quat] * count
-            ends += own
-            radii += [radius] * count
-    middle, turn, end = (torch.tensor(x, dtype=pos.dtype) for x in (middles, turns, ends))
-    out = carried(pos[:, rows], quat[:, rows], carried(middle, turn, end))
-    out[..., 2] -= torch.tensor(radii, dtype=pos.dtype)
-    return out
 
 
 def balance_point(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from poise.body import BodyTable
+from poise.kin.fk import carried
 from poise.metrics import KINDS, Shapes, geom_heights
 from poise.metrics import centre_of_mass as geoms_centre
 from poise.motion import Clip
@@ -47,3 +51,30 @@ def lowest_height(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
 def centre_of_mass(table: BodyTable, pos: Tensor, quat: Tensor) -> Tensor:
     """`(..., 3)` m from world body poses; a body's mass sits in the middle of its shapes."""
     return geoms_centre(pos, quat, shapes_of(table))
+
+
+def extreme_points(
+    table: BodyTable, pos: Tensor, quat: Tensor, rows: Sequence[int] | None = None
+) -> Tensor:
+    """`(T, P, 3)` m, the ends and corners of all shapes, or those of `rows`, lowered by their radius."""
+    of = list[int]()
+    middles, ends = list[tuple[float, ...]](), list[tuple[float, ...]]()
+    turns, radii = list[tuple[float, ...]](), list[float]()
+    for i in range(len(table.rows)) if rows is None else rows:
+        for geom in table.rows[i].geoms:
+            size = geom.size
+            own, radius = [(0.0, 0.0, 0.0)], size[0]
+            if geom.kind == "capsule":
+                own = [(0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]
+            elif geom.kind == "box":
+                own, radius = list(itertools.product(*((-x, x) for x in size))), 0.0
+            count = len(own)
+            of += [i] * count
+            middles += [geom.pos] * count
+            turns += [geom.quat] * count
+            ends += own
+            radii += [radius] * count
+    middle, turn, end = (torch.tensor(x, dtype=pos.dtype) for x in (middles, turns, ends))
+    out = carried(pos[:, of], quat[:, of], carried(middle, turn, end))
+    out[..., 2] -= torch.tensor(radii, dtype=pos.dtype)
+    return out

@@ -10,9 +10,10 @@ import torch
 
 from poise.body import BodyTable, generate_table
 from poise.kin import lowest_height
-from poise.kin.balance import balance_point, extreme_points, hull_distance
+from poise.kin.balance import balance_point, hull_distance
 from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
 from poise.kin.ground import fit_heights
+from poise.kin.solids import extreme_points
 from poise.motion import Clip, shifted
 from toy_human import human, swing, turn
 

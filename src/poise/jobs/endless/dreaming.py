@@ -32,6 +32,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
 from poise.kin.rate.reading import read_clip
+from poise.kin.travel import find_travel, travelled
 from poise.learn.run import interruptible
 from poise.motion import Clip
 from poise.settings import changed
@@ -136,6 +137,8 @@ def past_of(clip: Clip | str | Path, generator: Kinematic, tracker: Tracker) -> 
         PoiseError: the clip cannot be read, or is too short.
     """
     clip = clip if isinstance(clip, Clip) else read_clip(clip)
+    travel = find_travel(clip)
+    clip = clip if travel is None else travelled(clip, travel)
     qpos = torch.tensor(place(clip, tracker).qpos)
     if len(qpos) < generator.past:
         raise PoiseError(

@@ -19,6 +19,7 @@ from poise.kin.doctor.clean import clean_clip
 from poise.kin.place import OnBody
 from poise.kin.rate.judge import judge_rate
 from poise.kin.rate.reading import read_clip
+from poise.kin.travel import find_travel, travelled
 from poise.motion import Clip, Skeleton, resample, shifted, trim
 from poise.motion.io import read_skeleton
 
@@ -150,6 +151,8 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
         note = replace(note, seconds=clip.seconds, notes=clip.skeleton.source.notes)
         rule = "not human"
         cleaned, report = clean_clip(clip)
+        travel = find_travel(cleaned)
+        cleaned = cleaned if travel is None else travelled(cleaned, travel)
         rule = "short"
         resampled = resample(cleaned, fps).replaced(name=file.name)
     except PoiseError as problem:
@@ -162,8 +165,9 @@ def _read(file: MotionFile, fps: float, config: LibraryConfig) -> Taken | ClipNo
     word = _telling_word(file.name, config.words)
     if word and not matches(config.keep, file.name, file.subject):
         return replace(note, rule="word", reason=f"its name says '{word}'")
+    said = [] if travel is None else [f"It {travel.words()}, and was given that travel."]
     doubt, obeyed = judge_rate(clip).sentence(), _stated(config.rates, file.name) is not None
-    return Taken(file, resampled, tuple(report.sentences()), doubt, obeyed)
+    return Taken(file, resampled, (*said, *report.sentences()), doubt, obeyed)
 
 
 def _stated(pairs: Sequence[tuple[str, _T]], name: str) -> _T | None:

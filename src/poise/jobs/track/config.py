@@ -7,6 +7,7 @@ from typing import Literal
 
 from poise.errors import PoiseError
 from poise.jobs.track.direction import Direction
+from poise.jobs.track.in_place import Mode
 from poise.jobs.track.pushed import PushConfig
 from poise.jobs.track.simulation import Retake
 from poise.kin.supports import Support
@@ -46,6 +47,7 @@ class TrackConfig:
             single clip.
         push: a push in it, to which the character gives way; for one character and a single clip, which
             no search looks for.
+        in_place: what becomes of a clip in place, see `track.in_place`.
     """
 
     noise: tuple[Noise, ...] = ()
@@ -63,6 +65,7 @@ class TrackConfig:
     direction: Direction = field(default_factory=Direction)
     retake: Retake | None = None
     push: PushConfig | None = None
+    in_place: Mode = "auto"
 
     def __post_init__(self) -> None:
         validate(self)

@@ -15,6 +15,7 @@ from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
 from poise.jobs.settled import settled
 from poise.jobs.track.best import Merit, merit
+from poise.jobs.track.in_place import InPlace
 from poise.jobs.track.missing import shortfalls
 from poise.jobs.track.parts import Part
 from poise.jobs.track.placement import Placed, home
@@ -26,6 +27,7 @@ from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
 from poise.kin.directed import Pin, pinned
 from poise.kin.supports import Support
+from poise.kin.travel import travelled
 from poise.motion import Clip
 from poise.motion.io import home_suffix, write_clip
 from poise.plan import SamplingResult
@@ -89,6 +91,7 @@ class Tracked(Result):
     undirected: Clip | None = None
     retake: Retake | None = None
     doubts: tuple[str, ...] = ()
+    travel: InPlace | None = None
 
     @property
     def failed_s(self) -> tuple[float, ...]:
@@ -108,8 +111,19 @@ class Tracked(Result):
     @cached_property
     def finished(self) -> Delivery:
         """What is written, standing feet held: made once, for the card and for the files."""
+        return self.as_written(True)
+
+    def as_written(self, hold: bool) -> Delivery:
+        """What is written, a clip in place as it came. hold: standing feet are held."""
         source, before = self.placed.source, self.undirected
-        return finished(self.imitation, self.evaluation, True, source, self.at_home, before)
+        done = finished(self.imitation, self.evaluation, hold, source, self.at_home, before)
+        if self.travel is None:
+            return done
+        moved, lost = self.placed.moved, min(self.failed_s, default=None)
+        scale = moved.scale if moved else 1.0
+        body = {name: self.travel.written(clip, scale, lost) for name, clip in done.clips.items()}
+        home = {name: self.travel.written(clip, 1.0, lost) for name, clip in done.home.items()}
+        return replace(done, clips=body, home=home)
 
     @property
     def clip(self) -> Clip:
@@ -121,7 +135,9 @@ class Tracked(Result):
         held."""
         if hold:
             return tuple(self.finished.home.values())[character]
-        return self.at_home(as_high_as_source(self.motion(character), self.imitation), False)
+        motion = self.at_home(as_high_as_source(self.motion(character), self.imitation), False)
+        lost = min(self.failed_s, default=None)
+        return motion if self.travel is None else self.travel.written(motion, 1.0, lost)
 
     def at_home(self, motion: Clip, hold: bool) -> Clip:
         """A motion of the body on the skeleton that came in. hold: limbs that stay put are led
@@ -141,13 +157,16 @@ class Tracked(Result):
         earlier = None
         if hold and not isinstance(retake.of, Simulation):
             earlier = written_as(Path(retake.of), motion)
+            if earlier is not None and self.travel is not None and not self.travel.travels:
+                earlier = travelled(earlier, self.travel.travel)
         if earlier is None:
             was = replace(self.evaluation, recordings=[replace(recordings[0], qpos=before.qpos.numpy())])
-            earlier = replace(self, evaluation=was, retake=None).delivered(0, hold)
+            earlier = replace(self, evaluation=was, retake=None, travel=None).delivered(0, hold)
         return spliced(earlier, motion, span)
 
     def _shown(self) -> Shown:
-        return Shown(self.clip, self.placed.source, self.card, self.notes)
+        source = self.placed.source if self.travel is None else self.travel.beside
+        return Shown(self.clip, source, self.card, self.notes)
 
     def _save_all(self, folder: Path) -> dict[str, Path]:
         return write(self, folder).paths
@@ -189,7 +208,7 @@ def write(
     said += shortfalls(t.evaluation.card) if count == 1 and not t.parts else ()
     done = deliver(
         t.imitation, t.evaluation, out, curve or {}, inner, hold, placed.source, said, keys, t.failed_s,
-        t.at_home, t.finished if hold else None,
+        t.at_home, t.finished if hold else t.as_written(False),
     )  # fmt: skip
     (out / FILE).unlink(missing_ok=True)
     if t.simulation is not None:

@@ -24,6 +24,7 @@ from poise.jobs.track.best import RULE
 from poise.jobs.track.config import TrackConfig
 from poise.jobs.track.controllers import Show, done_by, led_by
 from poise.jobs.track.crowd import places
+from poise.jobs.track.in_place import InPlace, with_travel
 from poise.jobs.track.missing import needs_of
 from poise.jobs.track.parts import Span, cut, parts_of, with_parts
 from poise.jobs.track.placement import Placed, place, place_all
@@ -95,11 +96,15 @@ def track(
     motions = [clip] if isinstance(clip, Motion) else list(clip)
     config.check(len(motions))
     motions = [read_motion(m) for m in motions]
-    motion = motions[0]
+    several = len(motions) > 1
+    travels = [_with_travel(m, config, several) for m in motions]
+    motions = [m if t is None else t.clip for m, t in zip(motions, travels, strict=True)]
+    motion, travel = motions[0], travels[0]
     given, points = _input(motion, config)
+    if travel is not None:
+        config = replace(config, direction=travel.moved(config.direction))
     config.direction.check(given, tracker.humanoid.table)
     undirected, (given, directions) = given, config.direction.applied(given)
-    several = len(motions) > 1
     if config.recover or several:
         all_placed = place_all([given, *(_input(m, config)[0] for m in motions[1:])], tracker)
     else:
@@ -109,7 +114,7 @@ def track(
     imitation = imitation_of(tracker, all_placed)
     notes = [f"{p.clip.name}: {n}" if several else n for p in all_placed for n in p.notes]
     notes += directions
-    doubts = rate_doubts(all_placed)
+    doubts = [*(t.sentence() for t in travels if t is not None), *rate_doubts(all_placed)]
     if warn is not None:
         for doubt in doubts:
             warn(doubt)
@@ -177,6 +182,7 @@ def track(
         done.controller, parts, supports, config.direction.pins,
         None if several or config.recover else done.simulation, done.pushed,
         undirected if config.direction else None, config.retake, tuple(doubts),
+        None if several else travel,
     )  # fmt: skip
 
 
@@ -233,6 +239,23 @@ def read_motion(clip: Motion) -> Clip | Keypoints:
         return clip
     made = read_clip(clip)
     return points_of(made, ReadOptions()) or settled(made)
+
+
+def _with_travel(motion: Clip | Keypoints, config: TrackConfig, several: bool) -> InPlace | None:
+    """A motion in place with its travel, if it is one.
+
+    A loop is repeated for a single character that has nothing to do at a certain time. Several clips in
+    a row, and a motion that waits for its character, are written with their travel.
+    """
+    if isinstance(motion, Keypoints):
+        return None
+    single = config.count == 1 and not config.recover and not several
+    timed = bool(config.direction) or config.push is not None
+    made = with_travel(motion, config.in_place, repeats=single and not timed, returns=single)
+    if made is not None and made.overlap is not None and config.retake is not None:
+        what = "it is a loop in place, of which several periods were simulated and one is written"
+        raise PoiseError(what, motion.name, "Leave the range out")
+    return made
 
 
 def _input(motion: Clip | Keypoints, config: TrackConfig) -> tuple[Clip, Keypoints | None]:

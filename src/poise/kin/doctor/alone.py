@@ -10,11 +10,11 @@ import numpy as np
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.balance import LEAST_WEIGHT, balance_point, extreme_points, hull_distance
+from poise.kin.balance import LEAST_WEIGHT, balance_point, hull_distance
 from poise.kin.flight import Flight, find_flights
 from poise.kin.ground import ALOFT_M
 from poise.kin.series import find_runs
-from poise.kin.solids import centre_of_mass, poses_of
+from poise.kin.solids import centre_of_mass, extreme_points, poses_of
 from poise.motion import Clip
 
 Kind = Literal["held", "leaning", "below", "leap"]

@@ -11,6 +11,7 @@ from poise.errors import PoiseError
 from poise.kin.doctor.flips import Flip, out_of_reach, unflip
 from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds, without_rougher
 from poise.kin.rate.judge import judge_rate
+from poise.kin.travel import Travel, find_travel
 from poise.motion import Clip
 
 
@@ -93,19 +94,22 @@ def clean_clip(
 @dataclass(frozen=True)
 class Faults:
     """What a clip's fit will repair or doubt: in words, and as numbers (`CleanReport.to_dict` and
-    `likely_fps`, the frame rate that physics vouches for where it is far from the file's)."""
+    `likely_fps`, the frame rate that physics vouches for where it is far from the file's); and what was
+    taken out of a clip in place."""
 
     sentences: tuple[str, ...]
     numbers: dict[str, Any]
+    travel: Travel | None = None
 
 
 def find_faults(clip: Clip) -> Faults | None:
     """The faults of a clip, before a body is fitted; None where its joints are no human's."""
     try:
         _, report = clean_clip(clip)
-        judged = judge_rate(clip, generate_table(clip.skeleton, None, [clip]))
+        table = generate_table(clip.skeleton, None, [clip])
+        judged = judge_rate(clip, table)
     except PoiseError:
         return None
     doubt = judged.sentence()
     numbers = {**report.to_dict(), "likely_fps": judged.likely}
-    return Faults((*([doubt] if doubt else []), *report.sentences()), numbers)
+    return Faults((*([doubt] if doubt else []), *report.sentences()), numbers, find_travel(clip, table))

@@ -20,8 +20,10 @@ from poise.kin.doctor.slides import mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
 from poise.kin.hinges import chain_angles
+from poise.kin.loops import best_period, overlap_of, repeated
 from poise.kin.rate.judge import judge_rate
 from poise.kin.series import smooth_lift
+from poise.kin.travel import Travel, find_travel, in_place, travelled
 from poise.metrics import floating, jerk, penetration
 from poise.motion import Clip
 
@@ -29,6 +31,8 @@ from poise.motion import Clip
 BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
+#: Periods of a loop that are mended, of which one is taken.
+HEALED = 3
 
 
 #: Kinds that tell how a file was written or read, not how the body moves.
@@ -38,11 +42,13 @@ READ_ONLY = ("bone drift", "quaternion length", "rest frame", "limit")
 @dataclass(frozen=True)
 class Examination:
     """What was found in a clip. figures: numbers to compare before and after a repair, None where
-    they cannot be told. judged: whether the body could be told, so that feet and joints were judged."""
+    they cannot be told. judged: whether the body could be told, so that feet and joints were judged.
+    travel: what was taken out of a clip in place; its feet are judged with it."""
 
     faults: tuple[Fault, ...]
     figures: dict[str, float | None]
     judged: bool
+    travel: Travel | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers."""
@@ -50,16 +56,21 @@ class Examination:
             "faults": [f.to_dict() for f in self.faults],
             "figures": dict(self.figures),
             "judged": self.judged,
+            "in_place": None if self.travel is None else self.travel.to_dict(),
         }
 
 
 def examine(clip: Clip) -> Examination:
     """All faults of a clip and its figures; nothing is changed.
 
-    Faults of the frames and of the joints are told of the clip as it is, the stance of the feet too.
+    Faults of the frames and of the joints are told of the clip as it is, the stance of the feet too, but
+    that of a clip in place with its travel.
     """
     anatomy = anatomy_of(clip)
     support = support_of(clip, anatomy)
+    travel = None if support is None else support.travel
+    if travel is not None:
+        support = support_of(travelled(clip, travel.level), anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
     faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
     faults += [*limit_faults(clip), *_read_faults(clip)]
@@ -73,7 +84,7 @@ def examine(clip: Clip) -> Examination:
         hint = "the joints named left lie on the body's right; --swap-sides exchanges the names"
         faults.append(Fault("sides", "", 0, clip.frames - 1, 1.0, hint))
     ordered = [f for group in by_kind(faults).values() for f in group]
-    return Examination(tuple(ordered), _figures(clip, support), support is not None)
+    return Examination(tuple(ordered), _figures(clip, support), support is not None, travel)
 
 
 def heal(clip: Clip, path: bool = True) -> Clip:
@@ -83,8 +94,30 @@ def heal(clip: Clip, path: bool = True) -> Clip:
     drifting height, the height above the floor, sliding feet. A step changes nothing if its faults are
     not there. path: whether the root's path may be freed of the slip of standing feet, or legs alone
     hold them.
+
+    A clip in place is mended with its travel, and comes back in place, a loop as a loop.
     """
     anatomy = anatomy_of(clip)
+    support = support_of(clip, anatomy)
+    if support is None or support.travel is None:
+        return _healed(clip, anatomy, path)
+    travel, overlap = support.travel.level, overlap_of(clip)
+    if overlap is None:
+        moving = travelled(clip, travel)
+        healed = _healed(moving, anatomy, path)
+        return clip if healed is moving else in_place(healed, travel)
+    # From the last frame of a loop it goes on to the first.
+    closed = repeated(clip, overlap, 1)
+    travel = (find_travel(closed) or travel).level
+    moving = travelled(repeated(clip, overlap, HEALED), travel)
+    healed = _healed(moving, anatomy, path)
+    if healed is moving:
+        return clip
+    period = clip.frames - overlap
+    return best_period(in_place(healed, travel), period, overlap, first=1).replaced(cyclic=clip.cyclic)
+
+
+def _healed(clip: Clip, anatomy: Anatomy, path: bool) -> Clip:
     clip = mend_holds(clip)
     support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)

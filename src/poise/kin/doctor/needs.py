@@ -9,9 +9,9 @@ import numpy as np
 from torch import Tensor
 
 from poise.body import BodyTable
-from poise.kin.balance import balance_point, extreme_points, hull_distance
+from poise.kin.balance import balance_point, hull_distance
 from poise.kin.doctor.alone import AloneRules, NotAlone, beyond_a_floor
-from poise.kin.solids import centre_of_mass, lowest_height
+from poise.kin.solids import centre_of_mass, extreme_points, lowest_height
 
 #: Something that bears weight stays in its place: seats, steps and bars move slower than this (m/s).
 STILL = 0.25

@@ -19,6 +19,7 @@ from poise.kin.fk import carried
 from poise.kin.ground import HOVER_M, GroundFit, fit_heights
 from poise.kin.series import find_runs
 from poise.kin.solids import low_and_com
+from poise.kin.travel import Travel, told_by
 from poise.metrics import foot_contacts, foot_slide
 from poise.motion import Clip
 
@@ -43,7 +44,8 @@ class Support:
     soles: `(T, F, 3)` heel and toe end of every sole. feet: `(F,)` the foot joint of each.
     low: `(T, P)` heights of the body's joints and of its bone tips, each with its `margin (P,)`;
     names: `(P,)` the joint that each belongs to. sole_low: `(T,)` lowest point of the body's shapes.
-    com: `(T, 3)` centre of mass. fit: how the clip would be set on the floor. table: its body.
+    com: `(T, 3)` centre of mass. fit: how the clip would be set on the floor. table: its body. travel:
+    what was taken out of a clip in place.
     """
 
     fps: float
@@ -56,6 +58,7 @@ class Support:
     com: np.ndarray
     fit: GroundFit
     table: BodyTable
+    travel: Travel | None = None
 
     @classmethod
     def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
@@ -74,6 +77,7 @@ class Support:
             *low_and_com(table, pos, quat),
             fit_heights(table, pos, quat, clip.fps),
             table,
+            told_by(table, pos, quat, clip.fps),
         )
 
     @property

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from poise.body import BodyTable
-from poise.kin.balance import balance_point, beyond_reach, extreme_points, hull_reach
+from poise.kin.balance import balance_point, beyond_reach, hull_reach
 from poise.kin.feet.contact import NEAR_M, soles_of
 from poise.kin.flight import Flight, find_flights
 from poise.kin.series import find_runs
-from poise.kin.solids import centre_of_mass, poses_of
+from poise.kin.solids import centre_of_mass, extreme_points, poses_of
 from poise.motion import Clip
 from poise.motion.io.guess import root_jumps
 from poise.spatial import GRAVITY
