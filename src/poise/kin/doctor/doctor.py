@@ -12,10 +12,11 @@ import torch
 from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
+from poise.kin.doctor.estimate import denoise, noise_faults, refill
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
-from poise.kin.doctor.slides import mend_path, mend_slides
+from poise.kin.doctor.slides import drifts, mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
 from poise.kin.flight import likely_rate
@@ -60,7 +61,12 @@ def examine(clip: Clip) -> Examination:
     anatomy = anatomy_of(clip)
     support = support_of(clip, anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
-    faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
+    faults = [
+        *timing_faults(clip),
+        *_joint_faults(report, clip),
+        *noise_faults(clip),
+        *jitter_faults(cleaned),
+    ]
     faults += [*limit_faults(clip), *_read_faults(clip)]
     if support is not None:
         faults += [
@@ -75,20 +81,22 @@ def examine(clip: Clip) -> Examination:
     return Examination(tuple(ordered), _figures(clip, support), support is not None)
 
 
-def heal(clip: Clip, path: bool = True) -> Clip:
+def heal(clip: Clip, path: bool | None = None) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
-    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, the height
-    above the floor, sliding feet. A step changes nothing if its faults are not there. path: whether the
-    root's path may be freed of the slip of standing feet, or legs alone hold them.
+    In this order: repeated frames, root teleports, joints that were lost (`refill`), flips and speeds
+    (`clean_clip`), noise (`denoise`) and jitter, the height above the floor, sliding feet. A step
+    changes nothing if its faults are not there. path: whether the root's path is freed of the slip that
+    standing feet have in common, or legs alone hold them; None frees it where both feet tell the same
+    drift (`drifts`).
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)
     support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)
-    clip = mend_teleports(clip, low)
+    clip = refill(mend_teleports(clip, low))
     clip = clean_clip(clip, anatomy, rougher=False)[0]
-    clip = mend_jitter(clip)
+    clip = mend_jitter(denoise(clip))
     if support is None:
         return clip
     return _on_floor(_locked(_on_floor(clip, anatomy), anatomy, path), anatomy)
@@ -119,13 +127,15 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy, path: bool) -> Clip:
+def _locked(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
     """The clip without sliding feet. path: see `heal`."""
-    for step in (*[mend_path] * path, *[mend_slides] * SLIDE_ROUNDS):
+    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:
             return clip
+        if step is mend_path and not (drifts(support) if path is None else path):
+            continue
         clip = step(clip, support, faults)
     return clip
 
