@@ -12,7 +12,6 @@ import torch
 from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
-from poise.kin.doctor.estimate import denoise, noise_faults, refill
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
@@ -61,13 +60,8 @@ def examine(clip: Clip) -> Examination:
     anatomy = anatomy_of(clip)
     support = support_of(clip, anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
-    faults = [
-        *timing_faults(clip),
-        *_joint_faults(report, clip),
-        *noise_faults(clip),
-        *jitter_faults(cleaned),
-    ]
-    faults += [*limit_faults(clip), *_read_faults(clip)]
+    faults = [*timing_faults(clip), *_joint_faults(report, clip), *report.noise]
+    faults += [*jitter_faults(cleaned), *limit_faults(clip), *_read_faults(clip)]
     if support is not None:
         faults += [
             *height_faults(clip, support),
@@ -84,19 +78,18 @@ def examine(clip: Clip) -> Examination:
 def heal(clip: Clip, path: bool | None = None) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
-    In this order: repeated frames, root teleports, joints that were lost (`refill`), flips and speeds
-    (`clean_clip`), noise (`denoise`) and jitter, the height above the floor, sliding feet. A step
-    changes nothing if its faults are not there. path: whether the root's path is freed of the slip that
-    standing feet have in common, or legs alone hold them; None frees it where both feet tell the same
-    drift (`drifts`).
+    In this order: repeated frames, root teleports, joints that were lost, flips, speeds and noise
+    (`clean_clip`), jitter in spells, the height above the floor, sliding feet. A step changes nothing if
+    its faults are not there. path: whether the root's path is freed of the slip that standing feet have
+    in common, or legs alone hold them; None frees it where both feet tell the same drift (`drifts`).
     """
     anatomy = anatomy_of(clip)
     clip = mend_holds(clip)
     support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)
-    clip = refill(mend_teleports(clip, low))
+    clip = mend_teleports(clip, low)
     clip = clean_clip(clip, anatomy, rougher=False)[0]
-    clip = mend_jitter(denoise(clip))
+    clip = mend_jitter(clip)
     if support is None:
         return clip
     return _on_floor(_locked(_on_floor(clip, anatomy), anatomy, path), anatomy)

@@ -49,11 +49,12 @@ AROUND_S, WHOLE, CHANGE_S = 0.3, 0.7, 0.1
 WANDER_HZ = 0.15
 #: Length (s) of the pieces that are told and smoothed by themselves, and how long they overlap.
 PIECE_S, OVERLAP_S = 30.0, 2.0
-#: A joint that stands still for so long (s) and leaps on by so many of its steps was held; how fast (Hz)
-#: the curve through what is missing may turn.
-HELD_S, LEAPS, FILL_HZ = 0.08, 3.0, 6.0
-#: How far (m) a spike moves the end of what hangs on its joint at least.
-SPIKE_M = 0.02
+#: A joint that stands still for so long (s) and leaps on by so many of its steps, and by this angle (rad),
+#: was held; how fast (Hz) the curve through what is missing may turn.
+HELD_S, LEAPS, LEAP_RAD, FILL_HZ = 0.08, 3.0, 0.03, 6.0
+#: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
+#: toes snap by nearly as much in kicks and dashes.
+SPIKE_RAD, SPIKE_M = 0.35, 0.06
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
@@ -167,17 +168,17 @@ def _piece(
 def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
     """(kind, joint, first, last frame) where joints were not seen as they were.
 
-    A "spike" lasts a frame or two and moves the end of what hangs on the joint by `SPIKE_M` or more; a
-    joint is "held" that stands still and then leaps to where it has got. rot: `(T, J, 4)`, continuous in
-    sign.
+    A "spike" lasts a frame or two and turns the joint by `SPIKE_RAD` or more; a joint is "held" that
+    stands still and then leaps to where it has got. rot: `(T, J, 4)`, continuous in sign.
     """
     out: list[tuple[str, int, int, int]] = []
     spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
     for j in np.flatnonzero(spikes.any(0)):
         back = filled(rot[:, j], ~spikes[:, j], clip.fps)
-        moved = 2.0 * lever[j] * np.linalg.norm(back - rot[:, j], axis=-1)
+        turned = 2.0 * np.linalg.norm(back - rot[:, j], axis=-1)
+        least = max(SPIKE_RAD, SPIKE_M / max(lever[j], 1e-3))
         runs = find_runs(spikes[:, j], 0)
-        out += [("spike", int(j), a, b) for a, b in runs if moved[a : b + 1].max() >= SPIKE_M]
+        out += [("spike", int(j), a, b) for a, b in runs if turned[a : b + 1].max() >= least]
     still = (rot[1:] == rot[:-1]).all(-1)
     step, reach = np.linalg.norm(np.diff(rot, axis=0), axis=-1), max(3, round(0.2 * clip.fps))
     for j in np.flatnonzero(still.any(0) & ~still.all(0)):
@@ -186,7 +187,7 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
                 continue
             near = np.concatenate((step[max(first - reach, 0) : first, j], step[last + 2 :, j][:reach]))
             near = near[near > 0]
-            if len(near) and step[last + 1, j] > LEAPS * np.median(near):
+            if len(near) and step[last + 1, j] > max(LEAPS * np.median(near), 0.5 * LEAP_RAD):
                 out.append(("held", int(j), first + 1, last + 1))
     return out
 
