@@ -49,8 +49,8 @@ AROUND_S, WHOLE, CHANGE_S = 0.3, 0.7, 0.1
 WANDER_HZ = 0.15
 #: Length (s) of the pieces that are told and smoothed by themselves, and how long they overlap.
 PIECE_S, OVERLAP_S = 30.0, 2.0
-#: A joint that stands still for so long (s) and leaps on by so many of its steps, and by this angle (rad),
-#: was held; how fast (Hz) the curve through what is missing may turn.
+#: A joint that stands still for so long (s) and leaps on by so many of its steps, by this angle (rad) at
+#: least, was held; how fast (Hz) the curve through what is missing may turn.
 HELD_S, LEAPS, LEAP_RAD, FILL_HZ = 0.08, 3.0, 0.03, 6.0
 #: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
 #: toes snap by nearly as much in kicks and dashes.
