@@ -28,6 +28,8 @@ FIGURES = (
 )
 #: What is said to be worse after a repair: this share more, and as much more as the last digits say.
 WORSE, LEAST = 1.1, {"mm/s": 10.0, "mm": 10.0, "m/s^3": 50.0, "rad/s": 1.0}
+#: How far (mm) the root moves before it is said.
+TOLD_MM = 10.0
 #: Rows of faults of one kind that are printed.
 ROWS = 6
 
@@ -38,6 +40,8 @@ def run_on(path: Path, options: Options) -> Answer:
     from poise.kin import examine, heal
     from poise.motion.io import check_writable, read_clip, write_clip
 
+    if options.path is not None and not fix:
+        raise PoiseError("--path needs --fix", hint=f"Write poise doctor {path} --fix -o OUT")
     if (fix or rest) != (target is not None):
         asked = "--fix" if fix or not rest else "--rest-pose"
         hint = f"Write poise doctor {path} {asked} -o OUT"
@@ -57,7 +61,15 @@ def run_on(path: Path, options: Options) -> Answer:
     outcome = f"{len(found.faults)} faults"
     if target is None:
         return Answer(facts, notes=told, said=told, outcome=outcome)
-    healed = heal(clip) if fix else clip
+    free = None if options.path is None else options.path == "mend"
+    healed = heal(clip, free) if fix else clip
+    moved = _root_moved(clip, healed)
+    if moved is not None and moved["max_mm"] >= TOLD_MM:
+        again = "" if options.path else "; --path keep leaves the path, and legs alone hold the feet"
+        say(
+            f"The root moves by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and its path "
+            f"ends {moved['end_mm']:.0f} mm from where it ended{again}."
+        )
     written, said = healed, ""
     if rest:
         from poise.kin import with_rest_pose
@@ -69,7 +81,6 @@ def run_on(path: Path, options: Options) -> Answer:
     # What `poise doctor` says of the file that was written: reading may leave frames out, for example.
     again = read_clip(target)
     left = examine(again)
-    moved = _root_moved(clip, healed)
     facts["fixed"] = {"clip": str(target), "frames": again.frames, **left.to_dict()}
     facts["fixed"]["root_moved"] = moved
     facts["fixed"]["worse"] = worsened(found, left) if fix else []
@@ -81,11 +92,6 @@ def run_on(path: Path, options: Options) -> Answer:
     _compare(found, left)
     if worse := facts["fixed"]["worse"]:
         say(f"Mending made these figures worse: {', '.join(worse)}.")
-    if moved is not None and moved["max_mm"] >= 10.0:
-        say(
-            f"The root moved by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and ends "
-            f"{moved['end_mm']:.0f} mm from where it ended."
-        )
     if rate := _hidden_rate(found, left):
         say(rate)
     _written(clip, healed, found, left)

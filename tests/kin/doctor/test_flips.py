@@ -58,7 +58,7 @@ def test_clean_clips_come_back_as_they_are(clip, walk):
     for clean in (clip, walk):
         same, report = clean_clip(clean)
         assert same is clean and not report and report.sentences() == []
-        assert report.to_dict() == {"flips": (), "speeds": (), "left": (), "kept": ()}
+        assert report.to_dict() == {"flips": (), "speeds": (), "left": (), "kept": (), "noise": ()}
 
 
 @pytest.mark.parametrize("axis", AXES.values(), ids=AXES)

@@ -8,6 +8,8 @@ from typing import Any
 
 from poise.body import Anatomy, find_anatomy, generate_table
 from poise.errors import PoiseError
+from poise.kin.doctor.estimate import denoise, noise_faults, refill
+from poise.kin.doctor.faults import Fault
 from poise.kin.doctor.flips import Flip, out_of_reach, unflip
 from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds, without_rougher
 from poise.kin.rate.judge import judge_rate
@@ -21,20 +23,31 @@ class CleanReport:
 
     flips: feet and hands that were turned back. speeds: turns faster than a human joint. left: (joint,
     frames) of feet and hands that are still where none reaches, since no repair was sure enough. kept:
-    turns too fast that stay, since the body would jerk more without, see `without_rougher`.
+    turns too fast that stay, since the body would jerk more without, see `without_rougher`. noise: what
+    was taken off, and joints that were lost (`estimate.noise_faults`).
     """
 
     flips: tuple[Flip, ...] = ()
     speeds: tuple[SpeedRepair, ...] = ()
     left: tuple[tuple[str, int], ...] = ()
     kept: tuple[SpeedRepair, ...] = ()
+    noise: tuple[Fault, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.flips or self.speeds or self.left or self.kept)
+        return bool(self.flips or self.speeds or self.left or self.kept or self.noise)
 
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
-        out = []
+        out = [
+            f"The motion trembles by {f.size:.0f} mm {f.detail}; the tremble was taken off."
+            for f in self.noise
+            if f.kind == "tremble"
+        ]
+        lost = [f for f in self.noise if f.kind != "tremble"]
+        if lost:
+            parts = [f"{joint} {_frames(mine)}" for joint, mine in _by_joint(lost)]
+            more = f" and {len(parts) - 4} more joints" if len(parts) > 4 else ""
+            out.append(f"Lost for a moment, so interpolated: {', '.join(parts[:4])}{more}.")
         if self.flips:
             parts = [
                 f"{joint} {_frames(mine)} (by up to {max(f.angle_deg for f in mine):.0f} degrees)"
@@ -72,23 +85,28 @@ def _frames(found: Sequence[Any]) -> str:
 
 
 def clean_clip(
-    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True
+    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True, noise: bool = True
 ) -> tuple[Clip, CleanReport]:
     """The clip with its faults repaired, and every repair; a clean clip comes back as it is.
 
-    First feet and hands are turned back (`unflip`), then speeds that no human joint reaches are
-    interpolated (`limit_speeds`), so that what remains of the jumps goes too.
+    First joints that were lost for a moment are filled in (`refill`), then feet and hands are turned
+    back (`unflip`), speeds that no human joint reaches are interpolated (`limit_speeds`), so that what
+    remains of the jumps goes too, and at last noise is taken off (`denoise`).
 
     rougher: also where that jerks the body more, see `without_rougher`. A body with joints that cannot
-    turn so fast wants it; a file that stays a file does not.
+    turn so fast wants it; a file that stays a file does not. noise: whether noise and lost joints are
+    looked for.
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
-    turned, flips = unflip(clip, anatomy, TRUNK_SPEED)
+    found = tuple(noise_faults(clip)) if noise else ()
+    turned, flips = unflip(refill(clip) if found else clip, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     kept: tuple[SpeedRepair, ...] = ()
     if not rougher:
         slowed, speeds, kept = without_rougher(turned, slowed, speeds)
-    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept)
+    if any(f.kind == "tremble" for f in found):
+        slowed = denoise(slowed)
+    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, found)
 
 
 @dataclass(frozen=True)

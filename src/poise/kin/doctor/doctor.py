@@ -16,7 +16,7 @@ from poise.kin.doctor.drift import mend_drift
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
-from poise.kin.doctor.slides import mend_path, mend_slides
+from poise.kin.doctor.slides import drifts, mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
 from poise.kin.hinges import chain_angles
@@ -72,8 +72,8 @@ def examine(clip: Clip) -> Examination:
     if travel is not None:
         support = support_of(travelled(clip, travel.level), anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
-    faults = [*timing_faults(clip), *_joint_faults(report, clip), *jitter_faults(cleaned)]
-    faults += [*limit_faults(clip), *_read_faults(clip)]
+    faults = [*timing_faults(clip), *_joint_faults(report, clip), *report.noise]
+    faults += [*jitter_faults(cleaned), *limit_faults(clip), *_read_faults(clip)]
     if support is not None:
         faults += [
             *height_faults(clip, support),
@@ -87,13 +87,14 @@ def examine(clip: Clip) -> Examination:
     return Examination(tuple(ordered), _figures(clip, support), support is not None, travel)
 
 
-def heal(clip: Clip, path: bool = True) -> Clip:
+def heal(clip: Clip, path: bool | None = None) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
-    In this order: repeated frames, root teleports, flips and speeds (`clean_clip`), jitter, a
-    drifting height, the height above the floor, sliding feet. A step changes nothing if its faults are
-    not there. path: whether the root's path may be freed of the slip of standing feet, or legs alone
-    hold them.
+    In this order: repeated frames, root teleports, joints that were lost, flips, speeds and noise
+    (`clean_clip`), jitter in spells, a drifting height, the height above the floor, sliding feet. A step
+    changes nothing if its faults are not there. path: whether the root's path is freed of the slip that
+    standing feet have in common, or legs alone hold them; None frees it where both feet tell the same
+    drift (`drifts`).
 
     A clip in place is mended with its travel, and comes back in place, a loop as a loop.
     """
@@ -117,7 +118,7 @@ def heal(clip: Clip, path: bool = True) -> Clip:
     return best_period(in_place(healed, travel), period, overlap, first=1).replaced(cyclic=clip.cyclic)
 
 
-def _healed(clip: Clip, anatomy: Anatomy, path: bool) -> Clip:
+def _healed(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
     clip = mend_holds(clip)
     support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)
@@ -156,13 +157,15 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy, path: bool) -> Clip:
+def _locked(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
     """The clip without sliding feet. path: see `heal`."""
-    for step in (*[mend_path] * path, *[mend_slides] * SLIDE_ROUNDS):
+    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
         faults = slide_faults(clip, support) if support is not None else []
         if support is None or not faults:
             return clip
+        if step is mend_path and not (drifts(support) if path is None else path):
+            continue
         clip = step(clip, support, faults)
     return clip
 

@@ -10,12 +10,57 @@ from poise.kin.doctor.faults import Fault
 from poise.kin.doctor.support import Support, foot_slips
 from poise.kin.feet.contact import Sole
 from poise.kin.feet.hold import FIRM, Standing, hold
-from poise.kin.series import gaussian
+from poise.kin.series import find_runs, gaussian
 from poise.motion import Clip
 
 #: Deviation (s) of the Gaussian over which the common slip of standing feet is averaged, and the slip
 #: (m/s) that a rolling sole has anyway and that is left.
 COMMON_S, ROLL_SPEED = 0.4, 0.04
+#: The path drifts only where soles lie flat for so long (s) and slip with no more than this share of
+#: unsteadiness, each foot for this time (s) in all, and one foot tells this share of the other's slips.
+FLAT_S, STEADY, TOLD_S, EXPLAINED = 0.15, 0.5, 0.3, 0.6
+
+
+def drifts(support: Support) -> bool:
+    """Whether the path itself drifts: what slips is one motion of the floor, the same for both feet.
+
+    A foot tells where its whole sole is down for `FLAT_S` and slips steadily; one that rolls, pivots or
+    trembles does not. From the slips of either foot those of the other must follow, so that at least
+    `EXPLAINED` of their energy goes.
+    """
+    contact = support.contacts[1].numpy()
+    velocity = (torch.diff(support.soles[..., :2], dim=0) * support.fps).numpy()
+    told = []
+    for foot in dict.fromkeys(support.feet):
+        mine = np.flatnonzero(np.array(support.feet) == foot)
+        slip, weight = velocity[:, mine].mean(1), np.zeros(len(velocity))
+        turning = np.linalg.norm(velocity[:, mine] - slip[:, None], axis=-1).max(1)
+        for first, last in find_runs(contact[:, mine].all(-1), 0):
+            run = slice(first, last + 1)
+            mean = slip[run].mean(0)
+            off = np.linalg.norm(slip[run] - mean, axis=-1) + turning[run]
+            size = float(np.linalg.norm(mean))
+            if last - first + 1 >= FLAT_S * support.fps and np.sqrt(np.mean(off**2)) <= STEADY * size:
+                weight[run] = 1.0
+        told.append((slip, weight))
+    if len(told) != 2 or min(weight.sum() for _, weight in told) < TOLD_S * support.fps:
+        return False
+    for (slip, weight), (other, here) in (told, told[::-1]):
+        guess, near = _mean_near(other, here, support.fps)
+        both = (weight > 0) & (near > 0)
+        energy = float((slip[both] ** 2).sum())
+        left = float(((slip[both] - guess[both]) ** 2).sum())
+        if energy < ROLL_SPEED**2 * both.sum() or left > (1 - EXPLAINED) * energy or not both.any():
+            return False
+    return True
+
+
+def _mean_near(slip: np.ndarray, weight: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """The mean `(T, 2)` of `slip (T, 2)` by `weight (T)` around every frame, and the weight there."""
+    kernel = gaussian(COMMON_S * fps)
+    parts = [np.pad(x, len(kernel) // 2) for x in (weight, slip[:, 0] * weight, slip[:, 1] * weight)]
+    total, *mean = (np.convolve(x, kernel, "valid") for x in parts)
+    return np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None], total
 
 
 def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
@@ -30,10 +75,7 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     slip = np.sum([slip for _, slip, _ in feet], axis=0) / np.maximum(weight, 1.0)[:, None]
     if not weight.any() or not faults:
         return clip
-    kernel = gaussian(COMMON_S * clip.fps)
-    parts = [np.pad(x, len(kernel) // 2) for x in (weight, slip[:, 0] * weight, slip[:, 1] * weight)]
-    total, *mean = (np.convolve(x, kernel, "valid") for x in parts)
-    mean = np.stack(mean, -1) / np.maximum(total, 1e-6)[:, None]
+    mean = _mean_near(slip, weight, clip.fps)[0]
     size = np.linalg.norm(mean, axis=-1, keepdims=True)
     mean = mean * np.maximum(1.0 - ROLL_SPEED / np.maximum(size, 1e-9), 0.0)
     near = np.zeros(clip.frames - 1)

@@ -1,0 +1,287 @@
+"""Dirt of known size on clean clips, and what the repair leaves of it beside the best filters.
+
+    python benchmarks/repair.py --data FOLDER [--smoke] [--only white tone5] -o results/repair.csv
+
+FOLDER holds the development set. Every clip is dirtied so that its joints are 10 to 100 mm off on
+average, repaired by `heal`, and filtered by zero-phase Butterworth filters, Savitzky-Golay filters and
+the one-euro filter with the setting that an oracle chooses for the clip: the one that comes nearest to
+the truth. The null row does nothing. Slide is the horizontal speed of ankles and toes in frames in which
+the truth's own stand: within 5 cm of their lowest and slower than 0.1 m/s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import random
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.signal import butter, savgol_filter, sosfiltfilt
+
+from poise.errors import PoiseError
+from poise.kin import heal
+from poise.motion import Clip, read_clip, trim
+from poise.motion.edits import resample
+from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
+
+COLUMNS = ("subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command")
+#: Clips that the repair was made with, which are not measured.
+KNOWN = (
+    "dataset-1_walk_normal_001", "dataset-1_run_normal_001", "dataset-1_kick_normal_001",
+    "dataset-1_bow_normal_001", "dataset-1_punch_normal_001", "dataset-1_dash_normal_001",
+    "02_01", "02_04", "08_02", "35_17",
+)  # fmt: skip
+SIZES_MM, LONGEST_S, SHORTEST_S, CLIPS = (10.0, 25.0, 50.0, 100.0), 10.0, 1.5, 40
+CUTOFFS = (0.5, 0.7, 1, 1.3, 1.6, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 10, 12)
+WINDOWS = (5, 7, 9, 13, 17, 23, 31)
+
+Noise = tuple[np.ndarray, np.ndarray]
+"""Turns `(T, J, 3)` rad about a joint's own axes, moves `(T, 3)` m of the root, both of size one."""
+
+
+def white(rng: np.random.Generator, clip: Clip) -> Noise:
+    """Every frame by itself."""
+    return rng.standard_normal((clip.frames, len(clip.skeleton), 3)), 0.2 * rng.standard_normal(
+        (clip.frames, 3)
+    )
+
+
+def tone(hz: float) -> Callable[[np.random.Generator, Clip], Noise]:
+    """A sine of one frequency, every axis in a phase of its own."""
+
+    def made(rng: np.random.Generator, clip: Clip) -> Noise:
+        t = 2 * np.pi * hz * np.arange(clip.frames) / clip.fps
+        turn = np.sin(t[:, None, None] + rng.uniform(0, 2 * np.pi, (len(clip.skeleton), 3)))
+        return turn, 0.2 * np.sin(t[:, None] + rng.uniform(0, 2 * np.pi, 3))
+
+    return made
+
+
+def spikes(rng: np.random.Generator, clip: Clip) -> Noise:
+    """A joint in fifty leaps away for a frame."""
+    hit = rng.random((clip.frames, len(clip.skeleton), 1)) < 0.02
+    return rng.standard_normal((clip.frames, len(clip.skeleton), 3)) * hit, np.zeros((clip.frames, 3))
+
+
+def _slow(rng: np.random.Generator, clip: Clip, hz: float) -> np.ndarray:
+    """`(T)` smooth noise below a frequency, of deviation one."""
+    many = clip.frames + 200
+    path = sosfiltfilt(butter(2, hz, fs=clip.fps, output="sos"), rng.standard_normal(many))[100:-100]
+    return path / path.std()
+
+
+def wobble(rng: np.random.Generator, clip: Clip) -> Noise:
+    """The depth of one camera: the root wanders along one level direction, below 1 Hz."""
+    way = rng.uniform(0, 2 * np.pi)
+    path = _slow(rng, clip, 1.0)[:, None] * np.array([np.cos(way), np.sin(way), 0.0])
+    return np.zeros((clip.frames, len(clip.skeleton), 3)), path
+
+
+def drift(rng: np.random.Generator, clip: Clip) -> Noise:
+    """The root leaves steadily in one level direction."""
+    way, t = rng.uniform(0, 2 * np.pi), np.linspace(0, 1, clip.frames)
+    path = t[:, None] * np.array([np.cos(way), np.sin(way), 0.0])
+    return np.zeros((clip.frames, len(clip.skeleton), 3)), path
+
+
+KINDS = {
+    "white": white,
+    "tone5": tone(5.0),
+    "tone2": tone(2.0),
+    "spikes": spikes,
+    "wobble": wobble,
+    "drift": drift,
+}
+
+
+def held(clip: Clip, rng: np.random.Generator) -> Clip:
+    """Drop-outs: every joint stands still for 0.3 s, once in 5 s on average."""
+    rot, length = np.array(clip.rot), round(0.3 * clip.fps)
+    for j in range(len(clip.skeleton)):
+        for _ in range(rng.poisson(clip.seconds / 5)):
+            at = int(rng.integers(1, max(2, clip.frames - length)))
+            rot[at : at + length, j] = rot[at - 1, j]
+    return clip.replaced(rot=rot)
+
+
+def dirty(clip: Clip, kind: str, mm: float, seed: int) -> Clip:
+    """The clip with dirt of a kind, so that its joints are `mm` off; drop-outs have their own size."""
+    rng = np.random.default_rng(seed)
+    if kind == "dropouts":
+        return held(clip, rng)
+    parts = KINDS if kind == "all" else {kind: KINDS[kind]}
+    noise = [make(rng, clip) for make in parts.values()]
+    # In a mixture all kinds are alike in size.
+    if kind == "all":
+        noise = [_sized(clip, one, 20.0) for one in noise]
+    turn, move = (np.sum([one[k] for one in noise], axis=0) for k in (0, 1))
+    turn, move = _sized(clip, (turn, move), mm)
+    out = _with(clip, (turn, move))
+    return held(out, rng) if kind == "all" else out
+
+
+def _with(clip: Clip, noise: Noise) -> Clip:
+    rot = quat_mul(torch.tensor(clip.rot), rotvec_to_quat(torch.tensor(noise[0])))
+    return clip.replaced(rot=unwrap_quats(rot).numpy(), root_pos=clip.root_pos + noise[1])
+
+
+def _sized(clip: Clip, noise: Noise, mm: float) -> Noise:
+    size = 0.02
+    for _ in range(6):
+        size = min(
+            size * mm / max(off_mm(_with(clip, (size * noise[0], size * noise[1])), clip), 1e-6), 1.5
+        )
+    return size * noise[0], size * noise[1]
+
+
+def off_mm(a: Clip, b: Clip) -> float:
+    """mm between joints on average."""
+    return 1e3 * float(np.linalg.norm(a.positions() - b.positions(), axis=-1).mean())
+
+
+def filters(fps: float, frames: int) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
+    """Every filter that the oracle may choose."""
+    for hz in (c for c in CUTOFFS if c < 0.49 * fps):
+        sos = butter(4, hz, fs=fps, output="sos")
+        yield (
+            "butterworth",
+            lambda x, sos=sos: sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * fps))),
+        )
+    for window in (w for w in WINDOWS if w <= frames):
+        yield "savitzky-golay", lambda x, w=window: savgol_filter(x, w, 3, axis=0)
+    for hz in (0.5, 1.0, 2.0, 4.0, 8.0):
+        for beta in (0.0, 0.5, 2.0):
+            yield "one-euro", lambda x, hz=hz, beta=beta: one_euro(x, fps, hz, beta)
+
+
+def one_euro(x: np.ndarray, fps: float, hz: float, beta: float) -> np.ndarray:
+    """Casiez et al. 2012: a first-order low-pass whose cut-off grows with speed; it delays."""
+
+    def share(cutoff: np.ndarray | float) -> np.ndarray | float:
+        return 1.0 / (1.0 + fps / (2 * np.pi * cutoff))
+
+    out, speed = x.copy(), np.zeros_like(x[0])
+    for k in range(1, len(x)):
+        speed += share(1.0) * ((x[k] - x[k - 1]) * fps - speed)
+        a = share(hz + beta * np.abs(speed))
+        out[k] = a * x[k] + (1 - a) * out[k - 1]
+    return out
+
+
+def filtered(clip: Clip, one: Callable[[np.ndarray], np.ndarray]) -> Clip:
+    """The clip with the filter on the components of its quaternions and on its root."""
+    rot = one(np.array(clip.rot).reshape(clip.frames, -1)).reshape(clip.rot.shape)
+    rot = rot / np.maximum(np.linalg.norm(rot, axis=-1, keepdims=True), 1e-9)
+    return clip.replaced(rot=rot, root_pos=one(np.array(clip.root_pos)))
+
+
+def measured(clip: Clip, truth: Clip) -> dict[str, float]:
+    """What is left: distance, end of the path, slide of feet that stand in truth, share of its jerk."""
+    feet = [j for j, n in enumerate(truth.skeleton.names) if "foot" in n.lower() or "toe" in n.lower()]
+    there, here = truth.positions(), clip.positions()
+    speed = np.linalg.norm(np.diff(there[:, feet], axis=0), axis=-1) * truth.fps
+    stands = (there[1:, feet, 2] < there[:, feet, 2].min(0) + 0.05) & (speed < 0.1)
+
+    def slide(p: np.ndarray) -> float:
+        step = np.linalg.norm(np.diff(p[:, feet, :2], axis=0), axis=-1) * truth.fps
+        return 1e3 * float(step[stands].mean()) if stands.any() else float("nan")
+
+    jerk = [float(np.linalg.norm(np.diff(p, n=3, axis=0), axis=-1).mean()) for p in (here, there)]
+    return {
+        "distance_mm": 1e3 * float(np.linalg.norm(here - there, axis=-1).mean()),
+        "end_mm": 1e3 * float(np.linalg.norm(clip.root_pos[-1] - truth.root_pos[-1])),
+        "slide_more_mm_per_s": slide(here) - slide(there),
+        "jerk_ratio": jerk[0] / max(jerk[1], 1e-9),
+    }
+
+
+def clips_of(data: Path, count: int) -> Iterator[Clip]:
+    """Clips that nobody tuned on, of Bandai and CMU in turns, drawn by a seed."""
+    sets = [
+        sorted((data / "other/bandai_bvh").rglob("*.bvh")),
+        sorted((data / "cmu_amc").rglob("*.amc")),
+    ]
+    for files in sets:
+        random.Random(64).shuffle(files)
+    drawn = 0
+    for path in (p for pair in zip(*sets, strict=False) for p in pair):
+        if path.stem in KNOWN:
+            continue
+        try:
+            clip = read_clip(path)
+        except PoiseError:
+            continue
+        if clip.seconds < SHORTEST_S:
+            continue
+        clip = trim(clip, 0, min(clip.frames, int(LONGEST_S * clip.fps)))
+        yield resample(clip, 30.0) if clip.fps > 60 else clip
+        drawn += 1
+        if drawn == count:
+            return
+
+
+def main() -> None:
+    """Measures and writes the rows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", default=[*KINDS, "dropouts", "all"])
+    parser.add_argument("--sizes", nargs="*", type=float, default=SIZES_MM)
+    parser.add_argument("--clips", type=int, default=CLIPS)
+    parser.add_argument("--smoke", action="store_true", help="three clips, one size")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    if options.smoke:
+        options.clips, options.sizes = 3, (25.0,)
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
+    clips = list(clips_of(options.data, options.clips))
+    rows = []
+    for kind in options.only:
+        for mm in options.sizes if kind != "dropouts" else (0.0,):
+            left: dict[str, list[dict[str, float]]] = {"null": [], "best filter": [], "repair": []}
+            for k, clip in enumerate(clips):
+                broken = dirty(clip, kind, mm, k)
+                fixed = heal(broken)
+                if fixed.frames != clip.frames:
+                    continue
+                tried = [filtered(broken, one) for _, one in filters(clip.fps, clip.frames)]
+                best = min(tried, key=lambda c: off_mm(c, clip))
+                for name, made in zip(left, (broken, best, fixed), strict=True):
+                    left[name].append(measured(made, clip))
+            subject = f"{kind} {mm:g} mm" if mm else kind
+            ratio = [
+                a["distance_mm"] / b["distance_mm"]
+                for a, b in zip(left["repair"], left["best filter"], strict=True)
+            ]
+            told = {f"{name}: {m}": [r[m] for r in made] for name, made in left.items() for m in made[0]}
+            told |= {"distance over best filter's": ratio}
+            told |= {"share above 1.25": [float(np.mean([r > 1.25 for r in ratio]))]}
+            for metric, values in told.items():
+                low, middle, high = np.nanquantile(values, (0.25, 0.5, 0.75))
+                spread = f"{low:.3g} to {high:.3g}"
+                rows.append((subject, metric, f"{middle:.4g}", spread, len(ratio), 1, "", commit))
+            print(
+                subject,
+                f"{np.median(ratio):.2f}",
+                f"{np.mean([r > 1.25 for r in ratio]):.2f}",
+                file=sys.stderr,
+            )
+    command = "python benchmarks/repair.py --data FOLDER -o results/repair.csv"
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with options.out.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows((*row, command) for row in rows)
+
+
+if __name__ == "__main__":
+    main()

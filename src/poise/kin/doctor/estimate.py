@@ -1,0 +1,328 @@
+"""A motion estimated from a trembling one: every channel smoothed as much as it trembles, no more.
+
+A channel is taken as y = x + n + e: motion x, a tremble n at a frequency, white noise e. Their sizes are
+measured (`noise`); n goes first,
+
+    min over x, n   sum |y - x - n|^2 / s^2 + lambda |x'''|^2
+                        + |n_t+1 - 2 r cos(w) n_t + r^2 n_t-1|^2 / q,
+
+then x is the mean of smoothing splines of many stiffnesses lambda, each weighted in every frame by how
+near to the truth Stein's unbiased estimate says it is there:
+
+    risk = |y - S y|^2 / s^2 + 2 tr(S) / T,
+
+the mean over a joint's channels, around the frame and over the clip.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
+from scipy.ndimage import gaussian_filter1d
+
+from poise.kin.doctor.faults import Fault
+from poise.kin.doctor.noise import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
+from poise.kin.series import find_runs
+from poise.motion import Clip, Skeleton
+from poise.motion.points.clean import drop_spikes
+from poise.spatial import (
+    normalize,
+    quat_between,
+    quat_conj,
+    quat_distance,
+    quat_mul,
+    quat_to_rotvec,
+    rotvec_to_quat,
+    unwrap_quats,
+)
+
+#: Frequencies (Hz) at which the gain of the splines is one half.
+CUTOFFS = tuple(np.geomspace(0.35, 14.0, 20))
+#: Deviation (s) of the surroundings in which a stiffness is judged, the share of the whole clip in that
+#: judgement, and the deviation (s) over which its weight changes.
+AROUND_S, WHOLE, CHANGE_S = 0.3, 0.7, 0.1
+#: Width (Hz) of a tremble: the rate at which its size and phase wander.
+WANDER_HZ = 0.15
+#: Length (s) of the pieces that are told and smoothed by themselves, and how long they overlap.
+PIECE_S, OVERLAP_S = 30.0, 2.0
+#: A joint that stands still for so long (s) and leaps on by so many of its steps, by this angle (rad) at
+#: least, was held; how fast (Hz) the curve through what is missing may turn.
+HELD_S, LEAPS, LEAP_RAD, FILL_HZ = 0.08, 3.0, 0.03, 6.0
+#: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
+#: toes snap by nearly as much in kicks and dashes.
+SPIKE_RAD, SPIKE_M = 0.35, 0.06
+_THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
+
+
+def refill(clip: Clip) -> Clip:
+    """The clip with every joint that was lost (`find_lost`) on the smoothest curve through its other
+    frames; one that lost none comes back as it is."""
+    rot = unwrap_quats(torch.tensor(clip.rot)).numpy()
+    lost = np.zeros(rot.shape[:2], dtype=bool)
+    for _, j, a, b in find_lost(clip, rot):
+        lost[a : b + 1, j] = True
+    if not lost.any():
+        return clip
+    for j in np.flatnonzero(lost.any(0)):
+        rot[:, j] = filled(rot[:, j], ~lost[:, j], clip.fps)
+    return clip.replaced(rot=rot / np.linalg.norm(rot, axis=-1, keepdims=True))
+
+
+def denoise(clip: Clip) -> Clip:
+    """The clip without the noise that it has; one that does not tremble comes back as it is.
+
+    A long clip is told and smoothed by pieces of `PIECE_S`, which fade into each other.
+    """
+    size, overlap = round(PIECE_S * clip.fps), round(OVERLAP_S * clip.fps)
+    count = max(1, math.ceil((clip.frames - overlap) / (size - overlap)))
+    edges = np.linspace(0, clip.frames - overlap, count + 1).round().astype(int)
+    root, rot = np.array(clip.root_pos), unwrap_quats(torch.tensor(clip.rot)).numpy()
+    positions, world = clip.positions(), unwrap_quats(torch.tensor(clip.world()[1])).numpy()
+    out_root, out_rot, changed = root.copy(), rot.copy(), False
+    for first, stop in zip(edges[:-1], edges[1:] + overlap, strict=True):
+        here = slice(first, min(stop, clip.frames))
+        found = _piece(clip, root[here], rot[here], world[here], positions[here])
+        if found is None:
+            continue
+        changed = True
+        share = np.ones(here.stop - here.start)
+        ramp = (np.arange(overlap) + 1) / (overlap + 1)
+        if first > 0:
+            share[:overlap] = ramp[: len(share)]
+        # Where the next piece begins it takes over, be it smoothed or not.
+        if here.stop < clip.frames:
+            share[-overlap:] *= ramp[::-1]
+        out_root[here] += share[:, None] * (found[0] - root[here])
+        turn = quat_to_rotvec(quat_mul(quat_conj(torch.tensor(rot[here])), torch.tensor(found[1])))
+        step = rotvec_to_quat(torch.tensor(share)[:, None, None] * turn)
+        out_rot[here] = quat_mul(torch.tensor(out_rot[here]), step).numpy()
+    if not changed:
+        return clip
+    out_rot /= np.linalg.norm(out_rot, axis=-1, keepdims=True)
+    return clip.replaced(root_pos=out_root, rot=unwrap_quats(torch.tensor(out_rot)).numpy())
+
+
+def noise_faults(clip: Clip) -> list[Fault]:
+    """What `denoise` takes off: trembles of the body in mm (rms over joints), spikes and held joints in
+    degrees."""
+    if clip.frames < SHORTEST:
+        return []
+    rot, last = unwrap_quats(torch.tensor(clip.rot)).numpy(), clip.frames - 1
+    whole = refill(clip)
+    turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
+    out = [
+        Fault(kind, clip.skeleton.names[j], a, b, float(turned[a : b + 1, j].max()))
+        for kind, j, a, b in find_lost(clip, rot)
+    ]
+    positions, calm = whole.positions(), unwrap_quats(torch.tensor(whole.rot)).numpy()
+    groups = np.repeat(np.arange(len(clip.skeleton)), 3)
+    hz = _pose_spectrum(np.array(clip.root_pos), calm, clip.fps).tremble()
+    if hz is not None:
+        places = Spectrum.of(positions.reshape(clip.frames, -1), clip.fps, groups)
+        size = 1e3 * math.sqrt(float(places.tone(hz)[0].mean()))
+        out.append(Fault("tremble", "", 0, last, size, f"at {hz:.1f} Hz"))
+    elif (white := white_mm(positions, clip.fps)) >= WHITE_MM:
+        out.append(Fault("tremble", "", 0, last, white, "from frame to frame"))
+    return out
+
+
+def _piece(
+    clip: Clip, root: np.ndarray, rot: np.ndarray, world: np.ndarray, positions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Root `(T, 3)` and rotations `(T, J, 4)` of a piece without its noise, None where it has none."""
+    tones, calm_root, calm = [], root, {"own": rot, "world": world}
+    if len(root) < SHORTEST:
+        return None
+    for _ in range(LINES):
+        hz = _pose_spectrum(calm_root, calm["own"], clip.fps).tremble()
+        if hz is None:
+            break
+        tones.append(hz)
+        only = np.zeros(3, dtype=int)
+        calm_root = calm_root - _tremble(calm_root, only, Spectrum.of(calm_root, clip.fps, only), hz)[0]
+        calm = {frame: _still(quats, clip.fps, hz) for frame, quats in calm.items()}
+    if not tones and white_mm(positions, clip.fps) < WHITE_MM:
+        return None
+    # In a captured chain the noise of one joint undoes that of the next: it is the world's then.
+    floors = {f: _pose_spectrum(calm_root, q, clip.fps).floor()[1:-1].sum() for f, q in calm.items()}
+    taken = {f: ((calm[f] - q) ** 2).sum() for f, q in (("own", rot), ("world", world))}
+    frames, joints = rot.shape[:2]
+    own = floors["own"] * frames + taken["own"] <= floors["world"] * frames + taken["world"]
+    quats = calm["own" if own else "world"]
+    y = np.concatenate((quats.reshape(frames, -1), calm_root), 1)
+    groups = _groups(joints)
+    x = _smooth(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
+    out = torch.tensor(x[:, : 4 * joints].reshape(quats.shape))
+    out = normalize(out)
+    if not own:
+        local = [out[:, 0]]
+        local += [quat_between(out[:, p], out[:, j]) for j, p in enumerate(clip.skeleton.parents) if j]
+        out = torch.stack(local, 1)
+    return x[:, 4 * joints :], out.numpy()
+
+
+def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
+    """(kind, joint, first, last frame) where joints were not seen as they were.
+
+    A "spike" lasts a frame or two and turns the joint by `SPIKE_RAD` or more; a joint is "held" that
+    stands still and then leaps to where it has got. rot: `(T, J, 4)`, continuous in sign.
+    """
+    out: list[tuple[str, int, int, int]] = []
+    spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
+    for j in np.flatnonzero(spikes.any(0)):
+        back = filled(rot[:, j], ~spikes[:, j], clip.fps)
+        turned = 2.0 * np.linalg.norm(back - rot[:, j], axis=-1)
+        least = max(SPIKE_RAD, SPIKE_M / max(lever[j], 1e-3))
+        runs = find_runs(spikes[:, j], 0)
+        out += [("spike", int(j), a, b) for a, b in runs if turned[a : b + 1].max() >= least]
+    still = (rot[1:] == rot[:-1]).all(-1)
+    step, reach = np.linalg.norm(np.diff(rot, axis=0), axis=-1), max(3, round(0.2 * clip.fps))
+    for j in np.flatnonzero(still.any(0) & ~still.all(0)):
+        for first, last in find_runs(still[:, j], 0):
+            if (last - first + 1) < HELD_S * clip.fps or last + 1 >= len(step):
+                continue
+            near = np.concatenate((step[max(first - reach, 0) : first, j], step[last + 2 :, j][:reach]))
+            near = near[near > 0]
+            if len(near) and step[last + 1, j] > max(LEAPS * np.median(near), 0.5 * LEAP_RAD):
+                out.append(("held", int(j), first + 1, last + 1))
+    return out
+
+
+def _reach(skeleton: Skeleton) -> np.ndarray:
+    """`(J)` m, how far the farthest tip hangs from each joint along its bones."""
+    out, length = np.zeros(len(skeleton)), np.linalg.norm(skeleton.offsets, axis=-1)
+    for j, tip in skeleton.tips:
+        out[j] = max(out[j], float(np.linalg.norm(tip)))
+    for j in range(len(skeleton) - 1, 0, -1):
+        parent = skeleton.parents[j]
+        out[parent] = max(out[parent], out[j] + length[j])
+    return out
+
+
+def filled(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
+    """`y (T, C)` with the frames that are not `known (T)` on the smoothest curve through the rest."""
+    band = np.zeros((4, len(y)))
+    band[0] = known + 1e-9
+    _add(band, _THIRD, float((2 * np.sin(np.pi * FILL_HZ / fps)) ** -6), len(y), 1, 0)
+    curve = solveh_banded(band, y * known[:, None], lower=True)
+    return np.where(known[:, None], y, curve)
+
+
+def _groups(joints: int) -> np.ndarray:
+    return np.concatenate((np.repeat(np.arange(joints), 4), [joints] * 3))
+
+
+def _pose_spectrum(root: np.ndarray, rot: np.ndarray, fps: float) -> Spectrum:
+    y = np.concatenate((rot.reshape(len(rot), -1), root), 1)
+    return Spectrum.of(y, fps, _groups(rot.shape[1]))
+
+
+def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
+    """The rotations `(T, J, 4)` without a tremble at `hz`.
+
+    A joint trembles about axes of its own or of its parent, where its tremble is pure; in the components
+    of a quaternion the joint's turning modulates it. So it is taken off the small turn between a slow
+    motion and the joint, in the frame in which the tone stands out most.
+    """
+    frames, joints = rot.shape[:2]
+    stiff = float((2 * np.sin(np.pi * hz / 3 / fps)) ** -6)
+    slow = cho_solve_banded((_spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
+    base, quat = torch.tensor(slow / np.linalg.norm(slow, axis=-1, keepdims=True)), torch.tensor(rot)
+    groups = np.repeat(np.arange(joints), 3)
+    ways = (
+        (lambda x: quat_mul(quat_conj(base), x), lambda d: quat_mul(base, d)),
+        (lambda x: quat_mul(x, quat_conj(base)), lambda d: quat_mul(d, base)),
+    )
+    tries = []
+    for apart, together in ways:
+        turn = quat_to_rotvec(apart(quat)).reshape(frames, -1).numpy()
+        found, clear = _tremble(turn, groups, Spectrum.of(turn, fps, groups), hz)
+        left = torch.tensor((turn - found).reshape(frames, joints, 3))
+        tries.append((clear, together(rotvec_to_quat(left))))
+    own = torch.tensor(tries[0][0] >= tries[1][0])
+    return unwrap_quats(torch.where(own[:, None], tries[0][1], tries[1][1])).numpy()
+
+
+def _tremble(
+    y: np.ndarray, groups: np.ndarray, found: Spectrum, hz: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it."""
+    out = np.zeros_like(y)
+    size, beside = found.tone(hz)
+    floor = found.floor()
+    for g in np.unique(groups):
+        if size[g] <= 0.0:
+            continue
+        mine = np.flatnonzero(groups == g)
+        white = max(floor[g], 0.02 * beside[g], 1e-4 * size[g])
+        motion = max(beside[g] - white, 0.1 * white) / white
+        # The spline's power at hz is that of the motion there: 1 / (lambda |2 sin(w / 2)|^6).
+        stiff = 1.0 / (motion * (2 * np.sin(np.pi * hz / found.fps)) ** 6)
+        unit = np.sqrt(white / len(mine))
+        out[:, mine] = unit * _split(y[:, mine] / unit, found.fps, hz, stiff, size[g] / white)
+    return out, size / np.maximum(beside, 1e-300)
+
+
+def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> np.ndarray:
+    """n of the module's text, for white noise of size 1 and a tremble of variance `size`."""
+    frames = len(y)
+    wander = np.exp(-np.pi * WANDER_HZ / fps)
+    step = np.array([wander**2, -2 * wander * np.cos(2 * np.pi * hz / fps), 1.0])
+    # The variance of the process for steps of variance 1.
+    own = (1 + step[0]) / ((1 - step[0]) * ((1 + step[0]) ** 2 - step[1] ** 2))
+    band = np.zeros((8, 2 * frames))
+    # Unknowns x_0, n_0, x_1, n_1, ...
+    band[0] += 1.0
+    band[1, 0::2] += 1.0
+    _add(band, _THIRD, stiff, frames, 2, 0)
+    _add(band, step, own / size, frames, 2, 1)
+    band[0] += 1e-9
+    return solveh_banded(band, np.repeat(y, 2, axis=0), lower=True)[1::2]
+
+
+def _add(band: np.ndarray, row: np.ndarray, weight: float, frames: int, stride: int, first: int) -> None:
+    """Adds `weight |row * z|^2` at every frame to normal equations in lower banded form."""
+    count = frames - len(row) + 1
+    for i in range(len(row)):
+        for j in range(i + 1):
+            at = stride * (np.arange(max(count, 0)) + j) + first
+            band[stride * (i - j), at] += weight * row[i] * row[j]
+
+
+@lru_cache(maxsize=64)
+def _spline(frames: int, stiff: float) -> np.ndarray:
+    band = np.zeros((4, frames))
+    band[0] = 1.0
+    _add(band, _THIRD, stiff, frames, 1, 0)
+    return cholesky_banded(band, lower=True)
+
+
+def _smooth(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """The channels without white noise of variance `floor (G)`, the sum over a group's channels."""
+    curves, traces = [y], [1.0]
+    turn = np.linspace(0.0, np.pi, 400)
+    for cutoff in (c for c in CUTOFFS if c < 0.45 * fps):
+        stiff = float((2 * np.sin(np.pi * cutoff / fps)) ** -6)
+        curves.append(cho_solve_banded((_spline(len(y), stiff), True), y))
+        traces.append(float(np.mean(1.0 / (1.0 + stiff * (2 * np.sin(turn / 2)) ** 6))))
+    trace, out = np.array(traces), np.empty_like(y)
+    for g in np.unique(groups):
+        mine = np.flatnonzero(groups == g)
+        white = floor[g] / len(mine)
+        if white <= 0.0:
+            out[:, mine] = y[:, mine]
+            continue
+        # One stack a group: that of all would be many times the clip.
+        stack = np.stack([c[:, mine] for c in curves])
+        off = ((stack - stack[:1]) ** 2).mean(-1) / white
+        risk = (1 - WHOLE) * gaussian_filter1d(off, AROUND_S * fps, axis=1, mode="reflect")
+        risk += WHOLE * off.mean(1, keepdims=True) + 2 * trace[:, None]
+        samples = 2.5 * AROUND_S * fps * len(mine)
+        share = np.exp(-samples * (risk - risk.min(0)))
+        share = gaussian_filter1d(share / share.sum(0), CHANGE_S * fps, axis=1, mode="nearest")
+        out[:, mine] = (share[..., None] * stack).sum(0)
+    return out
