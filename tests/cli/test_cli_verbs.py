@@ -135,7 +135,7 @@ def test_what_tyro_refuses_becomes_one_sentence() -> None:
     assert said(*given, "--minuts", "3") == near
     assert said(*given, "--xyzzy") == "there is no option --xyzzy"
     assert said(*given, "b.bvh") == "b.bvh is one argument too many"
-    assert said(*given, "--up", "Q") == "--up cannot be 'Q'. Known: Y, Z"
+    assert said(*given, "--up", "Q") == "--up cannot be 'Q'. Known: -X, -Y, -Z, X, Y, Z"
     assert said(*given, "--fps", "soon") == "--fps needs a number, got 'soon'"
     assert said(*given, "--envs", "1.5") == "--envs needs a whole number, got '1.5'"
     assert said(*given, "--fps") == "--fps needs a value"

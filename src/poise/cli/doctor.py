@@ -51,9 +51,9 @@ class Options:
     """A motion file or a folder of them: sliding, floating, penetration, jumps, flips, jitter, bones."""
     fix: Flag = False
     """Mend what kinematics can mend, and write the result to OUT."""
-    path: Literal["keep", "mend"] | None = None
-    """With --fix: keep the root's path, or take off it what standing feet slip in common. By default it
-    is mended where both feet tell the same drift."""
+    path: Literal["auto", "keep", "mend"] = "auto"
+    """With --fix: keep leaves the root's path; mend takes off it what standing feet slip in common; auto
+    does so where both feet tell the same drift."""
     rest_pose: Flag = False
     """Write it with a rest pose that other tools understand: a T-pose with all rotations at zero. The
     motion stays; without --fix nothing else is changed."""

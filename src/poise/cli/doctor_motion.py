@@ -40,7 +40,7 @@ def run_on(path: Path, options: Options) -> Answer:
     from poise.kin import examine, heal
     from poise.motion.io import check_writable, read_clip, write_clip
 
-    if options.path is not None and not fix:
+    if options.path != "auto" and not fix:
         raise PoiseError("--path needs --fix", hint=f"Write poise doctor {path} --fix -o OUT")
     if (fix or rest) != (target is not None):
         asked = "--fix" if fix or not rest else "--rest-pose"
@@ -61,11 +61,15 @@ def run_on(path: Path, options: Options) -> Answer:
     outcome = f"{len(found.faults)} faults"
     if target is None:
         return Answer(facts, notes=told, said=told, outcome=outcome)
-    free = None if options.path is None else options.path == "mend"
+    free = {"auto": None, "keep": False, "mend": True}[options.path]
     healed = heal(clip, free) if fix else clip
     moved = _root_moved(clip, healed)
     if moved is not None and moved["max_mm"] >= TOLD_MM:
-        again = "" if options.path else "; --path keep leaves the path, and legs alone hold the feet"
+        again = (
+            ""
+            if options.path != "auto"
+            else "; --path keep leaves the path, and legs alone hold the feet"
+        )
         say(
             f"The root moves by up to {moved['max_mm']:.0f} mm (frame {moved['frame']}), and its path "
             f"ends {moved['end_mm']:.0f} mm from where it ended{again}."

@@ -21,8 +21,6 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
-from scipy.ndimage import gaussian_filter1d
 
 from poise.kin.doctor.faults import Fault
 from poise.kin.doctor.noise import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
@@ -207,6 +205,8 @@ def filled(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
     """`y (T, C)` with the frames that are not `known (T)` on the smoothest curve through the rest."""
     band = np.zeros((4, len(y)))
     band[0] = known + 1e-9
+    from scipy.linalg import solveh_banded
+
     _add(band, _THIRD, float((2 * np.sin(np.pi * FILL_HZ / fps)) ** -6), len(y), 1, 0)
     curve = solveh_banded(band, y * known[:, None], lower=True)
     return np.where(known[:, None], y, curve)
@@ -228,6 +228,9 @@ def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     of a quaternion the joint's turning modulates it. So it is taken off the small turn between a slow
     motion and the joint, in the frame in which the tone stands out most.
     """
+    # SciPy takes 0.3 s to load, which clean clips need not wait for.
+    from scipy.linalg import cho_solve_banded
+
     frames, joints = rot.shape[:2]
     stiff = float((2 * np.sin(np.pi * hz / 3 / fps)) ** -6)
     slow = cho_solve_banded((_spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
@@ -281,6 +284,8 @@ def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> n
     _add(band, _THIRD, stiff, frames, 2, 0)
     _add(band, step, own / size, frames, 2, 1)
     band[0] += 1e-9
+    from scipy.linalg import solveh_banded
+
     return solveh_banded(band, np.repeat(y, 2, axis=0), lower=True)[1::2]
 
 
@@ -295,6 +300,8 @@ def _add(band: np.ndarray, row: np.ndarray, weight: float, frames: int, stride: 
 
 @lru_cache(maxsize=64)
 def _spline(frames: int, stiff: float) -> np.ndarray:
+    from scipy.linalg import cholesky_banded
+
     band = np.zeros((4, frames))
     band[0] = 1.0
     _add(band, _THIRD, stiff, frames, 1, 0)
@@ -303,6 +310,9 @@ def _spline(frames: int, stiff: float) -> np.ndarray:
 
 def _smooth(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -> np.ndarray:
     """The channels without white noise of variance `floor (G)`, the sum over a group's channels."""
+    from scipy.linalg import cho_solve_banded
+    from scipy.ndimage import gaussian_filter1d
+
     curves, traces = [y], [1.0]
     turn = np.linspace(0.0, np.pi, 400)
     for cutoff in (c for c in CUTOFFS if c < 0.45 * fps):
