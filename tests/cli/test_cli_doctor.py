@@ -108,7 +108,7 @@ def test_fix_shows_before_and_after(broken: Path, tmp_path: Path, capsys) -> Non
     row = next(line for line in text.splitlines() if "teleport, spells" in line)
     assert [c.strip() for c in row.split("│")[3:5]] == ["1", "0"]
     assert "0 after" in text.splitlines()[-2]
-    assert "The root moved by up to 505 mm (frame 46)" in text
+    assert "The root moves by up to 505 mm (frame 46)" in text
 
 
 def test_what_mending_made_worse_is_named(broken: Path, tmp_path: Path, capsys) -> None:
@@ -163,8 +163,11 @@ def test_what_is_stated_is_no_guess(capsys) -> None:
     facts = json.loads(said(capsys, *argv))["result"]
     why = {g["what"]: g["evidence"] for g in facts["guesses"]}
     assert (why["up"], why["unit"]) == ("Stated with --up", "Stated with --unit")
-    # Played twice as fast, a walk does not fly, so that gravity has no say.
-    assert why["fps"] == "Stated with --fps"
+    # Played twice as fast, a walk is out of balance: the rate is obeyed, and doubted.
+    assert why["fps"].startswith("Stated with --fps; but in ")
+    assert "likely it has 30 frames per second" in why["fps"]
+    facts = json.loads(said(capsys, "info", WALK, "--fps", "30", "--json"))["result"]
+    assert {g["what"]: g["evidence"] for g in facts["guesses"]}["fps"] == "Stated with --fps"
 
 
 def test_the_floor_can_be_stated_or_taken_from_the_soles(broken: Path, capsys) -> None:

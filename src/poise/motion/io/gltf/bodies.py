@@ -23,8 +23,8 @@ def choose_joints(
 ) -> list[int]:
     """The nodes that become joints, parents first.
 
-    The joints of the body whose skins the animation moves most, see `_bodies`, and what is animated
-    below them; without a skin, the animated nodes and what hangs on them. Nodes between joints and
+    They are the joints of the body with the skins that the animation moves most, see `_bodies`, and
+    what is animated below them; without a skin, the animated nodes and what hangs on them. Nodes between joints and
     moving nodes above them belong to the joints. Of several people one is taken, and the others are
     named. Without any animation it is the largest body, or else the largest tree.
 

@@ -144,7 +144,7 @@ def _skeletons(
 ) -> tuple[_Found, list[_Found]]:
     """The skeleton to read, and the others that are animated too.
 
-    It is the first whose joints move, or else the first that a transform above it moves, or else one
+    It is the first with joints that move, or else the first that a transform above it moves, or else one
     that stands in a pose of its animation.
     """
     UsdSkel, UsdGeom = pxr.UsdSkel, pxr.UsdGeom
