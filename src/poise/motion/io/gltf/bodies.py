@@ -24,9 +24,9 @@ def choose_joints(
     """The nodes that become joints, parents first.
 
     They are the joints of the body with the skins that the animation moves most, see `_bodies`, and
-    what is animated below them; without a skin, the animated nodes and what hangs on them. Nodes between joints and
-    moving nodes above them belong to the joints. Of several people one is taken, and the others are
-    named. Without any animation it is the largest body, or else the largest tree.
+    what is animated below them; without a skin, the animated nodes and what hangs on them. Nodes between
+    joints and moving nodes above them belong to the joints. Of several people one is taken, and the
+    others are named. Without any animation it is the largest body, or else the largest tree.
 
     Args:
         targeted: nodes with translation or rotation channels.
