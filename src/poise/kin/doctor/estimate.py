@@ -266,7 +266,7 @@ def _tremble(
         # The spline's power at hz is that of the motion there: 1 / (lambda |2 sin(w / 2)|^6).
         stiff = 1.0 / (motion * (2 * np.sin(np.pi * hz / found.fps)) ** 6)
         unit = np.sqrt(white / len(mine))
-        out[:, mine] = unit * _split(y[:, mine] / unit, found.fps, hz, stiff, size[g] / white)
+        out[:, mine] = unit * _split(y[:, mine] / unit, found.fps, hz, stiff, float(size[g] / white))
     return out, size / np.maximum(beside, 1e-300)
 
 

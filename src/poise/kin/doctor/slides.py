@@ -35,7 +35,7 @@ def drifts(support: Support) -> bool:
         mine = np.flatnonzero(np.array(support.feet) == foot)
         slip, weight = velocity[:, mine].mean(1), np.zeros(len(velocity))
         turning = np.linalg.norm(velocity[:, mine] - slip[:, None], axis=-1).max(1)
-        for first, last in find_runs(contact[:, mine].all(-1), 0):
+        for first, last in find_runs(np.all(contact[:, mine], axis=-1), 0):
             run = slice(first, last + 1)
             mean = slip[run].mean(0)
             off = np.linalg.norm(slip[run] - mean, axis=-1) + turning[run]
