@@ -48,7 +48,7 @@ class Options:
     """Say what is wrong with a motion, and mend it; without a clip, what works on this machine."""
 
     clip: Annotated[Positional[Path | None], arg(metavar="[CLIP]", help_behavior_hint="")] = None
-    """A motion file or a folder of them: sliding, floating, penetration, jumps, flips, jitter, bones."""
+    """A motion file or a folder of them: trembling, sliding, floating, sinking, jumps, flips, bones."""
     fix: Flag = False
     """Mend what kinematics can mend, and write the result to OUT."""
     path: Literal["auto", "keep", "mend"] = "auto"

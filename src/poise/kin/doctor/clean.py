@@ -39,7 +39,7 @@ class CleanReport:
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
         out = [
-            f"The motion trembles by {f.size:.0f} mm {f.detail}; the tremble was taken off."
+            f"The motion trembles by {f.size:.0f} mm {f.detail}: the tremble is taken off."
             for f in self.noise
             if f.kind == "tremble"
         ]
@@ -47,7 +47,8 @@ class CleanReport:
         if lost:
             parts = [f"{joint} {_frames(mine)}" for joint, mine in _by_joint(lost)]
             more = f" and {len(parts) - 4} more joints" if len(parts) > 4 else ""
-            out.append(f"Lost for a moment, so interpolated: {', '.join(parts[:4])}{more}.")
+            told = ", ".join(parts[:4])
+            out.append(f"Joints that were lost for a moment are interpolated: {told}{more}.")
         if self.flips:
             parts = [
                 f"{joint} {_frames(mine)} (by up to {max(f.angle_deg for f in mine):.0f} degrees)"
