@@ -59,9 +59,12 @@ class Migration:
             holder, name = _holder(out, old)
             if holder is not None and name in holder:
                 value = holder.pop(name)
-                target, name = _holder(out, new)
-                if target is not None:
-                    target[name] = value
+                *parts, last = new.split(".")
+                target: Any = out
+                for part in parts:
+                    target = target.setdefault(part, {}) if isinstance(target, dict) else None
+                if isinstance(target, dict):
+                    target[last] = value
         for name, known in self.values.items():
             holder, last = _holder(out, name)
             if holder is not None and isinstance(holder.get(last), str):

@@ -112,7 +112,7 @@ OPTIONS = (
     (("--set", "nobody.kp=3"), "nobody"),
     (("--set", "right_ankle.taste=3"), "torque"),
     (("--fps", "0"), "--fps"),
-    (("--up", "X"), "Y, Z"),
+    (("--up", "W"), "X, Y, Z"),
     (("--minuts", "3"), "Did you mean --minutes? See poise imitate --help"),
 )
 

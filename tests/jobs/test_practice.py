@@ -19,7 +19,14 @@ def result(ended: int, reached: float = 1.0, **more: Any) -> Any:
     merit = Merit(ended, 0.0, float("inf") if ended else reached)
     aid = SimpleNamespace(limit_n=100.0, force_mean_n=0.0)
     body = SimpleNamespace(humanoid=SimpleNamespace(mass=50.0))
-    own = {"merit": merit, "doubts": (), "placed": None, "controller": "search", "tracker": body}
+    own = {
+        "merit": merit,
+        "doubts": (),
+        "placed": None,
+        "controller": "search",
+        "tracker": body,
+        "travel": None,
+    }
     return SimpleNamespace(card=SimpleNamespace(help=aid), **(own | more))
 
 
@@ -41,6 +48,7 @@ def stubs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     made["tracker"] = tracker
     made["watching"] = Watching(lambda *_: made[next(follows)], lambda _: None, made["said"].append)
     for name, stub in {
+        "with_travel": lambda *_: None,
         "learn": learn, "from_every_start": lambda *_: made["own"],
         "help_wanted": lambda *_: made["wanted"], "with_help": lambda *_: made["aided"],
     }.items():  # fmt: skip

@@ -111,7 +111,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "no joints": (
         {"names": np.zeros(0, dtype="U1"), "rot": np.zeros((7, 0, 4)), "parents": np.zeros(0),
          "offsets": np.zeros((0, 3))},
-        ": it has 0 joints; 1 to 2000 are allowed",
+        ": it has 0 joints; 1 to 1500 are allowed",
     ),
     "parents": (
         {"parents": np.array([-1, 2, 0])},

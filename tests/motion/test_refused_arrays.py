@@ -72,7 +72,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
         ": its node_names are no list of texts"),
     "no names": (
         lambda f: save_npy(f / "a.npy", _tree(node_names=[])),
-        ": it has 0 joints; 1 to 2000 are allowed"),
+        ": it has 0 joints; 1 to 1500 are allowed"),
     "a list of two dicts": (
         lambda f: save_pickle(f / "a.pkl", [{"a": 1}, {"a": 2}]),
         ": the pickle holds a list, not a dict of named arrays"),

@@ -206,7 +206,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     print_card(done.card)
     told = story(tracked, o.reset_on_fail)
     if told.failed:
-        for doubt in tracked.doubts:
+        for doubt in (d for d in tracked.doubts if d not in said_early):
             say(doubt)
     say(told.sentence)
     for part in tracked.parts:

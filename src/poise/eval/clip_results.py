@@ -83,7 +83,7 @@ class ClipJudge:
         sim, ref = env.pose().pos, env.goal_pose().pos
         distance, counted = mpjpe_global(sim, ref), self.alive & (step <= self.last)
         # A world that went bad has no distance, and has failed.
-        good = ~has_lost(sim, ref)
+        good = ~has_lost(sim, ref) & distance.isfinite()
         known = counted & distance.isfinite()
         self.far += torch.where(known, distance, 0.0)
         self.local += torch.where(known, mpjpe_root(sim, ref), 0.0)

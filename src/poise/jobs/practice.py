@@ -123,6 +123,11 @@ def practise(
     return _best(clip, tracker, learned, first, newtons, config, device, told, travel)
 
 
+def _in_place(tracked: Tracked, travel: InPlace | None) -> Tracked:
+    """What was simulated of a clip in place, to be written as it came."""
+    return tracked if travel is None else replace(tracked, travel=travel)
+
+
 def _moving(clip: Clip, travel: InPlace | None) -> Clip:
     """What is simulated of a clip."""
     return clip if travel is None else travel.clip
@@ -166,7 +171,7 @@ def _best(
 ) -> Practised:
     """What is kept of all that was tried, and why."""
     moving, said = _moving(clip, travel), list[str]()
-    own = replace(from_every_start(learned.tracker, moving, device), travel=travel)
+    own = _in_place(from_every_start(learned.tracker, moving, device), travel)
     if newtons:
         said.append(
             f"A residual force of at first up to {_newtons(newtons, learned.tracker)} helped while it "
@@ -184,7 +189,8 @@ def _best(
         kept = max(kept, first, key=lambda t: t.merit)
     aided = with_help(learned.tracker, moving, device) if newtons and kept.merit.ended == LOST else None
     if aided is not None and aided.merit > kept.merit:
-        kept, most = replace(aided, travel=travel), _newtons(float(aided.card.help.limit_n), tracker)
+        kept = _in_place(aided, travel)
+        most = _newtons(float(aided.card.help.limit_n), tracker)
         said.append(f"Without help it is still lost; with up to {most} it is done.")
     elif newtons:
         said.append("It has ended: nothing helps in what is written.")

@@ -55,6 +55,7 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     on = place_on_body(clip, humanoid.table, tracker.example, rate, how=tracker.onto, near=humanoid)
     fit = ClipFit(clip.name, judge_rate(clip), on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
+    notes = (*on.cleaned.noise_sentences(), *notes)
     return Placed(clip, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
 
 

@@ -38,17 +38,7 @@ class CleanReport:
 
     def sentences(self) -> list[str]:
         """The repairs in words, one line for each kind."""
-        out = [
-            f"The motion trembles by {f.size:.0f} mm {f.detail}: the tremble is taken off."
-            for f in self.noise
-            if f.kind == "tremble"
-        ]
-        lost = [f for f in self.noise if f.kind != "tremble"]
-        if lost:
-            parts = [f"{joint} {_frames(mine)}" for joint, mine in _by_joint(lost)]
-            more = f" and {len(parts) - 4} more joints" if len(parts) > 4 else ""
-            told = ", ".join(parts[:4])
-            out.append(f"Joints that were lost for a moment are interpolated: {told}{more}.")
+        out = self.noise_sentences()
         if self.flips:
             parts = [
                 f"{joint} {_frames(mine)} (by up to {max(f.angle_deg for f in mine):.0f} degrees)"
@@ -71,6 +61,21 @@ class CleanReport:
             out.append(f"Left faster than a human joint, since mending jerks the body more: {told}.")
         return out
 
+    def noise_sentences(self) -> list[str]:
+        """What was taken off and filled in, in words."""
+        out = [
+            f"The motion trembles by {f.size:.0f} mm {f.detail}: the tremble is taken off."
+            for f in self.noise
+            if f.kind == "tremble"
+        ]
+        lost = [f for f in self.noise if f.kind != "tremble"]
+        if lost:
+            parts = [f"{joint} {_frames(mine)}" for joint, mine in _by_joint(lost)]
+            more = f" and {len(parts) - 4} more joints" if len(parts) > 4 else ""
+            told = ", ".join(parts[:4])
+            out.append(f"Joints that were lost for a moment are interpolated: {told}{more}.")
+        return out
+
     def to_dict(self) -> dict[str, Any]:
         """The repairs as plain lists and numbers."""
         return asdict(self)
@@ -86,7 +91,7 @@ def _frames(found: Sequence[Any]) -> str:
 
 
 def clean_clip(
-    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True, noise: bool = True
+    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True
 ) -> tuple[Clip, CleanReport]:
     """The clip with its faults repaired, and every repair; a clean clip comes back as it is.
 
@@ -95,11 +100,10 @@ def clean_clip(
     remains of the jumps goes too, and at last noise is taken off (`denoise`).
 
     rougher: also where that jerks the body more, see `without_rougher`. A body with joints that cannot
-    turn so fast wants it; a file that stays a file does not. noise: whether noise and lost joints are
-    looked for.
+    turn so fast wants it; a file that stays a file does not.
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
-    found = tuple(noise_faults(clip)) if noise else ()
+    found = tuple(noise_faults(clip))
     turned, flips = unflip(refill(clip) if found else clip, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     kept: tuple[SpeedRepair, ...] = ()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError, did_you_mean
-from poise.motion.io.text import listed, shown
+from poise.motion.io.text import MAX_JOINTS, listed, shown
 from poise.motion.points.labels import split_label, unknown_labels
 
 # A person's mark before or behind a label, which may consist of words itself: "P1:LKnee", "Anna_LASI",
@@ -19,6 +19,8 @@ _APART = r"[\s:|/._(\[-]"
 _FIRST = re.compile(rf"^([^\s:|/._(\[-]+){_APART}+(.+)$")
 _LAST = re.compile(rf"^(.+?){_APART}+([^\s:|/._(\[-]+)$")
 _SIDES = {"l", "r", "left", "right", "lt", "rt"}
+#: Labels of more characters are none.
+LONGEST = 200
 #: An axis of people is no longer than this.
 MOST_PEOPLE = 8
 #: So many points make a person, and this share of them the other people have too.
@@ -39,6 +41,9 @@ def person_of(
     Raises:
         PoiseError: no person is called `take`.
     """
+    if len(names) > MAX_JOINTS * MOST_PEOPLE or max(map(len, names), default=0) > LONGEST:
+        # Their reader refuses them; a pattern would take its time with them.
+        return list(range(len(names))), tuple(names), []
     ways = ((pattern, mark) for mark in (1, 2) for pattern in (_FIRST, _LAST))
     people = next((found for pattern, mark in ways if (found := _marked(names, pattern, mark))), None)
     if people is None:

@@ -377,22 +377,21 @@ _PHC: dict[str, Any] = {
 #: What earlier versions called the settings, and what their runs did that name none.
 MIGRATION = Migration(
     keys={
-        "hard_starts": "adaptive_sampling",
-        "hard_over": "adaptive_over",
-        "paths": "trajopt",
+        "hard_starts": "adaptive_sampling", "hard_over": "adaptive_over", "paths": "trajopt",
         "trajopt.stretch_s": "trajopt.segment_s",
+        "trajopt.plan.frequency": "trajopt.plan.spring.frequency",
+        "trajopt.plan.damping": "trajopt.plan.spring.damping",
+        "trajopt.plan.turn_frequency": "trajopt.plan.spring.turn_frequency",
+        "trajopt.plan.turn_damping": "trajopt.plan.spring.turn_damping",
         "recovering.ways": "recovering.demonstrations",
         "recovering.way_share": "recovering.demonstration_share",
     },
     values={"help_by": {"moment": "bin"}},
     absent={
-        "recovery": False,
-        "help_by": "all",
-        "adaptive_sampling": 0.0,
-        "adaptive_over": "clip",
+        "recovery": False, "help_by": "all", "adaptive_sampling": 0.0, "adaptive_over": "clip",
         "heading": "twist",
     },
-)
+)  # fmt: skip
 
 
 def config_of(data: Mapping[str, Any], where: Path | str | None = None) -> Perpetual:

@@ -19,7 +19,7 @@ PERSON = 8
 
 def read(
     path: str, refuse: Refuse, joints: int, poses: int, value: float, fps: float | None,
-    take: str | None, rest: bool,
+    take: str | None, rest: bool = False,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """The joints' transforms at every frame of a take, in metres with Y up.
 

@@ -140,6 +140,8 @@ def _check(raw: RawPoints) -> None:
     if np.abs(known).max() > MAX_VALUE:
         raise PoiseError(f"it holds coordinates above {MAX_VALUE:g}, no place of a person", raw.path)
     flat = [c for c, width in zip("XYZ", np.ptp(known, axis=0), strict=True) if width == 0]
+    if len(flat) == 3:
+        raise PoiseError("all keypoints lie in one place", raw.path)
     if flat:
         raise PoiseError(
             f"the keypoints are flat: {' and '.join(flat)} never changes, as in the 2D of a camera",
