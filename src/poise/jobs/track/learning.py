@@ -43,8 +43,6 @@ from poise.recipes.perpetual.config import config_of
 WORLDS, MINIBATCH, EVERY = 512, 2048, 5
 #: Step size, which stays: one that follows the KL divergence shrinks where much is to be learned.
 STEP = 1e-4
-#: Iterations in which the critic alone learns: it knows other motions already.
-CRITIC = 2
 #: Shares of the help that a policy learned with, of which the least is left that suffices.
 LEFT = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 #: Evaluations without success after which training would end by itself.
@@ -63,7 +61,6 @@ def settings(policy: Perpetual, seed: int = 0, starts: int = 1) -> Perpetual:
     or flies is found by rough tries."""
     config = going_on(policy, Perpetual(num_envs=WORLDS, seed=seed, recovery=False))
     ppo = replace(config.ppo, minibatch=MINIBATCH, policy_lr=STEP, kl_target=None, smooth_weight=0.0)
-    ppo = replace(ppo, critic_warmup=min(ppo.critic_warmup, CRITIC))
     # One motion is lost or not: that is no curve by which to tell that nothing is gained any more.
     convergence = replace(config.convergence, patience=NEVER)
     config = replace(config, ppo=ppo, convergence=convergence, teacher=None, cooling=0.0)
