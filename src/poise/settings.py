@@ -60,11 +60,10 @@ class Migration:
             if holder is not None and name in holder:
                 value = holder.pop(name)
                 *parts, last = new.split(".")
-                target: Any = out
+                here = out
                 for part in parts:
-                    target = target.setdefault(part, {}) if isinstance(target, dict) else None
-                if isinstance(target, dict):
-                    target[last] = value
+                    here = cast("dict[str, Any]", here.setdefault(part, {}))
+                here[last] = value
         for name, known in self.values.items():
             holder, last = _holder(out, name)
             if holder is not None and isinstance(holder.get(last), str):
