@@ -8,7 +8,7 @@ from typing import Any
 
 from poise.body import Anatomy, find_anatomy, generate_table
 from poise.errors import PoiseError
-from poise.kin.doctor.estimate import denoise, noise_faults, refill
+from poise.kin.doctor.estimate import denoise, noise_faults
 from poise.kin.doctor.faults import Fault
 from poise.kin.doctor.flips import Flip, out_of_reach, unflip
 from poise.kin.doctor.speeds import TRUNK_SPEED, SpeedRepair, limit_speeds, without_rougher
@@ -62,7 +62,7 @@ class CleanReport:
         return out
 
     def noise_sentences(self) -> list[str]:
-        """What was taken off and filled in, in words."""
+        """The noise that was taken off and the joints that were filled in, in words."""
         out = [
             f"The motion trembles by {f.size:.0f} mm {f.detail}: the tremble is taken off."
             for f in self.noise
@@ -103,15 +103,15 @@ def clean_clip(
     turn so fast wants it; a file that stays a file does not.
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
-    found = tuple(noise_faults(clip))
-    turned, flips = unflip(refill(clip) if found else clip, anatomy, TRUNK_SPEED)
+    found, whole = noise_faults(clip)
+    turned, flips = unflip(whole, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     kept: tuple[SpeedRepair, ...] = ()
     if not rougher:
         slowed, speeds, kept = without_rougher(turned, slowed, speeds)
     if any(f.kind == "tremble" for f in found):
         slowed = denoise(slowed)
-    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, found)
+    return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, tuple(found))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,10 @@ the mean over a joint's channels, around the frame and over the clip.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -56,12 +59,12 @@ SPIKE_RAD, SPIKE_M = 0.35, 0.06
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
-def refill(clip: Clip) -> Clip:
-    """The clip with every joint that was lost (`find_lost`) on the smoothest curve through its other
-    frames; one that lost none comes back as it is."""
+def refill(clip: Clip, found: Sequence[tuple[str, int, int, int]] | None = None) -> Clip:
+    """The clip with every joint that was lost on the smoothest curve through its other frames; one that
+    lost none comes back as it is. found: what `find_lost` says, which is asked where it is not given."""
     rot = unwrap_quats(torch.tensor(clip.rot)).numpy()
     lost = np.zeros(rot.shape[:2], dtype=bool)
-    for _, j, a, b in find_lost(clip, rot):
+    for _, j, a, b in find_lost(clip, rot) if found is None else found:
         lost[a : b + 1, j] = True
     if not lost.any():
         return clip
@@ -75,23 +78,20 @@ def denoise(clip: Clip) -> Clip:
 
     A long clip is told and smoothed by pieces of `PIECE_S`, which fade into each other.
     """
-    size, overlap = round(PIECE_S * clip.fps), round(OVERLAP_S * clip.fps)
-    count = max(1, math.ceil((clip.frames - overlap) / (size - overlap)))
-    edges = np.linspace(0, clip.frames - overlap, count + 1).round().astype(int)
+    overlap = round(OVERLAP_S * clip.fps)
     root, rot = np.array(clip.root_pos), unwrap_quats(torch.tensor(clip.rot)).numpy()
     positions, world = clip.positions(), unwrap_quats(torch.tensor(clip.world()[1])).numpy()
     out_root, out_rot, changed = root.copy(), rot.copy(), False
-    for first, stop in zip(edges[:-1], edges[1:] + overlap, strict=True):
-        here = slice(first, min(stop, clip.frames))
+    for here in _pieces(clip):
         found = _piece(clip, root[here], rot[here], world[here], positions[here])
         if found is None:
             continue
         changed = True
         share = np.ones(here.stop - here.start)
         ramp = (np.arange(overlap) + 1) / (overlap + 1)
-        if first > 0:
+        if here.start > 0:
             share[:overlap] = ramp[: len(share)]
-        # Where the next piece begins it takes over, be it smoothed or not.
+        # The next piece takes over from its first frame on, be it smoothed or not.
         if here.stop < clip.frames:
             share[-overlap:] *= ramp[::-1]
         out_root[here] += share[:, None] * (found[0] - root[here])
@@ -104,28 +104,45 @@ def denoise(clip: Clip) -> Clip:
     return clip.replaced(root_pos=out_root, rot=unwrap_quats(torch.tensor(out_rot)).numpy())
 
 
-def noise_faults(clip: Clip) -> list[Fault]:
-    """What `denoise` takes off: trembles of the body in mm (rms over joints), spikes and held joints in
-    degrees."""
+def _pieces(clip: Clip) -> list[slice]:
+    """Frames of the pieces, each of which overlaps the next."""
+    size, overlap = round(PIECE_S * clip.fps), round(OVERLAP_S * clip.fps)
+    count = max(1, math.ceil((clip.frames - overlap) / (size - overlap)))
+    edges = np.linspace(0, clip.frames - overlap, count + 1).round().astype(int).tolist()
+    return [slice(a, min(b + overlap, clip.frames)) for a, b in pairwise(edges)]
+
+
+def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
+    """The faults that noise is, and the clip with its lost joints filled in.
+
+    A tremble of the body counts in mm (rms over joints), the largest of any piece; spikes and held joints
+    count in degrees.
+    """
     if clip.frames < SHORTEST:
-        return []
-    rot, last = unwrap_quats(torch.tensor(clip.rot)).numpy(), clip.frames - 1
-    whole = refill(clip)
+        return [], clip
+    rot = unwrap_quats(torch.tensor(clip.rot)).numpy()
+    lost = find_lost(clip, rot)
+    whole = refill(clip, lost)
     turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
     out = [
         Fault(kind, clip.skeleton.names[j], a, b, float(turned[a : b + 1, j].max()))
-        for kind, j, a, b in find_lost(clip, rot)
+        for kind, j, a, b in lost
     ]
     positions, calm = whole.positions(), unwrap_quats(torch.tensor(whole.rot)).numpy()
-    groups = np.repeat(np.arange(len(clip.skeleton)), 3)
-    hz = _pose_spectrum(np.array(clip.root_pos), calm, clip.fps).tremble()
-    if hz is not None:
-        places = Spectrum.of(positions.reshape(clip.frames, -1), clip.fps, groups)
-        size = 1e3 * math.sqrt(float(places.tone(hz)[0].mean()))
-        out.append(Fault("tremble", "", 0, last, size, f"at {hz:.1f} Hz"))
-    elif (white := white_mm(positions, clip.fps)) >= WHITE_MM:
-        out.append(Fault("tremble", "", 0, last, white, "from frame to frame"))
-    return out
+    groups, trembles = np.repeat(np.arange(len(clip.skeleton)), 3), list[Fault]()
+    for here in _pieces(clip):
+        first, last, places = here.start, here.stop - 1, positions[here]
+        hz = _pose_spectrum(np.array(clip.root_pos[here]), calm[here], clip.fps).tremble()
+        if hz is not None:
+            found = Spectrum.of(places.reshape(len(places), -1), clip.fps, groups)
+            size = 1e3 * math.sqrt(float(found.tone(hz)[0].mean()))
+            trembles.append(Fault("tremble", "", first, last, size, f"at {hz:.1f} Hz"))
+        elif (white := white_mm(places, clip.fps)) >= WHITE_MM:
+            trembles.append(Fault("tremble", "", first, last, white, "from frame to frame"))
+    if trembles:
+        worst = max(trembles, key=lambda f: f.size)
+        out.append(replace(worst, start=trembles[0].start, stop=trembles[-1].stop))
+    return out, whole
 
 
 def _piece(
