@@ -115,8 +115,8 @@ def _pieces(clip: Clip) -> list[slice]:
 def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     """The faults that noise is, and the clip with its lost joints filled in.
 
-    A tremble of the body counts in mm (rms over joints), the largest of any piece; spikes and held joints
-    count in degrees.
+    A tremble of the body counts in mm (rms over joints), the largest of any piece; spikes and held
+    joints count in degrees.
     """
     if clip.frames < SHORTEST:
         return [], clip
