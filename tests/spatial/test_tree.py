@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from poise.spatial import forward_kinematics, normalize
+from poise.spatial import forward_kinematics, normalize, quat_mul, quat_rotate
 
 PARENTS = (-1, 0, 1, 1, 3, 0)
 
@@ -42,3 +42,20 @@ def test_the_roots_offset_is_ignored_and_nothing_is_changed():
     pos, _ = forward_kinematics(PARENTS, offsets, root, rot)
     assert pos[0].tolist() == [0.0, 0.0, 0.0] and pos[4].tolist() == [27.0] * 3
     assert torch.equal(rot, before)
+
+
+def test_a_tree_of_many_joints_is_joined_by_doubling_alike():
+    rng = torch.Generator().manual_seed(1)
+    count = 700
+    parents = [-1, *(max(0, j - 1 - j % 3) for j in range(1, count))]
+    offsets = torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    root = torch.randn(5, 3, generator=rng, dtype=torch.float64)
+    rot = normalize(torch.randn(5, count, 4, generator=rng, dtype=torch.float64))
+    pos, quat = forward_kinematics(parents, offsets, root, rot)
+    for j, parent in enumerate(parents):
+        if parent < 0:
+            assert torch.equal(pos[:, j], root) and torch.equal(quat[:, j], rot[:, j])
+            continue
+        step = quat_rotate(quat[:, parent], offsets[j].expand(5, 3))
+        torch.testing.assert_close(pos[:, j], pos[:, parent] + step, atol=1e-9, rtol=0)
+        torch.testing.assert_close(quat[:, j], quat_mul(quat[:, parent], rot[:, j]), atol=1e-9, rtol=0)

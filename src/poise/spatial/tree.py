@@ -10,6 +10,9 @@ from torch import Tensor
 
 from poise.spatial.rotations import quat_mul, quat_rotate
 
+#: Joints from which on ancestors are joined in steps that double, not one by one.
+_MANY = 300
+
 
 def forward_kinematics(
     parents: Sequence[int], offsets: Tensor, root_pos: Tensor, rot: Tensor
@@ -26,6 +29,8 @@ def forward_kinematics(
     Returns:
         positions `(..., J, 3)` m and rotations `(..., J, 4)` wxyz, both world.
     """
+    if len(parents) > _MANY:
+        return _by_doubling(parents, offsets, root_pos, rot)
     pos: list[Tensor] = []
     quat: list[Tensor] = []
     for j, parent in enumerate(parents):
@@ -36,6 +41,27 @@ def forward_kinematics(
             pos.append(pos[parent] + quat_rotate(quat[parent], offsets[..., j, :].expand_as(root_pos)))
             quat.append(quat_mul(quat[parent], rot[..., j, :]))
     return torch.stack(pos, -2), torch.stack(quat, -2)
+
+
+def _by_doubling(
+    parents: Sequence[int], offsets: Tensor, root_pos: Tensor, rot: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As `forward_kinematics`, in log2(depth) steps over all joints: each step joins what lies between a
+    joint and its ancestor of 1, 2, 4, ... generations above with what lies above that one."""
+    up = torch.tensor(list(parents))
+    first = (up < 0).unsqueeze(-1)
+    pos = torch.where(first, root_pos.unsqueeze(-2), offsets.expand(*rot.shape[:-1], 3))
+    quat = rot
+    while (here := (up >= 0).nonzero().squeeze(-1)).numel():
+        above = up[here]
+        turn = quat[..., above, :]
+        new = pos[..., above, :] + quat_rotate(turn, pos[..., here, :])
+        pos, quat = (
+            pos.index_copy(-2, here, new),
+            quat.index_copy(-2, here, quat_mul(turn, quat[..., here, :])),
+        )
+        up = torch.where(up >= 0, up[up.clamp(min=0)], up)
+    return pos, quat
 
 
 @cache

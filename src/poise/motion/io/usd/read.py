@@ -74,9 +74,7 @@ def raw_of_matrices(
     names = unique_names([str(n) for n in held["names"]], notes)
     codes, local = held["codes"], held["local"]
     top = _parts(held["above"], f"{path}, the skeleton's own transform", codes)
-    where = (f"{path}, joint {shown(n)}" for n in names)
-    parts = [_parts(local[:, j], place, codes) for j, place in enumerate(where)]
-    place, turn, scale = ([p[k] for p in parts] for k in range(3))
+    place, turn, scale = _all_parts(local, [f"{path}, joint {shown(n)}" for n in names], codes)
     steady = [np.median(s, axis=0) for s in scale]
     above = np.median(top[2], axis=0)
     for name, one in (("the skeleton", top[2]), *zip(map(shown, names), scale, strict=True)):
@@ -151,6 +149,21 @@ def _one_root(held: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.nda
         "local": np.concatenate((still, held["local"]), 1),
         "ends": np.array(""),
     }
+
+
+def _all_parts(
+    local: np.ndarray, where: list[str], codes: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Places, turns and scales of joints' matrices `(T, J, 4, 4)`, joint by joint."""
+    try:
+        frames, joints = local.shape[:2]
+        place, turn, scale = _parts(local.reshape(-1, 4, 4), "", np.repeat(codes, joints))
+        parts = [x.reshape(frames, joints, -1).swapaxes(0, 1) for x in (place, turn, scale)]
+    except PoiseError:
+        # Which joint it is, is said one by one.
+        each = [_parts(local[:, j], place, codes) for j, place in enumerate(where)]
+        parts = [np.stack(x) for x in zip(*each, strict=True)]
+    return list(parts[0]), list(parts[1]), list(parts[2])
 
 
 def _parts(m: np.ndarray, where: str, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

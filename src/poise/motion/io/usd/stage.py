@@ -42,7 +42,7 @@ def _read(
 ) -> dict[str, np.ndarray]:
     notes: list[str] = []
     stage = _stage(pxr, path, refuse)
-    found, others = _skeletons(pxr, stage, refuse, rest, notes)
+    found, others = _skeletons(pxr, stage, refuse, rest, notes, limits[0])
     rig, query = found.rig, found.query
     count = len(query.GetJointOrder())
     if not 0 < count <= limits[0]:
@@ -140,12 +140,12 @@ class _Found:
 
 
 def _skeletons(
-    pxr: Any, stage: Any, refuse: Refuse, rest: bool, notes: list[str]
+    pxr: Any, stage: Any, refuse: Refuse, rest: bool, notes: list[str], most: int
 ) -> tuple[_Found, list[_Found]]:
     """The skeleton to read, and the others that are animated too.
 
     It is the first with joints that move, or else the first that a transform above it moves, or else one
-    that stands in a pose of its animation.
+    that stands in a pose of its animation. One of more than `most` joints is passed over.
     """
     UsdSkel, UsdGeom = pxr.UsdSkel, pxr.UsdGeom
     prims = list(stage.Traverse())
@@ -167,8 +167,13 @@ def _skeletons(
         if prim.IsA(UsdSkel.Root):
             cache.Populate(UsdSkel.Root(prim), pxr.Usd.PrimDefaultPredicate)
     bare: list[Any] = []
+    large = 0
     for prim in prims:
         if not prim.IsA(UsdSkel.Skeleton):
+            continue
+        if (count := len(UsdSkel.Skeleton(prim).GetJointsAttr().Get() or ())) > most:
+            # OpenUSD's query of so many takes seconds.
+            large = max(large, count)
             continue
         query = cache.GetSkelQuery(UsdSkel.Skeleton(prim))
         animation = query.GetAnimQuery() if query else None
@@ -182,6 +187,10 @@ def _skeletons(
         bare.append(one.rig)
         if query and (animation or one.moves() or rest):
             found.append(one)
+    if large and not found:
+        refuse(f"it has {large} joints; 1 to {most} are read")
+    if large:
+        notes.append(f"A skeleton of {large} joints was passed over; 1 to {most} are read")
     if not found and not all(_in_order(UsdSkel, rig) for rig in bare):
         refuse("its joints do not stand with parents before children")
     if not found and bare:
