@@ -12,9 +12,10 @@ import torch
 from scipy.signal import butter, sosfiltfilt
 
 from poise.kin import examine, heal
-from poise.kin.doctor.estimate import denoise, filled, find_lost, refill
-from poise.kin.doctor.noise import Spectrum, white_mm
+from poise.kin.doctor.estimate import denoise, find_lost, refill
 from poise.motion import Clip, read_clip
+from poise.motion.smoothing import filled
+from poise.motion.spectrum import Spectrum, white_mm
 from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
 
 CUTOFFS = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 10.0)

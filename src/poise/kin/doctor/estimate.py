@@ -1,17 +1,7 @@
-"""A motion estimated from a trembling one: every channel smoothed as much as it trembles, no more.
+"""A motion estimated from a trembling one: what its joints' rotations and its root are without noise.
 
-A channel is taken as y = x + n + e: motion x, a tremble n at a frequency, white noise e. Their sizes are
-measured (`noise`); n goes first,
-
-    min over x, n   sum |y - x - n|^2 / s^2 + lambda |x'''|^2
-                        + |n_t+1 - 2 r cos(w) n_t + r^2 n_t-1|^2 / q,
-
-then x is the mean of smoothing splines of many stiffnesses lambda, each weighted in every frame by how
-near to the truth Stein's unbiased estimate says it is there:
-
-    risk = |y - S y|^2 / s^2 + 2 tr(S) / T,
-
-the mean over a joint's channels, around the frame and over the clip.
+Noise is measured (`motion.spectrum`), and every channel is smoothed as much as it trembles
+(`motion.smoothing`), by pieces of some seconds. Joints that were lost for a moment are filled in.
 """
 
 from __future__ import annotations
@@ -19,17 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 import torch
 
 from poise.kin.doctor.faults import Fault
-from poise.kin.doctor.noise import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
 from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
 from poise.motion.points.clean import drop_spikes
+from poise.motion.smoothing import faded, filled, pieces, smoothed, spline, tremble_of
+from poise.motion.spectrum import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
 from poise.spatial import (
     normalize,
     quat_between,
@@ -41,22 +30,12 @@ from poise.spatial import (
     unwrap_quats,
 )
 
-#: Frequencies (Hz) at which the gain of the splines is one half.
-CUTOFFS = tuple(np.geomspace(0.35, 14.0, 20))
-#: Deviation (s) of the surroundings in which a stiffness is judged, the share of the whole clip in that
-#: judgement, and the deviation (s) over which its weight changes.
-AROUND_S, WHOLE, CHANGE_S = 0.3, 0.7, 0.1
-#: Width (Hz) of a tremble: the rate at which its size and phase wander.
-WANDER_HZ = 0.15
-#: Length (s) of the pieces that are told and smoothed by themselves, and how long they overlap.
-PIECE_S, OVERLAP_S = 30.0, 2.0
 #: A joint that stands still for so long (s) and leaps on by so many of its steps, by this angle (rad) at
-#: least, was held; how fast (Hz) the curve through what is missing may turn.
-HELD_S, LEAPS, LEAP_RAD, FILL_HZ = 0.08, 3.0, 0.03, 6.0
+#: least, was held.
+HELD_S, LEAPS, LEAP_RAD = 0.08, 3.0, 0.03
 #: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
 #: toes snap by nearly as much in kicks and dashes.
 SPIKE_RAD, SPIKE_M = 0.35, 0.06
-_THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 def refill(clip: Clip, found: Sequence[tuple[str, int, int, int]] | None = None) -> Clip:
@@ -78,22 +57,15 @@ def denoise(clip: Clip) -> Clip:
 
     A long clip is told and smoothed by pieces of `PIECE_S`, which fade into each other.
     """
-    overlap = round(OVERLAP_S * clip.fps)
     root, rot = np.array(clip.root_pos), unwrap_quats(torch.tensor(clip.rot)).numpy()
     positions, world = clip.positions(), unwrap_quats(torch.tensor(clip.world()[1])).numpy()
     out_root, out_rot, changed = root.copy(), rot.copy(), False
-    for here in _pieces(clip):
+    for here in pieces(clip.frames, clip.fps):
         found = _piece(clip, root[here], rot[here], world[here], positions[here])
         if found is None:
             continue
         changed = True
-        share = np.ones(here.stop - here.start)
-        ramp = (np.arange(overlap) + 1) / (overlap + 1)
-        if here.start > 0:
-            share[:overlap] = ramp[: len(share)]
-        # The next piece takes over from its first frame on, be it smoothed or not.
-        if here.stop < clip.frames:
-            share[-overlap:] *= ramp[::-1]
+        share = faded(here, clip.frames, clip.fps)
         out_root[here] += share[:, None] * (found[0] - root[here])
         turn = quat_to_rotvec(quat_mul(quat_conj(torch.tensor(rot[here])), torch.tensor(found[1])))
         step = rotvec_to_quat(torch.tensor(share)[:, None, None] * turn)
@@ -102,14 +74,6 @@ def denoise(clip: Clip) -> Clip:
         return clip
     out_rot /= np.linalg.norm(out_rot, axis=-1, keepdims=True)
     return clip.replaced(root_pos=out_root, rot=unwrap_quats(torch.tensor(out_rot)).numpy())
-
-
-def _pieces(clip: Clip) -> list[slice]:
-    """Frames of the pieces, each of which overlaps the next."""
-    size, overlap = round(PIECE_S * clip.fps), round(OVERLAP_S * clip.fps)
-    count = max(1, math.ceil((clip.frames - overlap) / (size - overlap)))
-    edges = np.linspace(0, clip.frames - overlap, count + 1).round().astype(int).tolist()
-    return [slice(a, min(b + overlap, clip.frames)) for a, b in pairwise(edges)]
 
 
 def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
@@ -130,7 +94,7 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     ]
     positions, calm = whole.positions(), unwrap_quats(torch.tensor(whole.rot)).numpy()
     groups, trembles = np.repeat(np.arange(len(clip.skeleton)), 3), list[Fault]()
-    for here in _pieces(clip):
+    for here in pieces(clip.frames, clip.fps):
         first, last, places = here.start, here.stop - 1, positions[here]
         hz = _pose_spectrum(np.array(clip.root_pos[here]), calm[here], clip.fps).tremble()
         if hz is not None:
@@ -158,7 +122,9 @@ def _piece(
             break
         tones.append(hz)
         only = np.zeros(3, dtype=int)
-        calm_root = calm_root - _tremble(calm_root, only, Spectrum.of(calm_root, clip.fps, only), hz)[0]
+        calm_root = (
+            calm_root - tremble_of(calm_root, only, Spectrum.of(calm_root, clip.fps, only), hz)[0]
+        )
         calm = {frame: _still(quats, clip.fps, hz) for frame, quats in calm.items()}
     if not tones and white_mm(positions, clip.fps) < WHITE_MM:
         return None
@@ -170,7 +136,7 @@ def _piece(
     quats = calm["own" if own else "world"]
     y = np.concatenate((quats.reshape(frames, -1), calm_root), 1)
     groups = _groups(joints)
-    x = _smooth(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
+    x = smoothed(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
     out = torch.tensor(x[:, : 4 * joints].reshape(quats.shape))
     out = normalize(out)
     if not own:
@@ -218,17 +184,6 @@ def _reach(skeleton: Skeleton) -> np.ndarray:
     return out
 
 
-def filled(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
-    """`y (T, C)` with the frames that are not `known (T)` on the smoothest curve through the rest."""
-    band = np.zeros((4, len(y)))
-    band[0] = known + 1e-9
-    from scipy.linalg import solveh_banded
-
-    _add(band, _THIRD, float((2 * np.sin(np.pi * FILL_HZ / fps)) ** -6), len(y), 1, 0)
-    curve = solveh_banded(band, y * known[:, None], lower=True)
-    return np.where(known[:, None], y, curve)
-
-
 def _groups(joints: int) -> np.ndarray:
     return np.concatenate((np.repeat(np.arange(joints), 4), [joints] * 3))
 
@@ -250,7 +205,7 @@ def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
 
     frames, joints = rot.shape[:2]
     stiff = float((2 * np.sin(np.pi * hz / 3 / fps)) ** -6)
-    slow = cho_solve_banded((_spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
+    slow = cho_solve_banded((spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
     base, quat = torch.tensor(slow / np.linalg.norm(slow, axis=-1, keepdims=True)), torch.tensor(rot)
     groups = np.repeat(np.arange(joints), 3)
     ways = (
@@ -260,96 +215,8 @@ def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     tries = []
     for apart, together in ways:
         turn = quat_to_rotvec(apart(quat)).reshape(frames, -1).numpy()
-        found, clear = _tremble(turn, groups, Spectrum.of(turn, fps, groups), hz)
+        found, clear = tremble_of(turn, groups, Spectrum.of(turn, fps, groups), hz)
         left = torch.tensor((turn - found).reshape(frames, joints, 3))
         tries.append((clear, together(rotvec_to_quat(left))))
     own = torch.tensor(tries[0][0] >= tries[1][0])
     return unwrap_quats(torch.where(own[:, None], tries[0][1], tries[1][1])).numpy()
-
-
-def _tremble(
-    y: np.ndarray, groups: np.ndarray, found: Spectrum, hz: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it."""
-    out = np.zeros_like(y)
-    size, beside = found.tone(hz)
-    floor = found.floor()
-    for g in np.unique(groups):
-        if size[g] <= 0.0:
-            continue
-        mine = np.flatnonzero(groups == g)
-        white = max(floor[g], 0.02 * beside[g], 1e-4 * size[g])
-        motion = max(beside[g] - white, 0.1 * white) / white
-        # The spline's power at hz is that of the motion there: 1 / (lambda |2 sin(w / 2)|^6).
-        stiff = 1.0 / (motion * (2 * np.sin(np.pi * hz / found.fps)) ** 6)
-        unit = np.sqrt(white / len(mine))
-        out[:, mine] = unit * _split(y[:, mine] / unit, found.fps, hz, stiff, float(size[g] / white))
-    return out, size / np.maximum(beside, 1e-300)
-
-
-def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> np.ndarray:
-    """n of the module's text, for white noise of size 1 and a tremble of variance `size`."""
-    frames = len(y)
-    wander = np.exp(-np.pi * WANDER_HZ / fps)
-    step = np.array([wander**2, -2 * wander * np.cos(2 * np.pi * hz / fps), 1.0])
-    # The variance of the process for steps of variance 1.
-    own = (1 + step[0]) / ((1 - step[0]) * ((1 + step[0]) ** 2 - step[1] ** 2))
-    band = np.zeros((8, 2 * frames))
-    # Unknowns x_0, n_0, x_1, n_1, ...
-    band[0] += 1.0
-    band[1, 0::2] += 1.0
-    _add(band, _THIRD, stiff, frames, 2, 0)
-    _add(band, step, own / size, frames, 2, 1)
-    band[0] += 1e-9
-    from scipy.linalg import solveh_banded
-
-    return solveh_banded(band, np.repeat(y, 2, axis=0), lower=True)[1::2]
-
-
-def _add(band: np.ndarray, row: np.ndarray, weight: float, frames: int, stride: int, first: int) -> None:
-    """Adds `weight |row * z|^2` at every frame to normal equations in lower banded form."""
-    count = frames - len(row) + 1
-    for i in range(len(row)):
-        for j in range(i + 1):
-            at = stride * (np.arange(max(count, 0)) + j) + first
-            band[stride * (i - j), at] += weight * row[i] * row[j]
-
-
-@lru_cache(maxsize=64)
-def _spline(frames: int, stiff: float) -> np.ndarray:
-    from scipy.linalg import cholesky_banded
-
-    band = np.zeros((4, frames))
-    band[0] = 1.0
-    _add(band, _THIRD, stiff, frames, 1, 0)
-    return cholesky_banded(band, lower=True)
-
-
-def _smooth(y: np.ndarray, fps: float, groups: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """The channels without white noise of variance `floor (G)`, the sum over a group's channels."""
-    from scipy.linalg import cho_solve_banded
-    from scipy.ndimage import gaussian_filter1d
-
-    curves, traces = [y], [1.0]
-    turn = np.linspace(0.0, np.pi, 400)
-    for cutoff in (c for c in CUTOFFS if c < 0.45 * fps):
-        stiff = float((2 * np.sin(np.pi * cutoff / fps)) ** -6)
-        curves.append(cho_solve_banded((_spline(len(y), stiff), True), y))
-        traces.append(float(np.mean(1.0 / (1.0 + stiff * (2 * np.sin(turn / 2)) ** 6))))
-    trace, out = np.array(traces), np.empty_like(y)
-    for g in np.unique(groups):
-        mine = np.flatnonzero(groups == g)
-        white = floor[g] / len(mine)
-        if white <= 0.0:
-            out[:, mine] = y[:, mine]
-            continue
-        # One stack a group: that of all would be many times the clip.
-        stack = np.stack([c[:, mine] for c in curves])
-        off = ((stack - stack[:1]) ** 2).mean(-1) / white
-        risk = (1 - WHOLE) * gaussian_filter1d(off, AROUND_S * fps, axis=1, mode="reflect")
-        risk += WHOLE * off.mean(1, keepdims=True) + 2 * trace[:, None]
-        samples = 2.5 * AROUND_S * fps * len(mine)
-        share = np.exp(-samples * (risk - risk.min(0)))
-        share = gaussian_filter1d(share / share.sum(0), CHANGE_S * fps, axis=1, mode="nearest")
-        out[:, mine] = (share[..., None] * stack).sum(0)
-    return out
