@@ -31,6 +31,9 @@ CUTOFFS = tuple(np.geomspace(0.35, 14.0, 20))
 AROUND_S, WHOLE, CHANGE_S = 0.3, 0.7, 0.1
 #: Width (Hz) of a tremble: the rate at which its size and phase wander.
 WANDER_HZ = 0.15
+#: Below this frequency (Hz) people step: there a tremble has in no group more than so many times the
+#: variance that it has in the quietest (this quantile of all).
+STEPS_HZ, UNEVEN, QUIET = 3.5, 1.5, 0.4
 #: Length (s) of the pieces that are told and smoothed by themselves, and how long they overlap.
 PIECE_S, OVERLAP_S = 30.0, 2.0
 #: How fast (Hz) a curve through what is missing may turn.
@@ -76,7 +79,13 @@ def tremble_of(
     """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it."""
     out = np.zeros_like(y)
     size, beside = found.tone(hz)
-    floor = found.floor()
+    floor, clear = found.floor(), size / np.maximum(beside, 1e-300)
+    if hz < STEPS_HZ:
+        # What a group has beyond that is a step of its own, and as narrow as a tremble: the power of
+        # either at hz is its variance times fps / (pi WANDER_HZ).
+        most = UNEVEN * np.quantile(size, QUIET, method="lower")
+        own = np.maximum(size - most, 0.0) * found.fps / (np.pi * WANDER_HZ)
+        beside, size = beside + own, np.minimum(size, most)
     for g in np.unique(groups):
         if size[g] <= 0.0:
             continue
@@ -87,7 +96,7 @@ def tremble_of(
         stiff = 1.0 / (motion * (2 * np.sin(np.pi * hz / found.fps)) ** 6)
         unit = np.sqrt(white / len(mine))
         out[:, mine] = unit * _split(y[:, mine] / unit, found.fps, hz, stiff, float(size[g] / white))
-    return out, size / np.maximum(beside, 1e-300)
+    return out, clear
 
 
 def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> np.ndarray:
@@ -103,7 +112,11 @@ def _split(y: np.ndarray, fps: float, hz: float, stiff: float, size: float) -> n
     band[1, 0::2] += 1.0
     _add(band, _THIRD, stiff, frames, 2, 0)
     _add(band, step, own / size, frames, 2, 1)
-    band[0] += 1e-9
+    # The first two of n are as large as all others: else a tone of any size would cost nothing.
+    like = -step[1] / (1 + step[0])
+    first = 1.0 / (size * (1.0 - like**2))
+    band[0, [1, 3]] += first
+    band[2, 1] -= like * first
     from scipy.linalg import solveh_banded
 
     return solveh_banded(band, np.repeat(y, 2, axis=0), lower=True)[1::2]

@@ -17,20 +17,22 @@ import numpy as np
 #: Edges of the bands, as shares of half the frame rate, in which a floor is looked for; a band belongs
 #: to it while all groups together have less than `FLAT` times the power of the highest three.
 BANDS, FLAT = np.linspace(0.4, 1.0, 9), 1.25
-#: From a frequency (Hz) on a tremble has this many times the largest power of the octave below, in all
-#: channels but the share `MOST`. What is slower has such peaks of its own: a gait's first harmonic has
-#: little below it.
-TREMBLES = ((1.6, 2.0), (2.5, 0.8), (3.5, 0.42))
-MOST = 0.4
-#: And as many times the largest power of the octave above, times this.
-ABOVE = 8.0
+#: From a frequency (Hz) on a tremble stands out of the octave below by this factor, and by `ABOVE` times
+#: this out of the octave above, in what the quietest of all channels but these shares have at most.
+#: People's joints differ by orders of magnitude, and the quiet ones have no step of their own; a tremble
+#: is in all. What is slower has such peaks of its own.
+TREMBLES = ((1.6, 7.0), (2.5, 4.0), (3.5, 3.0))
+ABOVE, QUIETEST = 4.0, (0.1, 0.2, 0.3, 0.5)
+#: Channels of less power than this share of the strongest one's stand still.
+STILL = 1e-9
 #: A tremble is told apart from this many widths of a tone on.
 RESOLVED = 1.9
 #: The highest tremble (Hz) that is looked for by itself; what is faster counts as white noise.
 HIGHEST_HZ = 15.0
 #: White noise (mm, rms over joints) from which a motion trembles: clean ones have up to 4, where it is
-#: fast, at 30 frames/s. Where the highest bands begin below this frequency (Hz) they hold motion.
-WHITE_MM, WHITE_HZ = 5.0, 6.0
+#: fast, at 30 frames/s. Less than this share of the way from frame to frame (rms) is none either: flips and
+#: sprints have it. Where the highest bands begin below this frequency (Hz) they hold motion.
+WHITE_MM, WHITE_SHARE, WHITE_HZ = 5.0, 0.08, 6.0
 #: Frames that a clip must have for its noise to be told.
 SHORTEST = 12
 #: So many trembles are looked for, one after another.
@@ -90,7 +92,8 @@ class Spectrum:
 
     def tremble(self) -> float | None:
         """The frequency (Hz) of the clearest tremble, None without any."""
-        alive = self.channels[:, self.channels.sum(0) > 1e-10 * self.channels.sum(0).max()]
+        total = self.channels.sum(0)
+        alive = self.channels[:, total > STILL * total.max()]
         # Bins of a quarter of a tone's width, each with its largest power.
         size = max(1, round(0.25 * self.width / self.hz[1]))
         top = min(int(np.searchsorted(self.hz, 2.3 * HIGHEST_HZ)), len(self.hz))
@@ -110,13 +113,14 @@ class Spectrum:
         at, spans = at[known], [(first[known], stop[known]) for first, stop in spans]
         if not len(at):
             return None
-        peak = np.maximum(power[at], np.maximum(power[at - 1], power[np.minimum(at + 1, count - 1)]))
+        peak = np.maximum(power, np.maximum(np.roll(power, 1, axis=0), np.roll(power, -1, axis=0)))
+        quiet = np.maximum(np.quantile(power, QUIETEST, axis=1).T, 1e-30)
         over, under = (
-            np.quantile(peak / np.maximum(_largest(power, *span), 1e-30), MOST, axis=1) for span in spans
+            np.quantile(peak[at], QUIETEST, axis=1).T / _largest(quiet, *span) for span in spans
         )
         starts, limits = np.array(TREMBLES).T
         limit = limits[np.searchsorted(starts, hz[at] + 1e-9) - 1]
-        clear = np.minimum(over, under / ABOVE) / limit
+        clear = np.minimum(over, under / ABOVE).max(1) / limit
         if clear.max() < 1.0:
             return None
         power, found = alive, float(hz[at[clear.argmax()]])
@@ -137,9 +141,13 @@ class Spectrum:
         beside = (away > 1.2 * self.width) & (away < max(2.4 * self.width, 0.8))
         rest = np.exp(np.log(np.maximum(self.power[beside], 1e-300)).mean(0)) if beside.any() else 0.0
         peak = self.power[self.near(hz)].max(0)
-        # A tone a sin(2 pi f t) under a Hann window of T frames has a peak of a^2 T / 6.
-        seconds = 2.0 / self.width
-        return 3.0 * np.maximum(peak - rest, 0.0) / (seconds * self.fps), rest + np.zeros_like(peak)
+        # As `peak_of`, the other way round.
+        return np.maximum(peak - rest, 0.0) / self.peak_of(1.0), rest + np.zeros_like(peak)
+
+    def peak_of(self, variance: np.ndarray | float) -> np.ndarray:
+        """The power at the peak of tones of a variance: a sin(2 pi f t) under a Hann window of T frames
+        has a^2 T / 6."""
+        return np.asarray(variance) * (2.0 / self.width) * self.fps / 3.0
 
 
 def _largest(values: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
@@ -169,4 +177,6 @@ def white_mm(positions: np.ndarray, fps: float) -> float:
     # 3-vector is 1.538 s.
     rough = np.median(np.linalg.norm(np.diff(positions, n=4, axis=0), axis=-1), axis=0)
     usual = 3.0 * ((rough / (math.sqrt(70.0) * 1.538)) ** 2).mean()
-    return 1e3 * math.sqrt(min(floor, usual))
+    white = math.sqrt(min(floor, usual))
+    way = math.sqrt((np.diff(positions, axis=0) ** 2).sum(-1).mean())
+    return 1e3 * white if white > WHITE_SHARE * way else 0.0

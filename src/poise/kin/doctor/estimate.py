@@ -17,6 +17,7 @@ from poise.kin.doctor.faults import Fault
 from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
 from poise.motion.points.clean import drop_spikes
+from poise.motion.skeleton import posed
 from poise.motion.smoothing import faded, filled, pieces, smoothed, spline, tremble_of
 from poise.motion.spectrum import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
 from poise.spatial import (
@@ -36,6 +37,10 @@ HELD_S, LEAPS, LEAP_RAD = 0.08, 3.0, 0.03
 #: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
 #: toes snap by nearly as much in kicks and dashes.
 SPIKE_RAD, SPIKE_M = 0.35, 0.06
+#: A tremble is looked for in what is faster than this (Hz), of axes that turn by more than this (rad).
+SLOW_HZ, STILL_RAD = 0.7, 1e-5
+#: Cycles are the same where they are apart by less than this share of their energy.
+REPEATED = 1e-4
 
 
 def refill(clip: Clip, found: Sequence[tuple[str, int, int, int]] | None = None) -> Clip:
@@ -96,7 +101,7 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     groups, trembles = np.repeat(np.arange(len(clip.skeleton)), 3), list[Fault]()
     for here in pieces(clip.frames, clip.fps):
         first, last, places = here.start, here.stop - 1, positions[here]
-        hz = _pose_spectrum(np.array(clip.root_pos[here]), calm[here], clip.fps).tremble()
+        hz = _tremble_hz(calm[here], clip.fps)
         if hz is not None:
             found = Spectrum.of(places.reshape(len(places), -1), clip.fps, groups)
             size = 1e3 * math.sqrt(float(found.tone(hz)[0].mean()))
@@ -117,14 +122,13 @@ def _piece(
     if len(root) < SHORTEST:
         return None
     for _ in range(LINES):
-        hz = _pose_spectrum(calm_root, calm["own"], clip.fps).tremble()
+        hz = _tremble_hz(calm["own"], clip.fps)
         if hz is None:
             break
         tones.append(hz)
-        only = np.zeros(3, dtype=int)
-        calm_root = (
-            calm_root - tremble_of(calm_root, only, Spectrum.of(calm_root, clip.fps, only), hz)[0]
-        )
+        axes = np.arange(3)
+        found = Spectrum.of(calm_root, clip.fps, axes)
+        calm_root = calm_root - tremble_of(calm_root, axes, found, hz)[0]
         calm = {frame: _still(quats, clip.fps, hz) for frame, quats in calm.items()}
     if not tones and white_mm(positions, clip.fps) < WHITE_MM:
         return None
@@ -136,14 +140,21 @@ def _piece(
     quats = calm["own" if own else "world"]
     y = np.concatenate((quats.reshape(frames, -1), calm_root), 1)
     groups = _groups(joints)
-    x = smoothed(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
-    out = torch.tensor(x[:, : 4 * joints].reshape(quats.shape))
-    out = normalize(out)
+    # What a tremble alone shook is left without it; smoothing takes white noise.
+    if not tones or _white_of(clip, calm_root, calm["own"]) >= WHITE_MM:
+        y = smoothed(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
+    out = normalize(torch.tensor(y[:, : 4 * joints].reshape(quats.shape)))
     if not own:
         local = [out[:, 0]]
         local += [quat_between(out[:, p], out[:, j]) for j, p in enumerate(clip.skeleton.parents) if j]
         out = torch.stack(local, 1)
-    return x[:, 4 * joints :], out.numpy()
+    return y[:, 4 * joints :], out.numpy()
+
+
+def _white_of(clip: Clip, root: np.ndarray, rot: np.ndarray) -> float:
+    """White noise (mm) of a piece of a clip in another motion, see `white_mm`."""
+    unit = rot / np.linalg.norm(rot, axis=-1, keepdims=True)
+    return white_mm(posed(clip.skeleton.parents, clip.skeleton.offsets, root, unit)[0], clip.fps)
 
 
 def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
@@ -193,6 +204,45 @@ def _pose_spectrum(root: np.ndarray, rot: np.ndarray, fps: float) -> Spectrum:
     return Spectrum.of(y, fps, _groups(rot.shape[1]))
 
 
+def _tremble_hz(rot: np.ndarray, fps: float) -> float | None:
+    """The frequency (Hz) of the clearest tremble of rotations `(T, J, 4)`; None without any, and of
+    cycles that repeat each other exactly, as those of a loop: noise never comes back."""
+    turn = _turns(rot, fps, SLOW_HZ).reshape(len(rot), -1)
+    turn = turn[:, np.abs(turn).max(0) > STILL_RAD]
+    if not turn.shape[1] or _repeats(rot.reshape(len(rot), -1)):
+        return None
+    return Spectrum.of(turn, fps, np.zeros(turn.shape[1], dtype=int)).tremble()
+
+
+def _repeats(y: np.ndarray) -> bool:
+    """Whether `y (T, C)` is one cycle again and again."""
+    frames, y = len(y), y - y.mean(0)
+    # |y_t - y_t+P|^2 summed over t, of all P at once.
+    power = (np.abs(np.fft.rfft(y, 2 * frames, axis=0)) ** 2).sum(1)
+    shared = np.fft.irfft(power)[: frames // 2 + 1]
+    square = np.concatenate(([0.0], np.cumsum((y**2).sum(1))))
+    lag = np.arange(3, frames // 2 + 1)
+    apart = square[frames - lag] + square[-1] - square[lag] - 2 * shared[lag]
+    return bool(len(lag) and (apart < REPEATED * square[-1]).any())
+
+
+def _turns(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
+    """`(T, J, 3)` rad, the small turns from the motion below `hz` to `rot (T, J, 4)`, in their axes."""
+    base = _slow(rot, fps, hz)
+    return quat_to_rotvec(quat_mul(quat_conj(base), torch.tensor(rot))).numpy()
+
+
+def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
+    """`(T, J, 4)` the motion of rotations below a frequency."""
+    # SciPy takes 0.3 s to load, which is spared where nothing asks for it.
+    from scipy.linalg import cho_solve_banded
+
+    frames = len(rot)
+    stiff = float((2 * np.sin(np.pi * hz / fps)) ** -6)
+    slow = cho_solve_banded((spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
+    return normalize(torch.tensor(slow))
+
+
 def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     """The rotations `(T, J, 4)` without a tremble at `hz`.
 
@@ -200,13 +250,8 @@ def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
     of a quaternion the joint's turning modulates it. So it is taken off the small turn between a slow
     motion and the joint, in the frame in which the tone stands out most.
     """
-    # SciPy takes 0.3 s to load, which clean clips need not wait for.
-    from scipy.linalg import cho_solve_banded
-
     frames, joints = rot.shape[:2]
-    stiff = float((2 * np.sin(np.pi * hz / 3 / fps)) ** -6)
-    slow = cho_solve_banded((spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
-    base, quat = torch.tensor(slow / np.linalg.norm(slow, axis=-1, keepdims=True)), torch.tensor(rot)
+    base, quat = _slow(rot, fps, hz / 3), torch.tensor(rot)
     groups = np.repeat(np.arange(joints), 3)
     ways = (
         (lambda x: quat_mul(quat_conj(base), x), lambda d: quat_mul(base, d)),
