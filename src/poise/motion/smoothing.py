@@ -71,11 +71,13 @@ def faded(here: slice, frames: int, fps: float) -> np.ndarray:
 
 
 def tremble_of(
-    y: np.ndarray, groups: np.ndarray, found: Spectrum, hz: float
+    y: np.ndarray, groups: np.ndarray, found: Spectrum, hz: float, most: float = math.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it."""
+    """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it. most: the
+    largest variance that it can have in a group."""
     out = np.zeros_like(y)
     size, beside = found.tone(hz)
+    size = np.minimum(size, most)
     floor = found.floor()
     for g in np.unique(groups):
         if size[g] <= 0.0:
