@@ -13,6 +13,7 @@ from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
 from poise.kin.doctor.drift import mend_drift
+from poise.kin.doctor.estimate import noise_faults
 from poise.kin.doctor.faults import KINDS, Fault, by_kind, read_faults, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
@@ -72,7 +73,9 @@ def examine(clip: Clip) -> Examination:
     if travel is not None:
         support = support_of(travelled(clip, travel.level), anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
-    faults = [*timing_faults(clip), *_joint_faults(report, clip), *report.noise]
+    # What is to stay is told all the same.
+    noise = noise_faults(clip)[0] if clip.skeleton.source.raw else report.noise
+    faults = [*timing_faults(clip), *_joint_faults(report, clip), *noise]
     faults += [*jitter_faults(cleaned), *limit_faults(clip), *read_faults(clip)]
     if support is not None:
         faults += [

@@ -97,8 +97,8 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
         cleaned, jumps = drop_spikes(points.positions, points.fps)
         notes += spike_note(points.names, jumps)
         points = points.replaced(positions=cleaned)
-    tracks, found = places_of(points)
-    notes += found
+    tracks, told = places_of(points)
+    notes += told
     unknown = unknown_labels(points.names)
     if unknown:
         notes.append(
