@@ -9,7 +9,7 @@ the truth. The null row does nothing. Slide is the horizontal speed of ankles an
 the truth's own stand: within 5 cm of their lowest and slower than 0.1 m/s.
 
 As keypoints the joints of a clip, onto which a skeleton was fitted, are its keypoints: the dirt moves
-each by itself, drop-outs are missing for 0.3 s, and what is repaired is the clip that reading them gives.
+each by itself, drop-outs are missing for 0.3 s, and repaired is the clip that reading them gives.
 The filters act on their places, gaps interpolated.
 """
 

@@ -28,6 +28,7 @@ from poise.motion.io.points.arrays import (
     mdm_points,
     named_joint_points,
 )
+from poise.motion.io.points.features import feature_points, is_features
 from poise.motion.io.points.raw import as_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.io.refused import is_qpos, refuse_array, refuse_qpos
@@ -81,6 +82,9 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
             if is_joints(header.shape, header.dtype):
                 file.seek(0)
                 return as_clip(joint_points)(read_npy(file, path), path, options)
+            if is_features(header.shape, header.dtype):
+                file.seek(0)
+                return as_clip(feature_points)(read_npy(file, path), path, options)
             if not header.dtype.hasobject:
                 refuse_array(header.shape, path)
     if not options.allow_pickle:

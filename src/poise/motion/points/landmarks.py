@@ -14,6 +14,7 @@ from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth
 from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels, unknown_labels
 from poise.motion.points.markers import marker_places
 from poise.motion.points.tremble import Tremble, still
+from poise.motion.smoothing import filled
 
 # What a place is filled relative to, so that a hidden wrist travels with its elbow.
 _CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
@@ -125,7 +126,7 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
     if gaps:
         worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
-    tracks = _filled(tracks)
+    tracks = _filled(tracks, points.fps)
     found: Tremble | None = None
     if smooth_hz is None and not points.source.raw:
         tracks, found = still(tracks, points.fps)
@@ -162,19 +163,31 @@ def _without_rare(tracks: dict[str, np.ndarray], notes: list[str]) -> dict[str, 
     return {place: track for place, track in tracks.items() if place not in rare}
 
 
-def _filled(tracks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _filled(tracks: dict[str, np.ndarray], fps: float) -> dict[str, np.ndarray]:
     """All gaps interpolated: hips in the world, everything else as seen from its carrier."""
-    out = {f"{side}_hip": fill(tracks[f"{side}_hip"]) for side in SIDES}
+    out = {f"{side}_hip": _curved(tracks[f"{side}_hip"], fps) for side in SIDES}
     hips = (out["left_hip"] + out["right_hip"]) / 2
-    out |= {f"{side}_shoulder": hips + fill(tracks[f"{side}_shoulder"] - hips) for side in SIDES}
+    out |= {f"{side}_shoulder": hips + _curved(tracks[f"{side}_shoulder"] - hips, fps) for side in SIDES}
     chest = (out["left_shoulder"] + out["right_shoulder"]) / 2
     for part, carrier in _CARRIER.items():
         for side in SIDES:
             place, above = f"{side}_{part}", f"{side}_{carrier}"
             if place in tracks:
-                out[place] = out[above] + fill(tracks[place] - out[above])
+                out[place] = out[above] + _curved(tracks[place] - out[above], fps)
     for place, track in tracks.items():
         if place not in out:
             base = hips if place == "pelvis" or place.startswith("spine") else chest
-            out[place] = base + fill(track - base)
+            out[place] = base + _curved(track - base, fps)
+    return out
+
+
+def _curved(values: np.ndarray, fps: float) -> np.ndarray:
+    """Values `(T, C)` with gaps on the smoothest curve; at the ends they hold."""
+    known = ~np.isnan(values).any(-1)
+    if known.all() or known.sum() < 4:
+        return fill(values)
+    first, last = np.flatnonzero(known)[[0, -1]]
+    out = fill(values)
+    inside = slice(first, last + 1)
+    out[inside] = filled(out[inside], known[inside], fps)
     return out
