@@ -11,7 +11,6 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
-from poise.motion.io.foot_labels import foot_labels, labelled
 from poise.motion.io.numpy.arrays import numeric, refuse_bad, require
 from poise.motion.io.numpy.smpl_table import LAYOUTS
 from poise.motion.io.raw import RawMotion, ReadOptions, assemble
@@ -75,7 +74,6 @@ def _skeletons() -> dict[int, tuple[tuple[str, ...], tuple[int, ...]]]:
 
 SKELETONS = _skeletons()
 """Names and parents by the number of joints: SOMA with 77 or 30, the body of SMPL-X with 22."""
-_FEET = (("LeftFoot", "RightFoot"), ("L_Ankle", "R_Ankle"))
 ROBOT = 34
 """Joints of Kimodo's robot."""
 
@@ -129,8 +127,4 @@ def read_kimodo(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Cl
         up_axis="Y",
         notes=notes,
     )
-    clip = assemble(raw, options)
-    if "foot_contacts" not in data:
-        return clip
-    labels, note = foot_labels(data["foot_contacts"], len(pos))
-    return labelled(clip, labels, note, next(f for f in _FEET if f[0] in names))
+    return assemble(raw, options)

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.motion.io.foot_labels import foot_labels
 from poise.motion.io.points.arrays import HUMANML3D, joint_points
 from poise.motion.io.points.raw import RawPoints
 from poise.motion.io.raw import UNSTATED, ReadOptions
 
 #: Root (turn, way in two axes, height), places, turns and velocities of the joints, contacts.
 WIDTH = 263
-_PLACES, _CONTACTS = slice(4, 4 + 3 * 21), slice(259, 263)
+_PLACES, CONTACTS = slice(4, 4 + 3 * 21), slice(259, 263)
 #: Heights (m) that a pelvis has on average.
 _LOWEST, _HIGHEST = 0.05, 2.5
 
@@ -25,7 +24,7 @@ def is_features(shape: tuple[int, ...], dtype: np.dtype) -> bool:
 
 
 def feature_points(table: np.ndarray, path: Path, options: ReadOptions = UNSTATED) -> RawPoints:
-    """The joints of features `(T, 263)`, m, Y up, with their labels of foot contacts.
+    """The joints of features `(T, 263)`, m, Y up; their `CONTACTS` are labels of the feet.
 
     The root turns about Y by twice the sum of the first feature and goes by the next two in its own
     frame; joints lie about it in that frame.
@@ -34,8 +33,9 @@ def feature_points(table: np.ndarray, path: Path, options: ReadOptions = UNSTATE
         PoiseError: features that are normalised, which tell no place.
     """
     x = table.astype(np.float64)
-    labels, note = foot_labels(x[:, _CONTACTS], len(x))
-    if not _LOWEST < np.median(x[:, 3]) < _HIGHEST or labels is None:
+    touch = x[:, CONTACTS]
+    # Normalised ones have a mean of 0 and a deviation of 1.
+    if not (_LOWEST < np.median(x[:, 3]) < _HIGHEST and touch.min() > -0.5 and touch.max() < 1.5):
         raise PoiseError(
             f"its array of shape {table.shape} holds the features of HumanML3D, but normalised or empty",
             path,
@@ -52,7 +52,7 @@ def feature_points(table: np.ndarray, path: Path, options: ReadOptions = UNSTATE
     raw = joint_points(joints, path, options)
     return RawPoints(
         "humanml3d", path, HUMANML3D, raw.positions, raw.fps, 1.0, "Y",
-        notes=(*raw.notes, note), rates=raw.rates, contacts=labels,
+        notes=raw.notes, rates=raw.rates,
     )  # fmt: skip
 
 

@@ -23,7 +23,6 @@ from poise.motion.keypoints import Keypoints
 from poise.motion.points import FitConfig, fit_clip
 from poise.motion.points.labels import NEEDED, SIDES
 from poise.motion.points.landmarks import places_of
-from poise.motion.points.measure import TITLE
 from poise.motion.skeleton import Source
 
 UNITS_M = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -37,8 +36,7 @@ class RawPoints:
 
     positions: `(T, K, 3)`, NaN where missing. unit_m, up_axis: what the file states, None where it
     states nothing. confidence: `(T, K)` or None. unit_note: why `unit_m`, where no file states it.
-    rates: as in `Source.rates`. contacts: `(T, 4)` bool, when left heel, left toe, right heel and right
-    toe touch the floor; None where nothing says so.
+    rates: as in `Source.rates`.
     """
 
     format: str
@@ -52,7 +50,6 @@ class RawPoints:
     notes: tuple[str, ...] = ()
     unit_note: str = ""
     rates: tuple[float, ...] = ()
-    contacts: np.ndarray | None = None
 
 
 # The places with the bones that make up a body's height, as the guesses know their names.
@@ -115,14 +112,8 @@ def as_clip(points: Callable[..., RawPoints]) -> Callable[..., Clip]:
 
     def read(*given: Any) -> Clip:
         options: ReadOptions = given[-1]
-        raw = points(*given)
-        clip = fit_clip(assemble_points(raw, options), FitConfig(smooth_hz=options.smooth_hz))
-        if raw.contacts is None or len(raw.contacts) != clip.frames:
-            return clip
-        feet = [clip.skeleton.index(f"{TITLE[side]}Foot") for side in SIDES]
-        return clip.replaced(
-            contacts=tuple((j, raw.contacts[:, 2 * k : 2 * k + 2]) for k, j in enumerate(feet))
-        )
+        raw = assemble_points(points(*given), options)
+        return fit_clip(raw, FitConfig(smooth_hz=options.smooth_hz))
 
     return read
 
