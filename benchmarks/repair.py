@@ -1,12 +1,16 @@
 """Dirt of known size on clean clips, and what the repair leaves of it beside the best filters.
 
-    python benchmarks/repair.py --data FOLDER [--smoke] [--only white tone5] -o results/repair.csv
+    python benchmarks/repair.py --data FOLDER [--as keypoints] [--smoke] [--only white tone5] -o FILE.csv
 
 FOLDER holds the development set. Every clip is dirtied so that its joints are 10 to 100 mm off on
 average, repaired by `heal`, and filtered by zero-phase Butterworth filters, Savitzky-Golay filters and
 the one-euro filter with the setting that an oracle chooses for the clip: the one that comes nearest to
 the truth. The null row does nothing. Slide is the horizontal speed of ankles and toes in frames in which
 the truth's own stand: within 5 cm of their lowest and slower than 0.1 m/s.
+
+As keypoints the joints of a clip, onto which a skeleton was fitted, are its keypoints: the dirt moves
+each by itself, drop-outs are missing for 0.3 s, and repaired is the clip that reading them gives.
+The filters act on their places, gaps interpolated.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ import csv
 import random
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +32,9 @@ from poise.errors import PoiseError
 from poise.kin import heal
 from poise.motion import Clip, read_clip, trim
 from poise.motion.edits import resample
+from poise.motion.keypoints import Keypoints
+from poise.motion.points import fit_clip
+from poise.motion.points.clean import fill
 from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
 
 COLUMNS = ("subject", "metric", "value", "spread", "n", "seeds", "policy", "commit", "command")
@@ -173,6 +181,27 @@ def one_euro(x: np.ndarray, fps: float, hz: float, beta: float) -> np.ndarray:
     return out
 
 
+def seen(clip: Clip, kind: str, mm: float, seed: int) -> Keypoints:
+    """The clip's joints as keypoints with dirt of a kind, each `mm` off on average."""
+    rng, pos = np.random.default_rng(seed), clip.positions()
+    if kind == "dropouts":
+        length = round(0.3 * clip.fps)
+        for j in range(len(clip.skeleton)):
+            for _ in range(rng.poisson(clip.seconds / 5)):
+                at = int(rng.integers(1, max(2, clip.frames - length)))
+                pos[at : at + length, j] = np.nan
+    else:
+        noise = KINDS[kind](rng, clip)[0]
+        pos = pos + noise * (mm / 1e3 / np.linalg.norm(noise, axis=-1).mean())
+    return Keypoints(clip.skeleton.names, pos, clip.fps, clip.name)
+
+
+def smoothed(points: Keypoints, one: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Places `(T, J, 3)` m of keypoints with the filter on them."""
+    whole = np.stack([fill(points.positions[:, k]) for k in range(len(points.names))], 1)
+    return one(whole.reshape(len(whole), -1)).reshape(whole.shape)
+
+
 def filtered(clip: Clip, one: Callable[[np.ndarray], np.ndarray]) -> Clip:
     """The clip with the filter on the components of its quaternions and on its root."""
     rot = one(np.array(clip.rot).reshape(clip.frames, -1)).reshape(clip.rot.shape)
@@ -180,10 +209,11 @@ def filtered(clip: Clip, one: Callable[[np.ndarray], np.ndarray]) -> Clip:
     return clip.replaced(rot=rot, root_pos=one(np.array(clip.root_pos)))
 
 
-def measured(clip: Clip, truth: Clip) -> dict[str, float]:
-    """What is left: distance, end of the path, slide of feet that stand in truth, share of its jerk."""
+def measured(here: np.ndarray, truth: Clip) -> dict[str, float]:
+    """What is left in joints' places `(T, J, 3)` m: distance, end of the path, slide of feet that stand
+    in truth, share of its jerk."""
     feet = [j for j, n in enumerate(truth.skeleton.names) if "foot" in n.lower() or "toe" in n.lower()]
-    there, here = truth.positions(), clip.positions()
+    there = truth.positions()
     speed = np.linalg.norm(np.diff(there[:, feet], axis=0), axis=-1) * truth.fps
     stands = (there[1:, feet, 2] < there[:, feet, 2].min(0) + 0.05) & (speed < 0.1)
 
@@ -194,10 +224,48 @@ def measured(clip: Clip, truth: Clip) -> dict[str, float]:
     jerk = [float(np.linalg.norm(np.diff(p, n=3, axis=0), axis=-1).mean()) for p in (here, there)]
     return {
         "distance_mm": 1e3 * float(np.linalg.norm(here - there, axis=-1).mean()),
-        "end_mm": 1e3 * float(np.linalg.norm(clip.root_pos[-1] - truth.root_pos[-1])),
+        "end_mm": 1e3 * float(np.linalg.norm(here[-1, 0] - there[-1, 0])),
         "slide_more_mm_per_s": slide(here) - slide(there),
         "jerk_ratio": jerk[0] / max(jerk[1], 1e-9),
     }
+
+
+def attempts(clip: Clip, kind: str, mm: float, seed: int) -> list[np.ndarray] | None:
+    """Places `(T, J, 3)` m of the dirty clip, of the best filter's and of the repaired one, None where
+    the repair has other frames."""
+    broken, there = dirty(clip, kind, mm, seed), clip.positions()
+    fixed = heal(broken)
+    if fixed.frames != clip.frames:
+        return None
+    tried = (filtered(broken, one).positions() for _, one in filters(clip.fps, clip.frames))
+    return [broken.positions(), _nearest(tried, there), fixed.positions()]
+
+
+def attempts_at_points(clip: Clip, kind: str, mm: float, seed: int) -> list[np.ndarray] | None:
+    """The same for the clip's joints as keypoints."""
+    broken, there = seen(clip, kind, mm, seed), clip.positions()
+    fixed = fit_clip(broken)
+    if fixed.frames != clip.frames:
+        return None
+    tried = [smoothed(broken, one) for _, one in filters(clip.fps, clip.frames)]
+    whole = smoothed(broken, lambda x: x)
+    return [whole, _nearest([*tried, whole], there), fixed.positions()]
+
+
+def _nearest(tried: Iterable[np.ndarray], there: np.ndarray) -> np.ndarray:
+    return min(tried, key=lambda p: float(np.linalg.norm(p - there, axis=-1).mean()))
+
+
+def fitted_of(clips: Iterable[Clip], count: int) -> Iterator[Clip]:
+    """Clips as a skeleton follows their joints, those that show a whole body."""
+    for clip in clips:
+        with suppress(PoiseError):
+            made = fit_clip(Keypoints(clip.skeleton.names, clip.positions(), clip.fps, clip.name))
+            if made.frames == clip.frames:
+                yield made
+                count -= 1
+        if not count:
+            return
 
 
 def clips_of(data: Path, count: int) -> Iterator[Clip]:
@@ -231,7 +299,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--only", nargs="*", default=[*KINDS, "dropouts", "all"])
+    parser.add_argument("--as", dest="form", choices=("rotations", "keypoints"), default="rotations")
+    parser.add_argument("--only", nargs="*", help="kinds of dirt, by default all that there are")
     parser.add_argument("--sizes", nargs="*", type=float, default=SIZES_MM)
     parser.add_argument("--clips", type=int, default=CLIPS)
     parser.add_argument("--smoke", action="store_true", help="three clips, one size")
@@ -243,21 +312,24 @@ def main() -> None:
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
     ).stdout.strip()
-    clips = list(clips_of(options.data, options.clips))
+    points = options.form == "keypoints"
+    try_out, kinds = attempts, [*KINDS, "dropouts", "all"]
+    clips: Iterable[Clip] = clips_of(options.data, options.clips)
+    if points:
+        try_out, kinds = attempts_at_points, ["white", "tone5", "tone2", "spikes", "dropouts"]
+        clips = fitted_of(clips_of(options.data, 2 * options.clips), options.clips)
+    clips = list(clips)
     rows = []
-    for kind in options.only:
+    for kind in options.only or kinds:
         for mm in options.sizes if kind != "dropouts" else (0.0,):
             left: dict[str, list[dict[str, float]]] = {"null": [], "best filter": [], "repair": []}
             for k, clip in enumerate(clips):
-                broken = dirty(clip, kind, mm, k)
-                fixed = heal(broken)
-                if fixed.frames != clip.frames:
+                made = try_out(clip, kind, mm, k)
+                if made is None:
                     continue
-                tried = [filtered(broken, one) for _, one in filters(clip.fps, clip.frames)]
-                best = min(tried, key=lambda c: off_mm(c, clip))
-                for name, made in zip(left, (broken, best, fixed), strict=True):
-                    left[name].append(measured(made, clip))
-            subject = f"{kind} {mm:g} mm" if mm else kind
+                for name, places in zip(left, made, strict=True):
+                    left[name].append(measured(places, clip))
+            subject = (f"{kind} {mm:g} mm" if mm else kind) + (" of keypoints" if points else "")
             ratio = [
                 a["distance_mm"] / b["distance_mm"]
                 for a, b in zip(left["repair"], left["best filter"], strict=True)
@@ -275,7 +347,7 @@ def main() -> None:
                 f"{np.mean([r > 1.25 for r in ratio]):.2f}",
                 file=sys.stderr,
             )
-    command = "python benchmarks/repair.py --data FOLDER -o results/repair.csv"
+    command = f"python benchmarks/repair.py --data FOLDER --as {options.form} -o {options.out.name}"
     options.out.parent.mkdir(parents=True, exist_ok=True)
     with options.out.open("w", newline="") as file:
         writer = csv.writer(file)

@@ -191,7 +191,7 @@ def test_single_arrays_and_robots_are_named(tmp_path: Path) -> None:
         "are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays"
     )
     for shape, message in (
-        ((60, 263), "holds the features of HumanML3D, and no joints. Give the joints recovered"),
+        ((60, 263), "holds the features of HumanML3D, but normalised or empty. Give features * Std"),
         ((5, 20, 22, 3), "holds 5 clips. Save each as a file of its own"),
         ((5, 20, 24, 3), "holds 5 clips"),
         ((20, 66), "may be joints of shape (20, 22, 3), flattened. If so, save it with reshape(20, 22,"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -140,20 +141,36 @@ def test_no_quaternion_flips_its_sign_and_the_twist_is_steady_through_straight_l
     assert float(quat_angle(quat_between(arm[1:], arm[:-1])).max()) * fps < 3.0
 
 
-def test_noise_of_a_centimetre_is_carried_and_smoothing_takes_it_away() -> None:
+def test_collars_in_one_place_do_not_turn_the_chest() -> None:
+    with as_file(files("poise") / "data/walk.bvh") as path:
+        walk = read_clip(path)
+    # Its collars both lie on its neck.
+    names, pos = walk.skeleton.names, walk.positions()
+    assert np.allclose(pos[:, names.index("LeftShoulder")], pos[:, names.index("RightShoulder")])
+    clip = fit_clip(Keypoints(names, pos, walk.fps))
+    chest = torch.tensor(clip.world()[1][:, clip.skeleton.index("Spine1")])
+    assert float(quat_angle(quat_between(chest[1:], chest[:-1])).max()) < np.radians(8)
+
+
+def test_noise_of_a_centimetre_is_taken_off_unless_the_file_is_to_stay() -> None:
     points = standing(120, 60.0)
     rng = np.random.default_rng(0)
     noisy = points.replaced(positions=points.positions + 0.01 * rng.standard_normal((120, len(BODY), 3)))
-    rough, calm = fit_clip(noisy), fit_clip(noisy, FitConfig(smooth_hz=5.0))
+    raw = noisy.replaced(source=replace(noisy.source, raw=True))
+    rough, calm, filtered = fit_clip(raw), fit_clip(noisy), fit_clip(noisy, FitConfig(smooth_hz=5.0))
     assert mean_mm(points, rough) < 16.0
-    jerk = [np.abs(np.diff(c.positions(), 2, axis=0)).mean() for c in (rough, calm)]
-    assert jerk[1] < 0.2 * jerk[0]
-    assert any("smoothed" in note for note in calm.skeleton.source.notes)
-    assert any("jitter by about 10 mm" in note for note in rough.skeleton.source.notes)
-    source = rough.skeleton.source
-    assert dict(source.evidence)["jitter"] in source.notes
-    assert "jitter" not in dict(calm.skeleton.source.evidence)
-    assert not any("jitter" in note for note in fit_clip(points).skeleton.source.notes)
+    assert mean_mm(points, calm) < 0.75 * mean_mm(points, filtered)
+    assert mean_mm(points, filtered) < 0.6 * mean_mm(points, rough)
+    assert any("smoothed" in note for note in filtered.skeleton.source.notes)
+    told = "The keypoints tremble by 17 mm from frame to frame: the tremble is taken off"
+    assert any(note.startswith(told) for note in calm.skeleton.source.notes)
+    ((kind, how, first, last, size),) = calm.skeleton.source.mended
+    # Three axes of 10 mm each.
+    assert (kind, how, first, last) == ("tremble", "from frame to frame", 0, 119)
+    assert size == pytest.approx(0.0173, rel=0.1)
+    for clip in (rough, filtered, fit_clip(points)):
+        assert not any("tremble" in note for note in clip.skeleton.source.notes)
+        assert not clip.skeleton.source.mended
 
 
 def test_spikes_are_taken_out_and_steps_and_fast_motion_stay() -> None:

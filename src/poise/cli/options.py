@@ -64,7 +64,10 @@ class Reading:
     """Read pickled files (AIST++ .pkl, poselib .npy) as plain arrays; no code of theirs runs."""
 
     smooth: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="")] = None
-    """Cut-off of a low-pass on jittering keypoints (TRC, C3D, CSV): 6 suits most motion."""
+    """Cut-off of a low-pass on keypoints (TRC, C3D, CSV), in place of what their noise asks for."""
+    raw: Flag = False
+    """Follow the motion as the file has it: no tremble is taken off, of joints or of keypoints, and no
+    joint that was lost is filled in."""
 
     def read(self, path: Path) -> Clip:
         """The clip in the file `path`."""
@@ -80,6 +83,7 @@ class Reading:
             allow_pickle=self.allow_pickle,
             take=self.take,
             smooth_hz=self.smooth,
+            raw=self.raw,
         )
         if clip.skeleton.source.rates:
             from poise.kin.rate.reading import settled

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Options:
     """Move a clip onto another human skeleton: joints are matched by their names, steps scaled by the
-    legs, standing feet kept standing."""
+    legs, standing feet kept standing. A tremble is taken off first, unless --raw says to keep it."""
 
     clip: Annotated[Positional[Path], arg(metavar="CLIP")]
     """The motion file."""
@@ -46,7 +46,7 @@ class Options:
 
 def run(options: Options, argv: Sequence[str]) -> Answer:
     """Reads both files, moves the motion over, writes, says what was matched and measured."""
-    from poise.kin import RetargetConfig, retarget
+    from poise.kin import RetargetConfig, retarget, without_noise
     from poise.motion.io import read_skeleton, write_clip
 
     out = options.out
@@ -55,14 +55,16 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     clip = options.reading.read(options.clip)
     onto = read_skeleton(options.onto, options.onto_skeleton)
     config = RetargetConfig(contacts=options.contacts, clear=options.contacts)
-    made, report = retarget(clip, onto, mapping, config)
+    calm, cleaned = without_noise(clip)
+    made, report = retarget(calm, onto, mapping, config)
     write_clip(made, out)
     show(report)
     say(f"{made.frames} frames at {made.fps:.5g} fps, {len(made.skeleton)} joints")
     # Both files' guesses (unit, vertical, ...) decide what is written.
     guessed = [*clip.skeleton.source.notes]
     guessed += [f"{options.onto.name}: {n}" for n in onto.skeleton.source.notes]
-    return Answer(report.to_dict(), {"clip": out}, [*guessed, *report.sentences()])
+    said = [*guessed, *cleaned.noise_sentences(), *report.sentences()]
+    return Answer(report.to_dict(), {"clip": out}, said)
 
 
 def pairs(texts: Sequence[str]) -> dict[str, str]:

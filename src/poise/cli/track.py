@@ -227,9 +227,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     saved = {"policy": o.save_policy} if o.save_policy else {}
     if o.learn and (out / "learned" / RUN_FILE).exists():
         saved["learned"] = out / "learned"
-    # What reading says of keypoints that jitter, which an option mends.
-    jitter = dict(tracked.placed.source.skeleton.source.evidence).get("jitter")
-    said = (*((f"{jitter}.",) if jitter else ()), *tracked.notes, *done.notes)
+    said = (*tracked.notes, *done.notes)
     early = (*said_early, *(tracked.doubts if told.failed else ()))
     code = LOST if told.failed else 0
     return Answer(result, {**done.paths, **saved}, said, code, told.word, done.card.mpjpe_mm, early)
@@ -325,5 +323,7 @@ def read(path: Path, reading: Reading) -> Clip | Keypoints:
     if reading.ground is not None or reading.swap_sides:
         # What was stated about the skeleton is known to the clip alone.
         return clip
-    stated = Stated(fps=reading.fps, unit_m=reading.unit_m(), up_axis=reading.up)
+    stated = Stated(
+        fps=reading.fps, unit_m=reading.unit_m(), up_axis=reading.up, take=reading.take, raw=reading.raw
+    )
     return points_of(clip, stated) or clip

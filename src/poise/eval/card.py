@@ -43,7 +43,9 @@ class ScoreCard:
     """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.
 
     NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
-    `kin.doctor.needs`. `variants` holds the tracking figures under each
+    `kin.doctor.needs`. `raw` is there where the motion came with noise that was taken off: the error
+    beside what came in (`mpjpe_mm`, `mpjpe_global_mm`), and that noise (`noise_mm`, and `noise_hz`, NaN
+    from frame to frame). `variants` holds the tracking figures under each
     weighting ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all
     frames, those after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success
     and tracking figures of action 0 from the same starts, `spread` their standard deviations over
@@ -73,6 +75,7 @@ class ScoreCard:
     mpjpe_succ_mm: float = NAN
     tracked: float = NAN
     needs: tuple[Mapping[str, Any], ...] = ()
+    raw: Mapping[str, float] = field(default_factory=dict)
     reference: Mapping[str, float] = field(default_factory=dict)
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
@@ -95,8 +98,10 @@ class ScoreCard:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values with the keys in field order; what is not finite becomes None."""
-        return plain(self)
+        """Plain JSON values with the keys in field order; what is not finite becomes None. `raw` is left
+        out where it is empty."""
+        out = plain(self)
+        return out if self.raw else {key: value for key, value in out.items() if key != "raw"}
 
 
 def write_score(card: ScoreCard, path: str | Path) -> Path:

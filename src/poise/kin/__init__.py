@@ -2,7 +2,7 @@
 
 from poise.kin.coords import clip_to_qpos, qpos_to_clip, qpos_velocity
 from poise.kin.cycle import close_cycle, cycle_step, cycle_velocity
-from poise.kin.doctor.clean import clean_clip, find_faults
+from poise.kin.doctor.clean import clean_clip, find_faults, without_noise
 from poise.kin.doctor.doctor import Examination, examine, heal
 from poise.kin.doctor.faults import Fault, by_kind
 from poise.kin.doctor.guesses import find_guesses, grounded
@@ -75,4 +75,5 @@ __all__ = [
     "swap_sides",
     "two_bone",
     "with_rest_pose",
+    "without_noise",
 ]

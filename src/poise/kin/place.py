@@ -73,7 +73,8 @@ def place_on_body(
         rate_hz: of the coordinates; by default the clip's own.
         example: a clip on the source's skeleton that shows how it stands, see `retarget`.
         how: it is retargeted.
-        clean: repair flips and impossible speeds (`clean_clip`).
+        clean: repair flips and impossible speeds, and take noise off unless the clip's source is raw
+            (`clean_clip`).
         level: turn feet that stand on their edge flat (`level_feet`).
         near: shift hinges by whole turns as near to this humanoid's ranges as can be.
         join: make the ends of a cyclic clip meet (`join_cycle`), unless that sinks it into the floor.
@@ -87,7 +88,8 @@ def place_on_body(
     skeleton = onto.skeleton if isinstance(onto, Clip) else onto
     if onto is not None and skeleton is not None and not clip.skeleton.same_bones(skeleton):
         moved, retargeting = retarget(clip, onto, config=how, example=example)
-    made, cleaned = clean_clip(moved) if clean else (moved, CleanReport())
+    raw = clip.skeleton.source.raw
+    made, cleaned = clean_clip(moved, raw=raw) if clean else (moved, CleanReport())
     turned = level_feet(made, table) if level else Levelled({})
     made = turned.onto(made)
     timed = made if rate_hz is None else resample(made, rate_hz)
@@ -118,8 +120,12 @@ def on_own_body(library: ClipLibrary, config: BodyConfig) -> tuple[ClipLibrary, 
     first = library.clips[0]
     if first.skeleton.names == own.skeleton.names:
         return library, table
-    moved = (retarget(c, own.skeleton, example=first)[0] for c in library)
-    return replace(library, clips=tuple(moved)), table
+    moved = [retarget(c, own.skeleton, example=first)[0] for c in library]
+    kept = tuple(
+        m.replaced(skeleton=m.skeleton.with_source(raw=True)) if c.skeleton.source.raw else m
+        for m, c in zip(moved, library, strict=True)
+    )
+    return replace(library, clips=kept), table
 
 
 def joint_error(clip: Clip, qpos: np.ndarray, table: BodyTable) -> float:

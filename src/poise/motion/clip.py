@@ -63,6 +63,8 @@ class Clip:
     rot: `(T, J, 4)` wxyz, each joint's rotation in its parent's frame (the root's in the world).
     fps: frames per second.
     name: a short name, usually the file's stem. cyclic: the end joins the start (DeepMimic `wrap`).
+    contacts: foot joints with `(T, 2)` bool, when heel and toe touch the floor, where a file says so; a
+        clip with other frames has none.
     """
 
     skeleton: Skeleton
@@ -71,6 +73,7 @@ class Clip:
     fps: float
     name: str = "clip"
     cyclic: bool = False
+    contacts: tuple[tuple[int, np.ndarray], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root_pos", _frozen(self.root_pos))
@@ -84,6 +87,8 @@ class Clip:
             )
         check_frames(frames, self.name)
         check_rate(self.fps, self.name)
+        if any(touch.shape != (frames, 2) for _, touch in self.contacts):
+            object.__setattr__(self, "contacts", ())
         if not np.isfinite(self.root_pos).all():
             frame = int(np.argwhere(~np.isfinite(self.root_pos))[0][0])
             raise PoiseError(f"the root position is not finite at frame {frame}", self.name)

@@ -77,7 +77,9 @@ def blended(clip: Clip, low: np.ndarray, share: np.ndarray) -> Clip:
 
 def trim(clip: Clip, start: int, stop: int | None = None) -> Clip:
     """Frames `start` up to but not including `stop`."""
-    return clip.replaced(root_pos=clip.root_pos[start:stop], rot=clip.rot[start:stop], cyclic=False)
+    contacts = tuple((j, touch[start:stop]) for j, touch in clip.contacts)
+    cut = {"root_pos": clip.root_pos[start:stop], "rot": clip.rot[start:stop], "contacts": contacts}
+    return clip.replaced(**cut, cyclic=False)
 
 
 def shifted(clip: Clip, offset: np.ndarray | tuple[float, float, float]) -> Clip:
@@ -96,4 +98,5 @@ def backwards(clip: Clip) -> Clip:
     Accelerations, and with them the forces of muscles and floor, are the same at every pose, so that a
     motion that can be done can be done backwards; only what hits the floor hard cannot.
     """
-    return clip.replaced(root_pos=clip.root_pos[::-1], rot=clip.rot[::-1])
+    contacts = tuple((j, touch[::-1]) for j, touch in clip.contacts)
+    return clip.replaced(root_pos=clip.root_pos[::-1], rot=clip.rot[::-1], contacts=contacts)

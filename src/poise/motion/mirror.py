@@ -78,7 +78,9 @@ def mirrored_clip(clip: Clip) -> Clip:
         for j, v in skeleton.ends
     )
     seen = replace(skeleton, offsets=(offsets[other] @ mirror).numpy(), ends=ends)
-    return clip.replaced(skeleton=seen, root_pos=(root @ mirror).numpy(), rot=rot.numpy())
+    contacts = tuple((int(other[j]), touch) for j, touch in clip.contacts)
+    made = clip.replaced(skeleton=seen, root_pos=(root @ mirror).numpy(), rot=rot.numpy())
+    return made.replaced(contacts=contacts)
 
 
 def _normal(names: tuple[str, ...], parents: tuple[int, ...], offsets: Tensor) -> Tensor:

@@ -44,12 +44,14 @@ class Source:
     frame_time: seconds per frame exactly as the file states it.
     travel_joint: the joint with the channels that carry the travel (Bandai: "Hips", not the root).
     ground_m: where the floor was before it was moved to z = 0 by the user's word; None if it was not.
-    evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps; and
-        ("jitter", sentence) where keypoints tremble so much that they are better smoothed.
+    evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps.
     mended: (kind, joint, first frame, last frame, size) of what the reader had to mend: "bone drift" m,
-        "quaternion length" (distance from 1), "rest frame" (frames dropped); last frame -1 is the end.
+        "quaternion length" (distance from 1), "rest frame" (frames dropped), "tremble" m of keypoints
+        (with "at 5.0 Hz" or the like for the joint); last frame -1 is the end.
     rates: where neither the file nor the user states a frame rate, those that such files have, frames/s;
         the first was taken.
+    raw: by the user's word the motion is followed as its file has it: neither a tremble is taken off nor
+        are joints that were lost filled in.
     """
 
     format: str = "poise"
@@ -65,6 +67,7 @@ class Source:
     mended: tuple[tuple[str, str, int, int, float], ...] = ()
     extra: tuple[tuple[str, str], ...] = ()
     rates: tuple[float, ...] = ()
+    raw: bool = False
 
 
 @dataclass(frozen=True)

@@ -74,18 +74,20 @@ def faded(here: slice, frames: int, fps: float) -> np.ndarray:
 
 
 def tremble_of(
-    y: np.ndarray, groups: np.ndarray, found: Spectrum, hz: float
+    y: np.ndarray, groups: np.ndarray, found: Spectrum, hz: float, most: float = math.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it."""
+    """The tremble `(T, C)` at `hz`, and `(G)` how far it stands out of what is beside it. most: the
+    largest variance that it can have in a group."""
     out = np.zeros_like(y)
     size, beside = found.tone(hz)
     floor, clear = found.floor(), size / np.maximum(beside, 1e-300)
     if hz < STEPS_HZ:
         # What a group has beyond that is a step of its own, and as narrow as a tremble: the power of
         # either at hz is its variance times fps / (pi WANDER_HZ).
-        most = UNEVEN * np.quantile(size, QUIET, method="lower")
-        own = np.maximum(size - most, 0.0) * found.fps / (np.pi * WANDER_HZ)
-        beside, size = beside + own, np.minimum(size, most)
+        usual = UNEVEN * float(np.quantile(size, QUIET, method="lower"))
+        own = np.maximum(size - usual, 0.0) * found.fps / (np.pi * WANDER_HZ)
+        beside, most = beside + own, min(most, usual)
+    size = np.minimum(size, most)
     for g in np.unique(groups):
         if size[g] <= 0.0:
             continue

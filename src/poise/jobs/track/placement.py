@@ -12,6 +12,7 @@ import torch
 
 from poise.body import Humanoid
 from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
+from poise.kin.doctor.faults import Fault, read_faults
 from poise.kin.feet.level import Levelled
 from poise.kin.fit import ClipFit
 from poise.kin.rate.judge import judge_rate
@@ -55,8 +56,21 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
     on = place_on_body(clip, humanoid.table, tracker.example, rate, how=tracker.onto, near=humanoid)
     fit = ClipFit(clip.name, judge_rate(clip), on.cleaned, None, on.ground, on.joint_error_mm)
     notes = _notes(on.qpos, humanoid, on.retargeting, tracker.config.widens)
-    notes = (*on.cleaned.noise_sentences(), *notes)
+    notes = (*_read_noise(clip), *on.cleaned.noise_sentences(), *notes)
     return Placed(clip, on.moved, on.qpos, FitReport((fit,)), on.retargeting, on.level, notes)
+
+
+def _read_noise(clip: Clip) -> tuple[str, ...]:
+    """What reading took off its keypoints."""
+    return tuple(
+        f"The keypoints tremble by {f.size:.0f} mm {f.detail}: the tremble is taken off."
+        for f in noise_read(clip)
+    )
+
+
+def noise_read(clip: Clip) -> list[Fault]:
+    """The noise that reading took off a clip's keypoints; none where it had none."""
+    return [f for f in read_faults(clip) if f.kind == "tremble"]
 
 
 def place_all(clips: Sequence[Clip], tracker: Tracker) -> list[Placed]:

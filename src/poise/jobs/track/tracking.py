@@ -20,6 +20,7 @@ from poise.env import Reference
 from poise.errors import PoiseError
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
+from poise.jobs.track.beside_raw import beside_raw
 from poise.jobs.track.best import RULE
 from poise.jobs.track.config import TrackConfig
 from poise.jobs.track.controllers import Show, done_by, led_by
@@ -161,6 +162,10 @@ def track(
         card = with_parts(card, parts)
     else:
         card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation, supports)))
+        raw = beside_raw(tracker, points or given, placed, rollouts.pos[0], done.judged.mask[0])
+        if raw is not None:
+            card = replace(card, raw=raw.figures)
+            notes.append(raw.sentence())
     clean = None
     if config.noise:
         seen = rollouts.pos[0], goals

@@ -91,7 +91,7 @@ def _frames(found: Sequence[Any]) -> str:
 
 
 def clean_clip(
-    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True
+    clip: Clip, anatomy: Anatomy | None = None, rougher: bool = True, raw: bool | None = None
 ) -> tuple[Clip, CleanReport]:
     """The clip with its faults repaired, and every repair; a clean clip comes back as it is.
 
@@ -100,10 +100,12 @@ def clean_clip(
     remains of the jumps goes too, and at last noise is taken off (`denoise`).
 
     rougher: also where that jerks the body more, see `without_rougher`. A body with joints that cannot
-    turn so fast wants it; a file that stays a file does not.
+    turn so fast wants it; a file that stays a file does not. raw: joints stay lost and noise stays, by
+    default where the clip's source says so.
     """
     anatomy = anatomy or find_anatomy(clip.skeleton, [clip])
-    found, whole = noise_faults(clip)
+    raw = clip.skeleton.source.raw if raw is None else raw
+    found, whole = ([], clip) if raw else noise_faults(clip)
     turned, flips = unflip(whole, anatomy, TRUNK_SPEED)
     slowed, speeds = limit_speeds(turned, anatomy)
     kept: tuple[SpeedRepair, ...] = ()
@@ -112,6 +114,16 @@ def clean_clip(
     if any(f.kind == "tremble" for f in found):
         slowed = denoise(slowed)
     return slowed, CleanReport(flips, speeds, out_of_reach(slowed, anatomy), kept, tuple(found))
+
+
+def without_noise(clip: Clip) -> tuple[Clip, CleanReport]:
+    """The clip without its noise and with its lost joints filled in, and nothing else changed; as it is
+    where its source is raw."""
+    if clip.skeleton.source.raw:
+        return clip, CleanReport()
+    found, whole = noise_faults(clip)
+    calm = denoise(whole) if any(f.kind == "tremble" for f in found) else whole
+    return calm, CleanReport(noise=tuple(found))
 
 
 @dataclass(frozen=True)

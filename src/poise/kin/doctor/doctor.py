@@ -13,7 +13,8 @@ from poise.body import Anatomy
 from poise.body.generate import asf_axis_quat
 from poise.kin.doctor.clean import CleanReport, clean_clip
 from poise.kin.doctor.drift import mend_drift
-from poise.kin.doctor.faults import KINDS, Fault, by_kind, spell_faults
+from poise.kin.doctor.estimate import noise_faults
+from poise.kin.doctor.faults import KINDS, Fault, by_kind, read_faults, spell_faults
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import drifts, mend_path, mend_slides
@@ -72,8 +73,10 @@ def examine(clip: Clip) -> Examination:
     if travel is not None:
         support = support_of(travelled(clip, travel.level), anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
-    faults = [*timing_faults(clip), *_joint_faults(report, clip), *report.noise]
-    faults += [*jitter_faults(cleaned), *limit_faults(clip), *_read_faults(clip)]
+    # What is to stay is told all the same.
+    noise = noise_faults(clip)[0] if clip.skeleton.source.raw else report.noise
+    faults = [*timing_faults(clip), *_joint_faults(report, clip), *noise]
+    faults += [*jitter_faults(cleaned), *limit_faults(clip), *read_faults(clip)]
     if support is not None:
         faults += [
             *height_faults(clip, support),
@@ -179,15 +182,6 @@ def _joint_faults(report: CleanReport, clip: Clip) -> list[Fault]:
     out += [Fault("joint jump", s.joint, s.start, s.stop, s.before) for s in report.kept]
     last = clip.frames - 1
     return out + [Fault("out of reach", joint, 0, last, float(n)) for joint, n in report.left]
-
-
-def _read_faults(clip: Clip) -> list[Fault]:
-    """What reading mended: bones that drift, quaternions off unit length, inserted frames."""
-    scale = {"bone drift": 1e3}
-    return [
-        Fault(kind, joint, a, clip.frames - 1 if b < 0 else b, size * scale.get(kind, 1.0))
-        for kind, joint, a, b, size in clip.skeleton.source.mended
-    ]
 
 
 def limit_faults(clip: Clip) -> list[Fault]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from poise.kin.series import find_runs
+from poise.motion import Clip
 
 
 class Kind(NamedTuple):
@@ -86,3 +87,16 @@ def spell_faults(
     """
     runs = [(a, b) for a, b in find_runs(bad, gap) if b - a + 1 >= least]
     return [Fault(kind, joint, a, b, float(np.max(size[a : b + 1]))) for a, b in runs]
+
+
+def read_faults(clip: Clip) -> list[Fault]:
+    """What reading mended: bones that drift, quaternions off unit length, inserted frames, keypoints
+    that tremble."""
+    out: list[Fault] = []
+    for kind, joint, a, b, size in clip.skeleton.source.mended:
+        stop = clip.frames - 1 if b < 0 else b
+        millimetres = size * (1e3 if KINDS[kind].unit == "mm" else 1.0)
+        # A tremble is the whole body's; its frequency stands in the joint's place.
+        named, detail = ("", joint) if kind == "tremble" else (joint, "")
+        out.append(Fault(kind, named, a, stop, millimetres, detail))
+    return out

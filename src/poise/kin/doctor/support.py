@@ -45,7 +45,8 @@ class Support:
     low: `(T, P)` heights of the body's joints and of its bone tips, each with its `margin (P,)`;
     names: `(P,)` the joint that each belongs to. sole_low: `(T,)` lowest point of the body's shapes.
     com: `(T, 3)` centre of mass. fit: how the clip would be set on the floor. table: its body. travel:
-    what was taken out of a clip in place.
+    what was taken out of a clip in place. labels: `(T, F)` bool, when each end touches, where the clip's
+    file says so of all feet.
     """
 
     fps: float
@@ -59,6 +60,7 @@ class Support:
     fit: GroundFit
     table: BodyTable
     travel: Travel | None = None
+    labels: np.ndarray | None = None
 
     @classmethod
     def of(cls, clip: Clip, anatomy: Anatomy, table: BodyTable) -> Support:
@@ -67,10 +69,13 @@ class Support:
         pos, quat = (x[:, [r.joint for r in table.rows]] for x in world)
         soles = soles_of(table, pos, quat)
         low, margin, names = _low_points(clip, anatomy, *world)
+        feet = [table.rows[row].joint for row in soles]
+        said = dict(clip.contacts)
+        labels = np.concatenate([said[j] for j in feet], 1) if feet and set(feet) <= set(said) else None
         return cls(
             clip.fps,
             torch.cat([sole.ends for sole in soles.values()], 1),
-            tuple(table.rows[row].joint for row in soles for _ in range(2)),
+            tuple(j for j in feet for _ in range(2)),
             low,
             margin,
             names,
@@ -78,6 +83,7 @@ class Support:
             fit_heights(table, pos, quat, clip.fps),
             table,
             told_by(table, pos, quat, clip.fps),
+            labels,
         )
 
     @property
@@ -115,10 +121,13 @@ class Support:
     def contacts(self) -> tuple[Tensor, Tensor]:
         """Horizontal speed (m/s) and contact of every sole point between frames, `(T - 1, F)`.
 
-        Contact as in `foot_contacts`, within `NEAR_M` of the floor that the soles tell.
+        Contact as the clip's file says it, from frame to frame; else as in `foot_contacts`, within
+        `NEAR_M` of the floor that the soles tell.
         """
         ground = -self.fit.lift_m
         speed, contact = foot_contacts(self.soles, self.fps, height=NEAR_M, ground=ground)
+        if self.labels is not None:
+            contact = torch.tensor(self.labels[1:] & self.labels[:-1])
         return speed / 1000.0, contact
 
 

@@ -72,13 +72,16 @@ def feet_of(passage: Passage) -> tuple[Foot, ...]:
     return tuple(out)
 
 
-def source_contacts(world: World, fps: float, feet: tuple[Foot, ...], ground: float) -> Tensor:
-    """`(T, F)` bool, which end touches the ground in the source: low and slow."""
-    out = []
+def source_contacts(clip: Clip, world: World, feet: tuple[Foot, ...], ground: float) -> Tensor:
+    """`(T, F)` bool, which end touches the ground in the source: as its file says, else low and slow."""
+    out, said = [], dict(clip.contacts)
     for foot in feet:
+        if foot.source in said:
+            out.append(torch.tensor(said[foot.source].any(1)))
+            continue
         tread = foot.points(*world, target=False)[:, None]
         low = TOUCH_M[foot.name.split()[1]]
-        out.append(contact_labels(tread, fps, low, ground=ground)[:, 0])
+        out.append(contact_labels(tread, clip.fps, low, ground=ground)[:, 0])
     return torch.stack(out, 1)
 
 

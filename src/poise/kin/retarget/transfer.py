@@ -71,7 +71,7 @@ def retarget(
         passage = replace(passage, joints=passage.joints.without(config.rigid))
     rot, root = passage.transfer(world, config.share)
     feet = feet_of(passage)
-    contacts = source_contacts(world, clip.fps, feet, passage.scale.ground)
+    contacts = source_contacts(clip, world, feet, passage.scale.ground)
     if config.contacts or config.clear:
         rot, root = plant(
             *(clip, world, passage, rot, root, feet, contacts), hold=config.contacts, clear=config.clear

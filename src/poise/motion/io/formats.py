@@ -139,6 +139,7 @@ def read_clip(
     allow_pickle: bool = False,
     smooth_hz: float | None = None,
     take: str | None = None,
+    raw: bool = False,
 ) -> Clip:
     """Reads a motion file as a clip in metres, Z up; its content decides more than its suffix.
 
@@ -153,13 +154,16 @@ def read_clip(
         smooth_hz: cut-off of a low-pass on keypoints (TRC, C3D, ...), see `FitConfig`; other formats
             are read as they are.
         take: which animation of a file that holds several, by name or number (glTF, MDM).
+        raw: the motion is followed as the file has it, see `Source.raw`: keypoints keep their noise and
+            samples that jump out of their path, and no verb takes a tremble off or fills in joints that
+            were lost.
 
     Raises:
         PoiseError: one sentence with the file, the line, joint or frame, and what to do.
     """
     asf = None if skeleton is None else Path(skeleton)
     options = ReadOptions(
-        asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz
+        asf, fps, unit_m, up_axis, allow_pickle=allow_pickle, take=take, smooth_hz=smooth_hz, raw=raw
     )
     check_options(options)
     return _read(Path(path), options)
@@ -168,7 +172,10 @@ def read_clip(
 def _read(path: Path, options: ReadOptions) -> Clip:
     reader = _reader_of(path)
     try:
-        return reader.read(path, options)
+        clip = reader.read(path, options)
+        # A file may tell of a flag with which it was once read: that of this reading counts.
+        same = clip.skeleton.source.raw == options.raw
+        return clip if same else clip.replaced(skeleton=clip.skeleton.with_source(raw=options.raw))
     except PoiseError as error:
         # A clip's own checks know its name only; what a file says may be long or obeyed by a terminal.
         raise brief(error, path) from None

@@ -10,6 +10,7 @@ from typing import Any
 from poise.errors import PoiseError
 from poise.motion.clip import Clip
 from poise.motion.io.angles.opensim import is_opensim, read_loco
+from poise.motion.io.foot_labels import labelled, with_labels
 from poise.motion.io.numpy.arrays import ASK, NPY_MAGIC, Archive, first_member, npy_header, read_npy
 from poise.motion.io.numpy.kimodo import is_kimodo, read_kimodo
 from poise.motion.io.numpy.pickles import load_plain, loads_restricted, named_arrays
@@ -28,6 +29,7 @@ from poise.motion.io.points.arrays import (
     mdm_points,
     named_joint_points,
 )
+from poise.motion.io.points.features import CONTACTS, feature_points, is_features
 from poise.motion.io.points.raw import as_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.io.refused import is_qpos, refuse_array, refuse_qpos
@@ -81,6 +83,10 @@ def read_pickled(path: Path, options: ReadOptions) -> Clip:
             if is_joints(header.shape, header.dtype):
                 file.seek(0)
                 return as_clip(joint_points)(read_npy(file, path), path, options)
+            if is_features(header.shape, header.dtype):
+                file.seek(0)
+                table = read_npy(file, path)
+                return labelled(as_clip(feature_points)(table, path, options), table[:, CONTACTS])
             if not header.dtype.hasobject:
                 refuse_array(header.shape, path)
     if not options.allow_pickle:
@@ -98,7 +104,7 @@ def _is_known(data: Mapping[str, Any]) -> bool:
 def _read(data: Mapping[str, Any], path: Path, options: ReadOptions) -> Clip:
     for kind in KINDS:
         if kind.holds(data):
-            return kind.read(data, path, options)
+            return with_labels(kind.read(data, path, options), data)
     there = listed((shown(k) for k in data), 4) if len(data) else "none at all"
     known = "; ".join(kind.name for kind in KINDS[:-1])
     raise PoiseError(f"its arrays are no motion that is known ({there})", path, f"Known: {known}")

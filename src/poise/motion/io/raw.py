@@ -31,7 +31,7 @@ from poise.spatial import normalize, unwrap_quats
 class ReadOptions:
     """What the caller states instead of leaving it to a guess; None where it is not stated.
 
-    rest: a file that holds a skeleton and no animation is read as it rests.
+    rest: a file that holds a skeleton and no animation is read as it rests. raw: as in `Source`.
     """
 
     skeleton: Path | None = None
@@ -42,6 +42,7 @@ class ReadOptions:
     smooth_hz: float | None = None
     take: str | None = None
     rest: bool = False
+    raw: bool = False
 
 
 UNSTATED = ReadOptions()

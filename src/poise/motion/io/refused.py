@@ -89,10 +89,7 @@ def refuse_array(shape: tuple[int, ...], path: Path) -> NoReturn:
     """One array that is no motion by itself: what its shape tells, and what to give."""
     what = f"it holds one array of shape {shape} without joint names or a frame rate"
     hint = "Joints of SMPL are (T, 22, 3) or (T, 24, 3); save others as npz with named arrays"
-    if len(shape) == 2 and shape[1] == 263:
-        what = f"its array of shape {shape} holds the features of HumanML3D, and no joints"
-        hint = "Give the joints recovered from them, (T, 22, 3)"
-    elif len(shape) == 4 and shape[2:] in ((22, 3), (24, 3)):
+    if len(shape) == 4 and shape[2:] in ((22, 3), (24, 3)):
         what = f"its array of shape {shape} holds {shape[0]} clips"
         hint = "Save each as a file of its own"
     elif len(shape) == 2 and shape[1] in (66, 72):

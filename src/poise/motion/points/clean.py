@@ -1,4 +1,4 @@
-"""Keypoints without spikes, gaps and (where asked for) jitter."""
+"""Keypoints without spikes, gaps and (where asked for) what is fast."""
 
 from __future__ import annotations
 
@@ -112,17 +112,6 @@ def smooth(values: np.ndarray, fps: float, cutoff_hz: float) -> np.ndarray:
     for k, weight in enumerate(kernel):
         out += weight * padded[k : k + len(flat)]
     return out.reshape(values.shape)
-
-
-def jitter(positions: np.ndarray) -> float:
-    """The size of white noise on positions `(T, K, 3)` m, per coordinate.
-
-    Third differences of smooth motion vanish; those of white noise of size s have the size sqrt(20) s.
-    The median over all samples knows no spikes.
-    """
-    if len(positions) < 8:
-        return 0.0
-    return float(1.4826 * np.median(np.abs(np.diff(positions, 3, axis=0))) / np.sqrt(20.0))
 
 
 def spike_note(names: tuple[str, ...], spikes: np.ndarray) -> list[str]:

@@ -32,7 +32,8 @@ class FitConfig:
     max_gap_s: the longest gap (s) of a needed keypoint that is interpolated; the recording is cut to its
         longest stretch without longer ones.
     drop_spikes: whether samples that jump out of their path and back are taken as missing.
-    smooth_hz: cut-off of a zero-phase low-pass on the keypoints, None for none.
+    smooth_hz: cut-off of a zero-phase low-pass on the keypoints; None takes off what noise they have
+        (`points.tremble`), and nothing where they have none.
     """
 
     max_gap_s: float = 0.5
@@ -81,8 +82,11 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     stop = marks.first + clip.frames
     note = _misfit_note(fit_distances(_cut(points, marks.first, stop), clip))
     all_notes = (*points.source.notes, *notes, note)
-    why = points.source.evidence + ((("jitter", marks.jitter),) if marks.jitter else ())
-    return clip.replaced(skeleton=skeleton.with_source(notes=all_notes, evidence=why))
+    mended = points.source.mended
+    if marks.tremble is not None:
+        found = marks.tremble
+        mended += (("tremble", found.how, 0, clip.frames - 1, found.size_mm / 1e3),)
+    return clip.replaced(skeleton=skeleton.with_source(notes=all_notes, mended=mended))
 
 
 def fit_distances(points: Keypoints, clip: Clip) -> dict[str, np.ndarray]:

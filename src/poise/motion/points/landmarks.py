@@ -10,15 +10,16 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.motion.io.text import listed
 from poise.motion.keypoints import Keypoints
-from poise.motion.points.clean import drop_spikes, fill, jitter, longest_stretch, smooth, spike_note
+from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth, spike_note
 from poise.motion.points.labels import NEEDED, SIDES, find_places, known_labels, unknown_labels
 from poise.motion.points.markers import marker_places
+from poise.motion.points.tremble import Tremble, still
+from poise.motion.smoothing import filled
 
 # What a place is filled relative to, so that a hidden wrist travels with its elbow.
 _CARRIER = {"knee": "hip", "ankle": "knee", "heel": "ankle", "toe": "ankle", "toe_tip": "ankle"}
 _CARRIER |= {"elbow": "shoulder", "wrist": "elbow", "hand": "wrist"}
 _LEAST_SHARE = 0.5
-_JITTER_M = 0.0035
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,13 @@ class Landmarks:
 
     tracks: place -> `(T, 3)`, no NaN.
     first: the frame of the recording that is frame 0 here. notes: one sentence per repair.
-    jitter: that of the notes which says how much they tremble, empty where they do not.
+    tremble: what was taken off, None without any.
     """
 
     tracks: dict[str, np.ndarray]
     first: int
     notes: tuple[str, ...]
-    jitter: str = ""
+    tremble: Tremble | None = None
 
 
 def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -85,18 +86,20 @@ def _lacking(points: Keypoints, lost: list[str]) -> PoiseError:
 
 
 def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float | None) -> Landmarks:
-    """All places of the body without spikes and gaps.
+    """All places of the body without spikes, gaps and noise (`still`); keypoints that are to stay as
+    their file has them (`Source.raw`) keep their spikes and their noise.
 
     Gaps are interpolated in the place of the joint above (wrist from elbow). The recording is cut to its
-    longest stretch in which no needed place is missing for longer than `max_gap_s`.
+    longest stretch in which no needed place is missing for longer than `max_gap_s`. smooth_hz: the
+    cut-off of a low-pass in place of what the noise asks for.
     """
     notes: list[str] = []
-    if spikes:
+    if spikes and not points.source.raw:
         cleaned, jumps = drop_spikes(points.positions, points.fps)
         notes += spike_note(points.names, jumps)
         points = points.replaced(positions=cleaned)
-    tracks, found = places_of(points)
-    notes += found
+    tracks, told = places_of(points)
+    notes += told
     unknown = unknown_labels(points.names)
     if unknown:
         notes.append(
@@ -123,21 +126,21 @@ def complete(points: Keypoints, max_gap_s: float, spikes: bool, smooth_hz: float
     if gaps:
         worst = listed((f"{p.replace('_', ' ')} {n}" for n, p in sorted(gaps, reverse=True)), 6)
         notes.append(f"Missing samples were interpolated: {worst} (frames)")
-    tracks = _filled(tracks)
-    size = jitter(np.stack([tracks[place] for place in NEEDED], 1))
-    trembles = ""
-    if smooth_hz is None and size > _JITTER_M:
-        trembles = (
-            f"The keypoints jitter by about {size * 1e3:.0f} mm from frame to frame, and so does the "
-            "clip: --smooth HZ (6 suits most motion) takes it away"
+    tracks = _filled(tracks, points.fps)
+    found: Tremble | None = None
+    if smooth_hz is None and not points.source.raw:
+        tracks, found = still(tracks, points.fps)
+    if found is not None:
+        notes.append(
+            f"The keypoints tremble by {found.size_mm:.0f} mm {found.how}: the tremble is taken off "
+            "(--raw keeps it)"
         )
-        notes.append(trembles)
     if smooth_hz is not None:
         tracks = {place: smooth(track, points.fps, smooth_hz) for place, track in tracks.items()}
         notes.append(
             f"The keypoints were smoothed by a zero-phase Gaussian low-pass at {smooth_hz:g} Hz"
         )
-    return Landmarks(tracks, start, tuple(notes), trembles)
+    return Landmarks(tracks, start, tuple(notes), found)
 
 
 def _lost(missing: np.ndarray, start: int, stop: int) -> str:
@@ -160,19 +163,31 @@ def _without_rare(tracks: dict[str, np.ndarray], notes: list[str]) -> dict[str, 
     return {place: track for place, track in tracks.items() if place not in rare}
 
 
-def _filled(tracks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _filled(tracks: dict[str, np.ndarray], fps: float) -> dict[str, np.ndarray]:
     """All gaps interpolated: hips in the world, everything else as seen from its carrier."""
-    out = {f"{side}_hip": fill(tracks[f"{side}_hip"]) for side in SIDES}
+    out = {f"{side}_hip": _curved(tracks[f"{side}_hip"], fps) for side in SIDES}
     hips = (out["left_hip"] + out["right_hip"]) / 2
-    out |= {f"{side}_shoulder": hips + fill(tracks[f"{side}_shoulder"] - hips) for side in SIDES}
+    out |= {f"{side}_shoulder": hips + _curved(tracks[f"{side}_shoulder"] - hips, fps) for side in SIDES}
     chest = (out["left_shoulder"] + out["right_shoulder"]) / 2
     for part, carrier in _CARRIER.items():
         for side in SIDES:
             place, above = f"{side}_{part}", f"{side}_{carrier}"
             if place in tracks:
-                out[place] = out[above] + fill(tracks[place] - out[above])
+                out[place] = out[above] + _curved(tracks[place] - out[above], fps)
     for place, track in tracks.items():
         if place not in out:
             base = hips if place == "pelvis" or place.startswith("spine") else chest
-            out[place] = base + fill(track - base)
+            out[place] = base + _curved(track - base, fps)
+    return out
+
+
+def _curved(values: np.ndarray, fps: float) -> np.ndarray:
+    """Values `(T, C)` with gaps on the smoothest curve; at the ends they hold."""
+    known = ~np.isnan(values).any(-1)
+    if known.all() or known.sum() < 4:
+        return fill(values)
+    first, last = np.flatnonzero(known)[[0, -1]]
+    out = fill(values)
+    inside = slice(first, last + 1)
+    out[inside] = filled(out[inside], known[inside], fps)
     return out

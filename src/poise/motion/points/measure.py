@@ -26,6 +26,8 @@ _SPINE_SHARES, _NECK_SHARE, _COLLAR_SHARE, _BALL_SHARE = (0.25, 0.55), 0.08, 0.2
 # ankle.
 _LEG_SHARE, _HEAD_SHARE, _BALL_DROP = 0.491, 0.065, 0.027
 _HEAD_OF_TOP = 0.35
+# Collars that are less apart than this share of the shoulders' distance lie in one place.
+_ONE_PLACE = 0.05
 _ASYMMETRY = 0.05
 
 
@@ -146,10 +148,18 @@ def pelvis_frame(tracks: dict[str, Tensor], spine: str) -> Tensor:
     return frame_quat(tracks["left_hip"] - tracks["right_hip"], tracks[spine] - hips)
 
 
+def collars_tell_sides(tracks: dict[str, Tensor]) -> bool:
+    """Whether there are collars, and not both in one place, as where they hang on the neck."""
+    if not all(f"{s}_collar" in tracks for s in SIDES):
+        return False
+    apart, width = (_median(tracks, f"left_{p}", f"right_{p}") for p in ("collar", "shoulder"))
+    return apart > _ONE_PLACE * width
+
+
 def chest_frame(tracks: dict[str, Tensor], chest: str) -> Tensor:
     """wxyz `(T, 4)`: z from the chest joint to the neck, x from right to left shoulder."""
     up = tracks["neck"] - tracks[chest]
-    part = "collar" if all(f"{s}_collar" in tracks for s in SIDES) else "shoulder"
+    part = "collar" if collars_tell_sides(tracks) else "shoulder"
     x = rejected(tracks[f"left_{part}"] - tracks[f"right_{part}"], up / up.norm(dim=-1, keepdim=True))
     return frame_quat(x, up)
 

@@ -7,7 +7,16 @@ import torch
 from torch import Tensor
 
 from poise.motion.points.labels import SIDES
-from poise.motion.points.measure import LEFT, SIGN, TITLE, UP, Rest, chest_frame, foot_axes
+from poise.motion.points.measure import (
+    LEFT,
+    SIGN,
+    TITLE,
+    UP,
+    Rest,
+    chest_frame,
+    collars_tell_sides,
+    foot_axes,
+)
 from poise.spatial import (
     axis_angle_to_quat,
     cluster_quat,
@@ -109,7 +118,7 @@ class Solver:
 
     def _chest(self, name: str) -> Tensor:
         """The chest's rotation: neck and collars (or shoulders, which count less) as one cluster."""
-        own = all(self.rest.points[f"{TITLE[s]}Shoulder"] for s in SIDES)
+        own = collars_tell_sides(self.tracks)
         names, template = ["Neck"], [self.rest.offsets["Neck"]]
         for side in SIDES:
             collar = self.rest.offsets[f"{TITLE[side]}Shoulder"]

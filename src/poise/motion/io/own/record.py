@@ -37,7 +37,9 @@ def source_from_json(text: str, path: Path) -> Source:
     try:
         source = fitted(loads(text, path, "source"), Source)
         cut = (n if len(n) <= MAX_NOTE else n[: MAX_NOTE - 3] + "..." for n in source.notes)
-        return replace(source, notes=tuple(cut))
+        # What was taken off its keypoints is no fault of the file that was written then.
+        mended = (m for m in source.mended if m[0] != "tremble")
+        return replace(source, notes=tuple(cut), mended=tuple(mended))
     except (KeyError, TypeError, ValueError) as error:
         raise PoiseError(
             f"the record of the clip's source is damaged ({shown(error)})", path, CUT_OFF

@@ -90,7 +90,7 @@ def assemble_points(raw: RawPoints, options: ReadOptions) -> Keypoints:
         Source(
             format=raw.format, path=str(raw.path), unit_m=scale, up_axis=axis, notes=tuple(notes),
             frame_time=1.0 / raw.fps, evidence=evidence(options, up, unit, rate),
-            rates=() if options.fps is not None else raw.rates,
+            rates=() if options.fps is not None else raw.rates, raw=options.raw,
         ),
     )  # fmt: skip
 
