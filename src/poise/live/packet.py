@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.kin.fading import Tremble
 from poise.live.quats import normalized
 from poise.motion import Clip, Skeleton
 
@@ -35,6 +36,7 @@ class Packet:
         whole: a clip that shows how the skeleton stands, where there is one; else the first seconds do.
         places: `(B, 3)` m, where the character's bodies are to be, for policies that are told places
             alone; None where the pose tells all.
+        tremble: what a source did that smooths by itself; None where poses are as they came.
     """
 
     person: str
@@ -44,6 +46,7 @@ class Packet:
     rot: np.ndarray
     whole: Clip | None = None
     places: np.ndarray | None = None
+    tremble: Tremble | None = None
 
 
 def checked(packet: Packet) -> Packet:

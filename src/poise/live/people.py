@@ -10,6 +10,7 @@ import numpy as np
 from poise.live.buffer import JitterBuffer, Pose
 from poise.live.calibration import OntoBody, Standing
 from poise.live.packet import PEOPLE, Packet
+from poise.live.steady import Steady
 
 #: s without a packet after which a person is away, and after which it is forgotten.
 AWAY_S, FORGET_S = 1.0, 20.0
@@ -51,8 +52,10 @@ class Person:
             self.forget()
         if self._first is None:
             self._first = packet
+            self.buffer.steady = Steady(packet.skeleton)
         self.arrived_s = arrived_s
-        self.buffer.add(packet.time_s, arrived_s, packet.root_pos, packet.rot, packet.places)
+        p = packet
+        self.buffer.add(p.time_s, arrived_s, p.root_pos, p.rot, p.places, p.tremble)
         if self.onto is None and self._made is None:
             whole = packet.whole or self._standing.add(packet)
             if whole is not None:
