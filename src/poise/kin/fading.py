@@ -34,8 +34,8 @@ WANDER_HZ = 0.15
 LEAST = 0.02
 #: s in which smoothing fades in and out; s of which samples are kept to be known better.
 FADE_S, KEPT_S = 0.3, 0.1
-#: s by which a stream that trembles is kept back: one control step, since the sample before the newest is
-#: known better by a third, and the one before that hardly more.
+#: s by which a stream that trembles is kept back: one control step, since the sample before the newest
+#: is known better by a third, and the one before that hardly more.
 LATE_S = 1.0 / 30.0
 #: Squares of an error, by their expected sum, beyond which a group did not move but is elsewhere.
 ELSEWHERE = 25.0
@@ -141,7 +141,7 @@ class FadingFilter:
         size = 0.0
         if noise.hz is not None:
             size = float(np.clip(np.median(noise.tone / white), 1.0, 1.0 / LEAST))
-        if not self._past or noise.hz != self._hz and (noise.hz is None or self._hz is None):
+        if not self._past or (noise.hz != self._hz and (noise.hz is None or self._hz is None)):
             self._begin(z, dt, size)
             return
         self._hz = noise.hz

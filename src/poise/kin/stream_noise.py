@@ -78,7 +78,8 @@ class StreamNoise:
         self._dts = deque[float](maxlen=LONG)
         self._last: np.ndarray | None = None
         self._since, self._seen, self._count, self._usual = 0.0, 0, 0, 0.0
-        self._suspect: int | None = None
+        self._suspect: float | None = None
+        self._phase = 0
 
     @property
     def trembles(self) -> bool:
@@ -90,6 +91,8 @@ class StreamNoise:
         self._since += dt
         if self._last is None:
             self._last, self._since = z, 0.0
+            # So that streams which begin together are not all looked at in one step.
+            self._phase = int(1e6 * float(np.abs(z).sum())) % EVERY
             return
         if self._since < APART_S:
             return
@@ -119,7 +122,7 @@ class StreamNoise:
             self._squares[self._seen % SAMPLES] = (rough * rough) @ self.member
             self._seen += 1
         # One thing in a sample, since each takes its time.
-        turn = self._count % EVERY
+        turn = (self._count + self._phase) % EVERY
         if turn % 6 == 1 and self._seen >= FEWEST:
             self._level()
         elif turn == 3 and self._count >= LONG // 2:
@@ -164,7 +167,9 @@ class StreamNoise:
     def _lately(self) -> tuple[np.ndarray, np.ndarray]:
         """The last steps `(T, C)`, and a window on them."""
         many = min(self._count, LONG)
-        steps = np.concatenate((self._steps[self._count % LONG + 1 :], self._steps[: self._count % LONG + 1]))
+        steps = np.concatenate(
+            (self._steps[self._count % LONG + 1 :], self._steps[: self._count % LONG + 1])
+        )
         return steps[-many:], np.hanning(many + 2)[1:-1, None]
 
     def _suspected(self) -> float | None:

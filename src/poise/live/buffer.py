@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from poise.kin.fading import Tremble
 from poise.live.quats import slerp
-from poise.live.steady import Steady
+from poise.live.steady import Earlier, leapt
 
 #: s of the buffer that even out how packets come at least, and share of it that does where that is more;
 #: the rest may be looked ahead at.
@@ -18,12 +19,12 @@ MARGIN_S, MARGIN = 0.05, 0.5
 FADE_S = 0.1
 #: s without a new pose after which motion is known to have stopped coming.
 STALLS_S = 0.2
-#: s a second by which motion that begins to tremble is kept back, until it is late enough to be smoothed.
+#: s a second by which motion that begins to tremble is kept back more and more.
 KEEPS_BACK = 0.15
-#: m/s and m beyond which a person did not move but is elsewhere, or is another one.
-JUMP, LEAP_M = 12.0, 0.4
 #: Packets by which the way's shortest time is known, and those that are kept.
 SEEN, KEPT = 240, 320
+
+NONE = Tremble()
 
 
 def margin(delay_s: float) -> float:
@@ -69,14 +70,13 @@ class JitterBuffer:
 
     Args:
         delay_s: s, 0 to 0.4; by what of it exceeds the margin, a goal lags behind what is read here.
-        steady: smooths poses; None lets them be.
 
     Attributes:
         tremble: what the person does now.
     """
 
-    def __init__(self, delay_s: float = 0.1, steady: Steady | None = None):
-        self.delay_s, self.steady, self.tremble = delay_s, steady, Tremble()
+    def __init__(self, delay_s: float = 0.1):
+        self.delay_s, self.tremble = delay_s, Tremble()
         self.late = self.jumps = 0
         self._frames: deque[_Frame] = deque(maxlen=KEPT)
         self._ways: deque[float] = deque(maxlen=SEEN)
@@ -94,14 +94,12 @@ class JitterBuffer:
         root_pos: np.ndarray,
         rot: np.ndarray,
         places: np.ndarray | None = None,
-        tremble: Tremble | None = None,
+        tremble: Tremble = NONE,
+        held_s: float = 0.0,
+        earlier: Sequence[Earlier] = (),
     ) -> None:
-        """One more packet; one that is older than the newest is left out.
-
-        tremble: of a source that smooths poses itself.
-        """
-        # Not for how long the source kept it back.
-        way = arrived_s - time_s - (0.0 if tremble is None else tremble.late_s)
+        """One more packet; one that is older than the newest is left out. The rest: see `Packet`."""
+        way = arrived_s - time_s - held_s
         self._ways.append(way)
         self._way = min(self._ways)
         self._arrived = max(self._arrived, arrived_s)
@@ -118,28 +116,14 @@ class JitterBuffer:
             return
         leaps = False
         if frames:
-            far = float(np.linalg.norm(root_pos - frames[-1].root_pos))
-            leaps = far > LEAP_M and far > JUMP * (time_s - frames[-1].time_s)
+            leaps = leapt(frames[-1].root_pos, root_pos, time_s - frames[-1].time_s)
             self.jumps += leaps
-        if tremble is not None:
-            self.tremble = tremble
-        elif self.steady is not None:
-            root_pos, rot = self._smoothed(self.steady, time_s, root_pos, rot, leaps)
+            for when, root, turned in earlier:
+                k = next((k for k in range(1, len(frames) + 1) if frames[-k].time_s <= when), 1)
+                if frames[-k].time_s == when:
+                    frames[-k] = frames[-k]._replace(root_pos=root, rot=turned)
+        self.tremble = tremble
         frames.append(_Frame(time_s, root_pos, rot, leaps, places))
-
-    def _smoothed(
-        self, steady: Steady, time_s: float, root_pos: np.ndarray, rot: np.ndarray, leaps: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The newest pose, and those before it in their places, as they are now known."""
-        frames = self._frames
-        if leaps:
-            steady.restart(root_pos, rot)
-            return root_pos, rot
-        now = steady(root_pos, rot, time_s - frames[-1].time_s if frames else 0.0)
-        for k, (root, turned) in enumerate(steady.before()[: len(frames)]):
-            frames[-1 - k] = frames[-1 - k]._replace(root_pos=root, rot=turned)
-        self.tremble = steady.tremble
-        return now
 
     def read(self, now_s: float) -> Pose | None:
         """The pose at `now_s` by the loop's clock; None before anything has come."""

@@ -71,7 +71,7 @@ def figures(aims: Aims, inbox: Inbox, times: Times) -> dict[str, Any]:
 
 
 def _of_tremble(tremble: Tremble) -> dict[str, Any]:
-    """By how many mm a person trembles, at how many Hz, and how many ms later it is followed for that."""
+    """By how many mm a person trembles, at how many Hz, and how many ms later it is followed."""
     hz = None if tremble.hz is None else round(tremble.hz, 1)
     return {"trembles_mm": round(tremble.mm), "hz": hz, "late_ms": round(1000.0 * tremble.late_s)}
 

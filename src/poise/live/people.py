@@ -7,10 +7,10 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from poise.kin.fading import Tremble
 from poise.live.buffer import JitterBuffer, Pose
 from poise.live.calibration import OntoBody, Standing
 from poise.live.packet import PEOPLE, Packet
-from poise.live.steady import Steady
 
 #: s without a packet after which a person is away, and after which it is forgotten.
 AWAY_S, FORGET_S = 1.0, 20.0
@@ -52,10 +52,9 @@ class Person:
             self.forget()
         if self._first is None:
             self._first = packet
-            self.buffer.steady = Steady(packet.skeleton)
         self.arrived_s = arrived_s
-        p = packet
-        self.buffer.add(p.time_s, arrived_s, p.root_pos, p.rot, p.places, p.tremble)
+        p, tremble = packet, packet.tremble or Tremble()
+        self.buffer.add(p.time_s, arrived_s, p.root_pos, p.rot, p.places, tremble, p.held_s, p.earlier)
         if self.onto is None and self._made is None:
             whole = packet.whole or self._standing.add(packet)
             if whole is not None:

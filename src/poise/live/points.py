@@ -88,9 +88,12 @@ class Performer:
         else:
             root, rot = self._body.performer(whole[None])
         at, turned = root[0].numpy(), rot[0].numpy()
-        return Packet(self.person, time_s, skeleton, at, turned, self._whole, places, tremble)
+        held = tremble.late_s
+        return Packet(self.person, time_s, skeleton, at, turned, self._whole, places, tremble, held)
 
-    def _smoothed(self, whole: np.ndarray, time_s: float, dt: float) -> tuple[np.ndarray, float, Tremble]:
+    def _smoothed(
+        self, whole: np.ndarray, time_s: float, dt: float
+    ) -> tuple[np.ndarray, float, Tremble]:
         """Points `(K, 3)` of the newest frame that is known well, when it was, and how they tremble."""
         if self._steady is None:
             self._steady = of_points(len(whole))

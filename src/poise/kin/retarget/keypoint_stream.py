@@ -30,7 +30,8 @@ class StreamConfig:
     """How a stream of keypoints is filtered.
 
     smooth_hz: cut-off of the filter on the keypoints; None smooths them as much as they tremble
-        (`FadingFilter`). lookahead: 1 takes velocities from the frames before and after, one control step late; 0 from the last two.
+        (`FadingFilter`). lookahead: 1 takes velocities from the frames before and after, one step
+        late; 0 from the last two.
     max_speed: m/s, a keypoint that jumps faster is taken as missing (sprinters' feet reach 20).
     """
 
