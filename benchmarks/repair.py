@@ -1,6 +1,7 @@
 """Dirt of known size on clean clips, and what the repair leaves of it beside the best filters.
 
     python benchmarks/repair.py --data FOLDER [--as keypoints] [--smoke] [--only white tone5] -o FILE.csv
+    python benchmarks/repair.py --data FOLDER --live -o results/repair_live.csv
 
 FOLDER holds the development set. Every clip is dirtied so that its joints are 10 to 100 mm off on
 average, repaired by `heal`, and filtered by zero-phase Butterworth filters, Savitzky-Golay filters and
@@ -293,6 +294,28 @@ def clips_of(data: Path, count: int) -> Iterator[Clip]:
             return
 
 
+def measure_live(data: Path, smoke: bool, out: Path) -> None:
+    """Writes the rows of streams."""
+    import repair_live as live
+
+    torch.set_num_threads(1)
+    clips = list(clips_of(data, 3 if smoke else live.CLIPS))
+    show = ["git", "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(show, capture_output=True, text=True).stdout.strip()
+    command = "python benchmarks/repair.py --data FOLDER --live -o results/repair_live.csv"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for subject, metric, values in live.live_rows(clips, (25.0,) if smoke else live.SIZES_MM):
+            low, middle, high = np.nanquantile(values, (0.25, 0.5, 0.75))
+            spread = f"{low:.3g} to {high:.3g}"
+            writer.writerow(
+                (subject, metric, f"{middle:.4g}", spread, len(values), 1, "", commit, command)
+            )
+            print(subject, metric, f"{middle:.4g}", spread, file=sys.stderr)
+
+
 def main() -> None:
     """Measures and writes the rows."""
     parser = argparse.ArgumentParser(
@@ -304,8 +327,12 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="*", type=float, default=SIZES_MM)
     parser.add_argument("--clips", type=int, default=CLIPS)
     parser.add_argument("--smoke", action="store_true", help="three clips, one size")
+    parser.add_argument("--live", action="store_true", help="streams, see repair_live.py")
     parser.add_argument("-o", "--out", type=Path, required=True)
     options = parser.parse_args()
+    if options.live:
+        measure_live(options.data, options.smoke, options.out)
+        return
     torch.set_num_threads(1)
     if options.smoke:
         options.clips, options.sizes = 3, (25.0,)

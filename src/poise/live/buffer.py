@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from poise.kin.fading import Tremble
 from poise.live.quats import slerp
+from poise.live.steady import Earlier, leapt
 
 #: s of the buffer that even out how packets come at least, and share of it that does where that is more;
 #: the rest may be looked ahead at.
@@ -16,10 +19,12 @@ MARGIN_S, MARGIN = 0.05, 0.5
 FADE_S = 0.1
 #: s without a new pose after which motion is known to have stopped coming.
 STALLS_S = 0.2
-#: m/s and m beyond which a person did not move but is elsewhere, or is another one.
-JUMP, LEAP_M = 12.0, 0.4
+#: s a second by which motion that begins to tremble is kept back more and more.
+KEEPS_BACK = 0.15
 #: Packets by which the way's shortest time is known, and those that are kept.
 SEEN, KEPT = 240, 320
+
+NONE = Tremble()
 
 
 def margin(delay_s: float) -> float:
@@ -60,21 +65,27 @@ class JitterBuffer:
 
     A source's clock is its own; the shortest way that a packet took is when it was made. What is read at
     `now` is as it was `margin(delay_s)` before, so that with no delay at all motion is
-    extrapolated, and with one it is between two packets.
+    extrapolated, and with one it is between two packets. Motion that trembles is read `tremble.late_s`
+    later, and smoothed by what has come meanwhile.
 
     Args:
         delay_s: s, 0 to 0.4; by what of it exceeds the margin, a goal lags behind what is read here.
+
+    Attributes:
+        tremble: what the person does now.
     """
 
     def __init__(self, delay_s: float = 0.1):
-        self.delay_s = delay_s
+        self.delay_s, self.tremble = delay_s, Tremble()
         self.late = self.jumps = 0
         self._frames: deque[_Frame] = deque(maxlen=KEPT)
         self._ways: deque[float] = deque(maxlen=SEEN)
         self._way = 0.0
         self._arrived = -np.inf
-        # The moment that was read last.
+        # The moment that was read last, when that was, and by how much motion is kept back.
         self._read = -np.inf
+        self._now: float | None = None
+        self._late = 0.0
 
     def add(
         self,
@@ -83,9 +94,13 @@ class JitterBuffer:
         root_pos: np.ndarray,
         rot: np.ndarray,
         places: np.ndarray | None = None,
+        tremble: Tremble = NONE,
+        held_s: float = 0.0,
+        earlier: Sequence[Earlier] = (),
     ) -> None:
-        """One more packet; one that is older than those that came is put in its place."""
-        self._ways.append(arrived_s - time_s)
+        """One more packet; one that is older than the newest is left out. The rest: see `Packet`."""
+        way = arrived_s - time_s - held_s
+        self._ways.append(way)
         self._way = min(self._ways)
         self._arrived = max(self._arrived, arrived_s)
         frames = self._frames
@@ -93,17 +108,21 @@ class JitterBuffer:
             # A source that began anew.
             frames.clear()
             self._ways.clear()
-            self._ways.append(arrived_s - time_s)
-            self._way = arrived_s - time_s
+            self._ways.append(way)
+            self._way = way
             self._read = -np.inf
         if frames and time_s <= frames[-1].time_s:
             self.late += 1
             return
         leaps = False
         if frames:
-            far = float(np.linalg.norm(root_pos - frames[-1].root_pos))
-            leaps = far > LEAP_M and far > JUMP * (time_s - frames[-1].time_s)
+            leaps = leapt(frames[-1].root_pos, root_pos, time_s - frames[-1].time_s)
             self.jumps += leaps
+            for when, root, turned in earlier:
+                k = next((k for k in range(1, len(frames) + 1) if frames[-k].time_s <= when), 1)
+                if frames[-k].time_s == when:
+                    frames[-k] = frames[-k]._replace(root_pos=root, rot=turned)
+        self.tremble = tremble
         frames.append(_Frame(time_s, root_pos, rot, leaps, places))
 
     def read(self, now_s: float) -> Pose | None:
@@ -111,7 +130,7 @@ class JitterBuffer:
         frames = self._frames
         if not frames:
             return None
-        at = now_s - self._way - margin(self.delay_s)
+        at = now_s - self._way - margin(self.delay_s) - self._kept_back(now_s)
         # A leap is told when it is read, which is later than it comes.
         jumped = any(f.leaps and self._read < f.time_s <= at for f in frames)
         self._read = max(self._read, at)
@@ -132,6 +151,13 @@ class JitterBuffer:
             places = a.places + share * (b.places - a.places)
         root = a.root_pos + share * (b.root_pos - a.root_pos)
         return Pose(root, slerp(a.rot, b.rot, share), stale, jumped, places, stalled)
+
+    def _kept_back(self, now_s: float) -> float:
+        """s, that of the tremble; it comes and goes gently."""
+        most = np.inf if self._now is None else KEEPS_BACK * max(0.0, now_s - self._now)
+        self._now = now_s
+        self._late += float(np.clip(self.tremble.late_s - self._late, -most, most))
+        return self._late
 
     def _beyond(self, at: float) -> tuple[_Frame, _Frame, float]:
         """The last two frames and a share of the way between them, beyond 1: q_0 + v_0 tau

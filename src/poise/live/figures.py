@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from poise.kin.fading import Tremble
 from poise.live.aims import Aims
 from poise.live.packet import Inbox
 from poise.live.people import STAND
@@ -55,15 +56,24 @@ def figures(aims: Aims, inbox: Inbox, times: Times) -> dict[str, Any]:
         "resets": world.resets, "help_n": 0.0, "received": inbox.received,
         "refused": dict(inbox.refused), "crowded": inbox.crowded,
         "people": [
-            {"name": p.name, "calibrated": round(p.share, 2), "said": "" if p.onto else p.said}
+            {
+                "name": p.name, "calibrated": round(p.share, 2), "said": "" if p.onto else p.said,
+                **_of_tremble(p.buffer.tremble),
+            }
             for p in people.known.values()
         ]
         + [
-            {"name": name, "calibrated": round(share, 2), "said": STAND}
+            {"name": name, "calibrated": round(share, 2), "said": STAND, **_of_tremble(Tremble())}
             for name, share in list(inbox.standing.items())
         ],
         "characters": [_of_character(aims, k) for k in range(world.count)],
     }  # fmt: skip
+
+
+def _of_tremble(tremble: Tremble) -> dict[str, Any]:
+    """By how many mm a person trembles, at how many Hz, and how many ms later it is followed."""
+    hz = None if tremble.hz is None else round(tremble.hz, 1)
+    return {"trembles_mm": round(tremble.mm), "hz": hz, "late_ms": round(1000.0 * tremble.late_s)}
 
 
 def _of_character(aims: Aims, k: int) -> dict[str, Any]:

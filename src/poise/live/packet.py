@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.kin.fading import Tremble
 from poise.live.quats import normalized
+from poise.live.steady import Earlier, Steady
 from poise.motion import Clip, Skeleton
 
 #: Packets of one person that wait at most; the newest win.
@@ -35,6 +37,9 @@ class Packet:
         whole: a clip that shows how the skeleton stands, where there is one; else the first seconds do.
         places: `(B, 3)` m, where the character's bodies are to be, for policies that are told places
             alone; None where the pose tells all.
+        tremble: what the person was found to do where this pose is smoothed, None where it came so.
+        held_s: s for which the source has kept it back, to know it better.
+        earlier: poses before it, as they are known now.
     """
 
     person: str
@@ -44,6 +49,9 @@ class Packet:
     rot: np.ndarray
     whole: Clip | None = None
     places: np.ndarray | None = None
+    tremble: Tremble | None = None
+    held_s: float = 0.0
+    earlier: tuple[Earlier, ...] = ()
 
 
 def checked(packet: Packet) -> Packet:
@@ -74,6 +82,8 @@ def checked(packet: Packet) -> Packet:
 class Inbox:
     """Packets on their way from the sources' threads to the loop; neither waits for the other.
 
+    Poses are smoothed on the way in, in the source's thread, as much as their person trembles.
+
     Attributes:
         received: packets that were taken.
         refused: how many were not, by the reason.
@@ -87,6 +97,7 @@ class Inbox:
         self.standing = dict[str, float]()
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[tuple[float, Packet]]] = {}
+        self._steady: dict[str, Steady] = {}
 
     def refuse(self, reason: str) -> None:
         """Counts something that is no packet."""
@@ -96,7 +107,7 @@ class Inbox:
     def offer(self, packet: Packet, arrived_s: float) -> bool:
         """Takes a packet that came at `arrived_s` by the loop's clock; False: it was refused."""
         try:
-            good = checked(packet)
+            good = self._smoothed(checked(packet))
         except PoiseError as problem:
             self.refuse(problem.what)
             return False
@@ -111,6 +122,26 @@ class Inbox:
             line.append((arrived_s, good))
             self.received += 1
         return True
+
+    def _smoothed(self, packet: Packet) -> Packet:
+        """The packet as its person is now known; one that comes late is left as it is."""
+        if packet.tremble is not None:
+            return packet
+        with self._lock:
+            steady = self._steady.pop(packet.person, None)
+            if steady is None or steady.skeleton is not packet.skeleton:
+                steady = Steady(packet.skeleton)
+            # Those that were heard of last are the last.
+            self._steady[packet.person] = steady
+            while len(self._steady) > PEOPLE:
+                del self._steady[next(iter(self._steady))]
+        known = steady(packet.time_s, packet.root_pos, packet.rot)
+        if known is None:
+            return packet
+        root, rot = known
+        return replace(
+            packet, root_pos=root, rot=rot, tremble=steady.tremble, earlier=tuple(steady.before())
+        )
 
     def take(self) -> dict[str, list[tuple[float, Packet]]]:
         """All that wait, by person, each with the time at which it came."""

@@ -116,7 +116,7 @@ def _levels(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 @lru_cache(maxsize=64)
-def _doublings(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+def doublings(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Joints, and those that all of the way up to which they know already hang on: each round doubles
     the way, so that few are enough."""
     above, out = np.array(parents), list[tuple[np.ndarray, np.ndarray]]()
@@ -130,7 +130,7 @@ def _doublings(parents: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
 def world_of(skeleton: Skeleton, rot: np.ndarray) -> np.ndarray:
     """World rotations `(J, 4)` of local ones."""
     out = rot.copy()
-    for joints, above in _doublings(tuple(skeleton.parents)):
+    for joints, above in doublings(tuple(skeleton.parents)):
         out[joints] = q.mul(out[above], out[joints])
     return out
 

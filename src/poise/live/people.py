@@ -7,6 +7,7 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from poise.kin.fading import Tremble
 from poise.live.buffer import JitterBuffer, Pose
 from poise.live.calibration import OntoBody, Standing
 from poise.live.packet import PEOPLE, Packet
@@ -52,7 +53,8 @@ class Person:
         if self._first is None:
             self._first = packet
         self.arrived_s = arrived_s
-        self.buffer.add(packet.time_s, arrived_s, packet.root_pos, packet.rot, packet.places)
+        p, tremble = packet, packet.tremble or Tremble()
+        self.buffer.add(p.time_s, arrived_s, p.root_pos, p.rot, p.places, tremble, p.held_s, p.earlier)
         if self.onto is None and self._made is None:
             whole = packet.whole or self._standing.add(packet)
             if whole is not None:

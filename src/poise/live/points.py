@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections import deque
 
 import numpy as np
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
+from poise.kin.fading import FadingFilter, Tremble, of_points
 from poise.kin.retarget.keypoint_body import PointBody
 from poise.kin.retarget.keypoint_stream import Gaps
 from poise.live.calibration import FEWEST, STAND_S, STILL_M
@@ -49,6 +51,9 @@ class Performer:
         # Keypoints that were seen while the person stood; others are left out.
         self._kept = np.arange(len(names))
         self._gaps = Gaps(len(names), MAX_SPEED)
+        self._steady: FadingFilter | None = None
+        # When the last frames were, and which of them was fitted last.
+        self._times, self._fitted = deque[float](maxlen=8), -np.inf
         self.share, self.arrived_s = 0.0, -np.inf
 
     def take(self, frame: Frame) -> Packet | None:
@@ -60,7 +65,7 @@ class Performer:
         before = self._time
         if before is not None and frame.time_s < before - 2.0:
             # A source that began anew.
-            self._gaps, before = Gaps(len(self._kept), MAX_SPEED), None
+            self._gaps, before, self._fitted = Gaps(len(self._kept), MAX_SPEED), None, -np.inf
         if before is not None and frame.time_s - before < APART_S:
             return None
         self._time = frame.time_s
@@ -72,6 +77,10 @@ class Performer:
         if whole is None or stale > STALE_S:
             raise PoiseError("keypoints are missing", self.person)
         assert self._whole is not None
+        whole, time_s, tremble = self._smoothed(whole, frame.time_s, dt)
+        if time_s <= self._fitted:
+            return None
+        self._fitted = time_s
         skeleton, places = self._whole.skeleton, None
         if self._tells_places:
             pos, root, rot = self._body.follow(whole[None])
@@ -79,7 +88,24 @@ class Performer:
         else:
             root, rot = self._body.performer(whole[None])
         at, turned = root[0].numpy(), rot[0].numpy()
-        return Packet(self.person, frame.time_s, skeleton, at, turned, self._whole, places)
+        held = tremble.late_s
+        return Packet(self.person, time_s, skeleton, at, turned, self._whole, places, tremble, held)
+
+    def _smoothed(
+        self, whole: np.ndarray, time_s: float, dt: float
+    ) -> tuple[np.ndarray, float, Tremble]:
+        """Points `(K, 3)` of the newest frame that is known well, when it was, and how they tremble."""
+        if self._steady is None:
+            self._steady = of_points(len(whole))
+        if not 0.0 < dt < 1.0:
+            self._times.clear()
+        self._times.appendleft(time_s)
+        points, steady = self._steady(whole.ravel(), dt), self._steady
+        tremble, earlier = steady.tremble, [points, *steady.before()]
+        # Of the frames that are known, the one that is kept back by most nearly as much.
+        late = [time_s - t for t in list(self._times)[: len(earlier)]]
+        k = int(np.abs(np.array(late) - tremble.late_s).argmin())
+        return earlier[k].reshape(-1, 3), time_s - late[k], tremble._replace(late_s=late[k])
 
     def _measure(self, frame: Frame) -> None:
         seen = self._seen
@@ -106,7 +132,7 @@ class Performer:
         except PoiseError as problem:
             raise PoiseError("these keypoints show no body", self.person) from problem
         self._body, self.share = body, 1.0
-        self._kept, self._gaps = kept, Gaps(len(kept), MAX_SPEED)
+        self._kept, self._gaps, self._steady = kept, Gaps(len(kept), MAX_SPEED), None
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:

@@ -30,8 +30,8 @@ RESOLVED = 1.9
 #: The highest tremble (Hz) that is looked for by itself; what is faster counts as white noise.
 HIGHEST_HZ = 15.0
 #: White noise (mm, rms over joints) from which a motion trembles: clean ones have up to 4, where it is
-#: fast, at 30 frames/s. Less than this share of the way from frame to frame (rms) is none either: flips and
-#: sprints have it. Where the highest bands begin below this frequency (Hz) they hold motion.
+#: fast, at 30 frames/s. Less than this share of the way from frame to frame (rms) is none either: flips
+#: and sprints have it. Where the highest bands begin below this frequency (Hz) they hold motion.
 WHITE_MM, WHITE_SHARE, WHITE_HZ = 5.0, 0.08, 6.0
 #: Frames that a clip must have for its noise to be told.
 SHORTEST = 12

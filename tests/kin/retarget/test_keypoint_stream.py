@@ -13,7 +13,7 @@ from poise.errors import PoiseError
 from poise.kin import RetargetConfig, retarget
 from poise.kin.ground import fit_heights
 from poise.kin.retarget.keypoint_body import PointBody
-from poise.kin.retarget.keypoint_stream import FadingFilter, KeypointStream, StreamConfig
+from poise.kin.retarget.keypoint_stream import KeypointStream, StreamConfig
 from poise.motion import Clip, read_clip, resample, trim
 from poise.motion.io.points.raw import assemble_points
 from poise.motion.io.points.trc import trc_points
@@ -89,7 +89,7 @@ def test_nothing_is_known_of_the_future(toy) -> None:
     other = points.positions.copy()
     other[12:] += 5.0
     for lookahead in (0, 1):
-        config = StreamConfig(lookahead=lookahead, smooth_s=0.05, max_speed=1e9)
+        config = StreamConfig(lookahead=lookahead, smooth_hz=3.0, max_speed=1e9)
         streams = KeypointStream(body, RATE, config), KeypointStream(body, RATE, config)
         assert streams[0].latency_s == lookahead / RATE
         for t in range(15):
@@ -155,20 +155,6 @@ def test_a_keypoint_that_jumps_is_missing(toy) -> None:
     assert apart.max() < 0.05 and goals[10].stale_s > 0
 
 
-def test_the_filter_follows_a_line_without_lag_and_halves_noise() -> None:
-    t = np.arange(200) / RATE
-    fading = FadingFilter(0.1)
-    line = np.array([fading(np.array([2.0 * x + 1.0]), 1 / RATE)[0] for x in t])
-    np.testing.assert_allclose(line[60:], 2.0 * t[60:] + 1.0, atol=1e-3)
-    noise = np.random.default_rng(0).normal(size=4000)
-    fading = FadingFilter(0.1)
-    out = np.array([fading(np.array([x]), 1 / RATE)[0] for x in noise])
-    # Its variance is (1 - a) (1 + 4 a + 5 a^2) / (1 + a)^3 of the input's, a = theta (Morrison).
-    a = np.exp(-1 / RATE / 0.1)
-    assert out[100:].var() == pytest.approx((1 - a) * (1 + 4 * a + 5 * a**2) / (1 + a) ** 3, rel=0.1)
-    assert [FadingFilter(0.0)(np.array([x]), 0.1)[0] for x in (1.0, 5.0)] == [1.0, 5.0]
-
-
 def test_what_cannot_be_streamed(toy) -> None:
     points, onto, table, body = toy
     stream = KeypointStream(body, RATE)
@@ -183,7 +169,7 @@ def test_what_cannot_be_streamed(toy) -> None:
     markers = replace(points, names=tuple(f"M{k}" for k in range(len(points.names))))
     with pytest.raises(PoiseError, match="one frame at a time"):
         PointBody.calibrate(markers, onto, table)
-    for bad in ({"lookahead": 2}, {"smooth_s": -1.0}, {"max_speed": 0.0}):
+    for bad in ({"lookahead": 2}, {"smooth_hz": -1.0}, {"max_speed": 0.0}):
         with pytest.raises(PoiseError):
             StreamConfig(**bad)
     with pytest.raises(PoiseError, match="control rate"):
@@ -206,7 +192,7 @@ def test_a_real_clip_and_real_keypoints(data_dir) -> None:
     path = data_dir / "noisy/pose2sim/single/S00_P00_T01_BalancingTrial_0-100.trc"
     raw = assemble_points(trc_points(path), Options())
     body = PointBody.calibrate(raw, onto, table)
-    goals = list(KeypointStream(body, RATE, StreamConfig(smooth_s=0.05)).follow(raw))
+    goals = list(KeypointStream(body, RATE, StreamConfig(smooth_hz=3.0)).follow(raw))
     assert len(goals) == 50
     assert np.isfinite([g.pos for g in goals]).all() and np.abs([g.linvel for g in goals]).max() < 6.0
     low = min(float(g.pos[:, 2].min()) for g in goals)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -64,7 +63,8 @@ def follow(
     The character begins as the fitted clip does; places and velocities of its goals are those that the
     stream gives from what came so far.
 
-    smooth_hz: cut-off of the stream's filter, which sees the past alone.
+    smooth_hz: cut-off of the stream's filter, which sees the past alone; None smooths as much as the
+        keypoints tremble.
     """
     if tracker.config.goal != "keypoints":
         what = "The policy follows rotations: it got the clip that was fitted to the keypoints."
@@ -80,7 +80,7 @@ def follow(
     except PoiseError as problem:
         what = f"The keypoints cannot be followed one by one ({problem.what}): they were fitted."
         return reference, [what]
-    config = StreamConfig(smooth_s=1.0 / (2.0 * math.pi * smooth_hz) if smooth_hz else 0.0)
+    config = StreamConfig(smooth_hz or None)
     goals = list(KeypointStream(body, reference.rate_hz, config).follow(points))
     if len(goals) < 2:
         what = "The keypoints give no goals: the clip that was fitted to them was tracked."

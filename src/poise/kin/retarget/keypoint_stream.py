@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from poise.errors import PoiseError
+from poise.kin.fading import of_points
 from poise.kin.retarget.keypoint_body import PointBody
 from poise.motion.keypoints import Keypoints
 
@@ -28,20 +29,21 @@ BLOCK = 64
 class StreamConfig:
     """How a stream of keypoints is filtered.
 
-    smooth_s: time constant of the filter on the keypoints, 0 for none (`FadingFilter`). lookahead: 1
-        takes velocities from the frames before and after, one control step late; 0 from the last two.
+    smooth_hz: cut-off of the filter on the keypoints; None smooths them as much as they tremble
+        (`FadingFilter`). lookahead: 1 takes velocities from the frames before and after, one step
+        late; 0 from the last two.
     max_speed: m/s, a keypoint that jumps faster is taken as missing (sprinters' feet reach 20).
     """
 
-    smooth_s: float = 0.0
+    smooth_hz: float | None = None
     lookahead: int = 1
     max_speed: float = 25.0
 
     def __post_init__(self) -> None:
         if self.lookahead not in (0, 1):
             raise PoiseError(f"a stream looks 0 or 1 control steps ahead, not {self.lookahead}")
-        if not (self.smooth_s >= 0 and self.max_speed > 0):
-            raise PoiseError("times and speeds of a stream must not be negative")
+        if not ((self.smooth_hz is None or self.smooth_hz > 0) and self.max_speed > 0):
+            raise PoiseError("frequencies and speeds of a stream must be above 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,31 +68,6 @@ class _Step(NamedTuple):
     stale_s: float
 
 
-class FadingFilter:
-    """A line through the past, its weights fading by theta per sample (Morrison 1969, degree 1).
-
-    With theta = exp(-dt / tau), g = 1 - theta^2, h = (1 - theta)^2 and the residual r = z - (x + v dt):
-    x' = x + v dt + g r, v' = v + h r / dt. A constant velocity is followed without any lag; tau = 0
-    gives the sample itself.
-    """
-
-    def __init__(self, tau_s: float):
-        self.tau = tau_s
-        self._state: tuple[np.ndarray, np.ndarray] | None = None
-
-    def __call__(self, z: np.ndarray, dt: float) -> np.ndarray:
-        """The filtered value after sample `z`, `dt` s after the one before."""
-        theta = np.exp(-dt / self.tau) if self.tau > 0 else 0.0
-        if self._state is None:
-            self._state = z.copy(), np.zeros_like(z)
-            return z.copy()
-        x, v = self._state
-        r = z - (x + v * dt)
-        x = x + v * dt + (1 - theta**2) * r
-        self._state = x, v + (1 - theta) ** 2 * r / dt
-        return x
-
-
 class KeypointStream:
     """Keypoints one frame after another; goals at every control step that they reach.
 
@@ -104,7 +81,7 @@ class KeypointStream:
         self.body, self.rate_hz, self.config = body, rate_hz, config or StreamConfig()
         self.latency_s = self.config.lookahead / rate_hz
         self._gaps = Gaps(len(body.names), self.config.max_speed)
-        self._filter = FadingFilter(self.config.smooth_s)
+        self._filter = of_points(len(body.names), self.config.smooth_hz)
         self._time: float | None = None
         self._last: _Step | None = None
         self._begin, self._count = 0.0, 0
@@ -161,7 +138,7 @@ class KeypointStream:
         whole, stale = self._gaps(positions, dt)
         if whole is None:
             return []
-        now = self._filter(whole, dt)
+        now = self._filter(whole.ravel(), dt).reshape(whole.shape)
         if self._last is None:
             self._begin, self._last, self._count = time_s, _Step(time_s, now, stale), 1
             return [self._last]

@@ -139,9 +139,11 @@
     if (document.activeElement !== $("follow")) $("follow").value = c.follows || "";
     const waits = message.people.find((p) => p.said && p.name === c.follows);
     const last = message.recorded && message.recorded.length ? `Recorded ${message.recorded.join(", ")}. ` : "";
+    const shakes = message.people.find((p) => p.trembles_mm && p.name === c.follows);
+    const steadied = shakes ? ` ${shakes.name} trembles by ${shakes.trembles_mm} mm${shakes.hz ? ` at ${shakes.hz} Hz` : ""}: smoothed, ${shakes.late_ms} ms later.` : "";
     $("says").textContent = waits ? `${waits.name}: ${waits.said} (${Math.round(100 * waits.calibrated)} %)`
       : c.endless ? `The character ${c.doing} endless motion.`
-      : c.doing === "at ease" ? "Nobody is here to follow." : `${last}The character ${c.doing}.`;
+      : c.doing === "at ease" ? "Nobody is here to follow." : `${last}The character ${c.doing}.${steadied}`;
   }
 
   const told = () => {

@@ -1,0 +1,246 @@
+"""How much a stream trembles, told by its last seconds: white noise, and a tremble of one frequency.
+
+White noise is what high differences are made of: those of order k of white noise of variance s^2 have
+(2k choose k) s^2, while motion all but vanishes in them. Medians over time leave out its bursts. A
+tremble stands out of the octaves below and above it, as in `doctor.noise`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from poise.kin.doctor.noise import ABOVE, HIGHEST_HZ, MOST, TREMBLES, WHITE_HZ, WHITE_MM
+
+#: Samples a second that are measured about; least s between two of them; s of gaps that are bridged.
+RATE, APART_S, BRIDGED_S = 30.0, 0.7 / 30.0, 0.3
+#: Order of differences, samples of which their median is, and the fewest.
+ORDER, SAMPLES, FEWEST = 6, 75, 20
+#: The median of a square of three normal components, by its mean.
+MEDIAN = 0.789
+#: Samples by which places tell how much of the noise is the body's, and after how many they do again.
+ASKED, AGAIN = 48, 75
+#: Share of `WHITE_MM` below which a stream that trembled does no more.
+CALMS = 0.7
+#: Samples in whose spectrum a tremble is looked for, how often that is, and looks in vain after which
+#: it is gone; mixtures of all channels that are looked at.
+LONG, EVERY, PATIENCE, MIXED = 128, 12, 4, 12
+#: The slowest tremble (Hz) that is told from motion in so short a time; mm that it has at least.
+SLOWEST_HZ, LEAST_MM = 2.5, 2.0
+#: How clear a tremble is in the mixtures for the channels to be asked.
+MAY = 0.6
+#: Peaks that are looked at, those with the fastest motion.
+FEW = 6
+
+
+#: What white noise of variance 1 makes of the median square of a difference.
+_THROUGH = math.comb(2 * ORDER, ORDER) * MEDIAN
+#: Channels of some samples to places of joints.
+Places = Callable[[np.ndarray], np.ndarray]
+
+
+class StreamNoise:
+    """Measures the noise of channels `(C)` sample by sample.
+
+    Args:
+        groups: `(C)` from 0 on, channels that move together, as those of a joint.
+        weights: `(G)` m by which the whole body's joints are off (rms) for an error of 1 in a group,
+            where groups err by themselves.
+        places: `(T, C)` to the places `(T, K, 3)` m of joints. With it the body's white noise is theirs,
+            since in a captured chain the error of a joint undoes that of the one above.
+
+    Attributes:
+        white: `(G)` variance of the white noise, the sum over a group's channels.
+        tone: `(G)` that of the tremble.
+        hz: its frequency, None without one.
+        mm: rms over joints of all noise, 0 while the stream does not tremble.
+    """
+
+    def __init__(self, groups: np.ndarray, weights: np.ndarray, places: Places | None = None):
+        count = int(groups.max()) + 1
+        self.member = np.zeros((len(groups), count))
+        self.member[np.arange(len(groups)), groups] = 1.0
+        self.white, self.tone, self.hz, self.mm = np.zeros(count), np.zeros(count), None, 0.0
+        self.hz: float | None
+        self._square = np.asarray(weights) ** 2
+        mixing = np.random.default_rng(0).normal(size=(len(groups), MIXED))
+        self._mixing = mixing
+        self._row = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
+        self._white_on, self._vain = False, 0
+        self._lasts = deque[np.ndarray](maxlen=ORDER + 1)
+        self._places, self._share, self._asks = places, 1.0, 0
+        self._kept = deque[np.ndarray](maxlen=ASKED if places is not None else 0)
+        self._squares = np.zeros((SAMPLES, count))
+        self._steps = np.zeros((LONG, len(groups)))
+        self._dts = deque[float](maxlen=LONG)
+        self._last: np.ndarray | None = None
+        self._since, self._seen, self._count, self._usual = 0.0, 0, 0, 0.0
+        self._suspect: float | None = None
+        self._phase = 0
+
+    @property
+    def trembles(self) -> bool:
+        """Whether there is anything to be smoothed."""
+        return self._white_on or self.hz is not None
+
+    def __call__(self, z: np.ndarray, dt: float) -> None:
+        """One more sample."""
+        self._since += dt
+        if self._last is None:
+            self._last, self._since = z, 0.0
+            # So that streams which begin together are not all looked at in one step.
+            self._phase = int(1e6 * float(np.abs(z).sum())) % EVERY
+            return
+        if self._since < APART_S:
+            return
+        usual = self._usual or self._since
+        count = max(1, min(round(self._since / usual), math.ceil(BRIDGED_S / usual)))
+        step = (z - self._last) / count
+        for k in range(1, count + 1):
+            self._take(self._last + k * step if k < count else z, step)
+        self._dts.append(self._since / count if self._since < BRIDGED_S else usual)
+        if self._count % 16 == 5 or self._count < 5:
+            self._usual = float(np.median(self._dts))
+        self._last, self._since = z, 0.0
+
+    def elsewhere(self, z: np.ndarray) -> None:
+        """The stream goes on from `z`, from where it did not move to."""
+        self._last, self._since = z, 0.0
+        self._lasts.clear()
+        self._kept.clear()
+
+    def _take(self, z: np.ndarray, step: np.ndarray) -> None:
+        self._count += 1
+        self._steps[self._count % LONG] = step
+        self._lasts.append(z)
+        self._kept.append(z)
+        if len(self._lasts) > ORDER:
+            rough = self._row @ np.array(self._lasts)
+            self._squares[self._seen % SAMPLES] = (rough * rough) @ self.member
+            self._seen += 1
+        # One thing in a sample, since each takes its time.
+        turn = (self._count + self._phase) % EVERY
+        if turn % 6 == 1 and self._seen >= FEWEST:
+            self._level()
+        elif turn == 3 and self._count >= LONG // 2:
+            self._suspect = self._suspected()
+        elif turn == 4 and self._count >= LONG // 2:
+            self._judge(self._suspect)
+
+    def _level(self) -> None:
+        rate = 1.0 / self._usual
+        if 0.35 * rate < WHITE_HZ:
+            self._white_on, self.white[:] = False, 0.0
+            return
+        white = np.median(self._squares[: min(self._seen, SAMPLES)], axis=0) / _THROUGH
+        if self.hz is not None:
+            through = (2.0 * math.sin(math.pi * self.hz / rate)) ** (2 * ORDER)
+            white = np.maximum(white - MEDIAN * self.tone * through / _THROUGH, 0.0)
+        self.white = white
+        size = 1e3 * math.sqrt(float(self._square @ white))
+        if size >= WHITE_MM and self._places is not None:
+            size *= self._of_places(self._places)
+        self._white_on = size >= (CALMS * WHITE_MM if self._white_on else WHITE_MM)
+        self._sum()
+
+    def _of_places(self, places: Places) -> float:
+        """The noise of places by that of groups which err by themselves."""
+        if self._seen >= self._asks and len(self._kept) > ORDER + 1:
+            self._asks = self._seen + AGAIN
+            kept = np.array(self._kept)
+            rough = np.diff(kept, n=ORDER, axis=0) ** 2 @ self.member
+            alone = float(self._square @ np.median(rough, axis=0))
+            there = (np.diff(places(kept), n=ORDER, axis=0) ** 2).sum(-1)
+            self._share = math.sqrt(float(np.median(there, axis=0).mean()) / alone)
+        return self._share
+
+    def _sum(self) -> None:
+        if not self.trembles:
+            self.mm = 0.0
+            return
+        variance = self._share**2 * self.white + self.tone
+        self.mm = 1e3 * math.sqrt(float(self._square @ variance))
+
+    def _lately(self) -> tuple[np.ndarray, np.ndarray]:
+        """The last steps `(T, C)`, and a window on them."""
+        many = min(self._count, LONG)
+        steps = np.concatenate(
+            (self._steps[self._count % LONG + 1 :], self._steps[: self._count % LONG + 1])
+        )
+        return steps[-many:], np.hanning(many + 2)[1:-1, None]
+
+    def _suspected(self) -> float | None:
+        """Hz of what may be a tremble, by mixtures of all channels."""
+        steps, window = self._lately()
+        size = np.sqrt(np.einsum("tc,tc->c", steps, steps))
+        mixed = steps @ (self._mixing / np.where(size > 1e-5 * size.max(), size, np.inf)[:, None])
+        hz, power = _spectrum(mixed * window, 1.0 / self._usual)
+        at = _clearest(hz, power, 1.0 / self._usual, len(steps))
+        return None if at is None else _peak(hz, power, at)
+
+    def _judge(self, found: float | None) -> None:
+        """Looks whether most channels have a tremble at `found` Hz, and how large it is."""
+        if found is not None:
+            steps, window = self._lately()
+            rate, many = 1.0 / self._usual, len(steps)
+            size = np.abs(steps).max(0)
+            hz, power = _spectrum(steps[:, size > 1e-5 * size.max()] * window, rate)
+            if _clear(hz, power, int(np.abs(hz - found).argmin()), many) >= 1.0:
+                at = found + 2.6 * rate / many * np.array([-1.0, 0.0, 1.0])
+                wave = np.exp(-2j * np.pi * at[:, None] * np.arange(many) / rate) * window[:, 0]
+                tone = 2.0 * np.abs(wave @ steps) ** 2 / window.sum() ** 2
+                tone /= (2.0 * np.sin(np.pi * at / rate)[:, None]) ** 2
+                tone = np.maximum(tone[1] - 0.5 * (tone[0] + tone[2]), 0.0) @ self.member
+                if 1e6 * float(self._square @ tone) >= LEAST_MM**2:
+                    self._vain, self.hz, self.tone = 0, found, tone
+                    self._sum()
+                    return
+        self._vain += 1
+        if self._vain >= PATIENCE:
+            self.hz, self.tone = None, np.zeros_like(self.tone)
+            self._sum()
+
+
+def _spectrum(steps: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Hz `(F)`, and the power `(F, N)` of what makes such `steps (T, N)`."""
+    hz = np.fft.rfftfreq(2 * LONG, 1.0 / rate)[1:]
+    power = np.abs(np.fft.rfft(steps, 2 * LONG, axis=0)[1:]) ** 2
+    return hz, power / (2.0 * np.sin(np.pi * hz[:, None] / rate)) ** 2
+
+
+def _clear(hz: np.ndarray, power: np.ndarray, k: int, many: int) -> float:
+    """How far the peak at `hz[k]` stands out in most channels, 1 for what is a tremble."""
+    rate = hz[0] * 2 * LONG
+    gap = max(2.0 * rate / many, 0.12 * hz[k])
+    # Bins are hz[0] apart, from hz[0] on.
+    edges = np.array([hz[k] / 2.2, hz[k] - gap, hz[k] + gap, 2.3 * hz[k]]) / hz[0] - 1.0
+    a, b, c, d = np.ceil(edges).astype(int)
+    if b <= a or c >= min(d, len(hz)):
+        return 0.0
+    peak = power[k - 1 : k + 2].max(0)
+    over, under = peak / (power[a:b].max(0) + 1e-300), peak / (power[c:d].max(0) + 1e-300)
+    most = int(MOST * len(peak))
+    clear = min(np.partition(over, most)[most], np.partition(under, most)[most] / ABOVE)
+    starts, limits = np.array(TREMBLES).T
+    return float(clear / limits[np.searchsorted(starts, hz[k] + 1e-9) - 1])
+
+
+def _clearest(hz: np.ndarray, power: np.ndarray, rate: float, many: int) -> int | None:
+    """Index of the peak of `power (F, N)` that stands out most; None where none may be a tremble."""
+    whole = power.sum(1)
+    top = (hz >= SLOWEST_HZ) & (hz <= min(HIGHEST_HZ, 0.42 * rate))
+    peaks = np.flatnonzero(top[1:-1]) + 1
+    peaks = peaks[(whole[peaks] > whole[peaks - 1]) & (whole[peaks] > whole[peaks + 1])]
+    peaks = peaks[np.argsort(-whole[peaks] * hz[peaks] ** 2)[:FEW]]
+    clear = [_clear(hz, power, int(k), many) for k in peaks]
+    return int(peaks[int(np.argmax(clear))]) if clear and max(clear) >= MAY else None
+
+
+def _peak(hz: np.ndarray, power: np.ndarray, k: int) -> float:
+    """Hz of the peak at `hz[k]`, between the bins."""
+    left, here, right = np.log(power[k - 1 : k + 2]).mean(1)
+    bend = left - 2 * here + right
+    return float(hz[k] + (0.5 * (left - right) / bend if bend < 0 else 0.0) * (hz[1] - hz[0]))
