@@ -32,6 +32,8 @@ from poise.motion import Clip
 BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
+#: What trembled is held from this share of a slide on, and stays as high as it is up to this (m).
+SHAKEN, UNSURE_M = 0.5, 0.06
 #: Periods of a loop that are mended, of which one is taken.
 HEALED = 3
 
@@ -126,26 +128,31 @@ def _healed(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
     support = support_of(clip, anatomy)
     low = None if support is None else support.low.min(-1)
     clip = mend_teleports(clip, low)
-    clip = clean_clip(clip, anatomy, rougher=False)[0]
+    clip, report = clean_clip(clip, anatomy, rougher=False)
     clip = mend_jitter(clip)
     if support is None:
         return clip
     support = support_of(clip, anatomy)
     clip = clip if support is None else mend_drift(clip, support.sole_low)
-    return _on_floor(_locked(_on_floor(clip, anatomy), anatomy, path), anatomy)
-
-
-def _on_floor(clip: Clip, anatomy: Anatomy) -> Clip:
+    # Feet that trembled still do a little where they stand, and tell less well how high the floor is.
+    shaken = any(f.kind == "tremble" for f in report.noise)
     support = support_of(clip, anatomy)
-    return clip if support is None else set_on_floor(clip, support)
+    if support is not None and (not shaken or abs(support.off_m) > UNSURE_M):
+        clip = set_on_floor(clip, support)
+    clip = _locked(clip, anatomy, path, SHAKEN if shaken else 1.0)
+    support = support_of(clip, anatomy)
+    return clip if support is None else set_on_floor(clip, support, whole=False)
 
 
-def set_on_floor(clip: Clip, support: Support) -> Clip:
+def set_on_floor(clip: Clip, support: Support, whole: bool = True) -> Clip:
     """The clip lowered or lifted where it floats or lies under the floor, smoothly, else as it is.
 
-    First the whole of it, by what its soles say; then spells that hover or sink, smoothed over 0.2 s.
+    First the `whole` of it, by what its soles say; then spells that hover or sink, smoothed over 0.2 s.
     """
-    lift = np.full(clip.frames, -support.off_m)
+    off = support.off_m
+    if off and not whole:
+        return clip
+    lift = np.full(clip.frames, -off)
     settle = support.fit.settle_m
     if any(
         f.kind == "float" and f.stop - f.start + 1 < clip.frames for f in height_faults(clip, support)
@@ -160,11 +167,11 @@ def set_on_floor(clip: Clip, support: Support) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
-    """The clip without sliding feet. path: see `heal`."""
+def _locked(clip: Clip, anatomy: Anatomy, path: bool | None, share: float) -> Clip:
+    """The clip without sliding feet. path: see `heal`. share: see `slide_faults`."""
     for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
-        faults = slide_faults(clip, support) if support is not None else []
+        faults = slide_faults(clip, support, share) if support is not None else []
         if support is None or not faults:
             return clip
         if step is mend_path and not (drifts(support) if path is None else path):

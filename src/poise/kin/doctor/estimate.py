@@ -37,6 +37,9 @@ HELD_S, LEAPS, LEAP_RAD = 0.08, 3.0, 0.03
 #: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
 #: toes snap by nearly as much in kicks and dashes.
 SPIKE_RAD, SPIKE_M = 0.35, 0.06
+#: Where this share of all joints and frames leaps for certain, smaller spikes are told as well: so many
+#: times the usual roughness, this angle (rad) at least, in so many rounds.
+MANY_SPIKES, SMALL_TIMES, SMALL_RAD, SPIKE_ROUNDS = 1e-3, 5.0, 0.02, 3
 #: A tremble is looked for in what is faster than this (Hz), of axes that turn by more than this (rad).
 SLOW_HZ, STILL_RAD = 0.7, 1e-5
 #: Cycles are the same where they are apart by less than this share of their energy.
@@ -46,7 +49,7 @@ REPEATED = 1e-4
 def refill(clip: Clip, found: Sequence[tuple[str, int, int, int]] | None = None) -> Clip:
     """The clip with every joint that was lost on the smoothest curve through its other frames; one that
     lost none comes back as it is. found: what `find_lost` says, which is asked where it is not given."""
-    rot = unwrap_quats(torch.tensor(clip.rot)).numpy()
+    rot = _continuous(clip.rot)
     lost = np.zeros(rot.shape[:2], dtype=bool)
     for _, j, a, b in find_lost(clip, rot) if found is None else found:
         lost[a : b + 1, j] = True
@@ -89,7 +92,7 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     """
     if clip.frames < SHORTEST:
         return [], clip
-    rot = unwrap_quats(torch.tensor(clip.rot)).numpy()
+    rot = _continuous(clip.rot)
     lost = find_lost(clip, rot)
     whole = refill(clip, lost)
     turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
@@ -165,12 +168,18 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
     """
     out: list[tuple[str, int, int, int]] = []
     spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
+    sure = np.zeros_like(spikes)
     for j in np.flatnonzero(spikes.any(0)):
         back = filled(rot[:, j], ~spikes[:, j], clip.fps)
         turned = 2.0 * np.linalg.norm(back - rot[:, j], axis=-1)
         least = max(SPIKE_RAD, SPIKE_M / max(lever[j], 1e-3))
-        runs = find_runs(spikes[:, j], 0)
-        out += [("spike", int(j), a, b) for a, b in runs if turned[a : b + 1].max() >= least]
+        for a, b in find_runs(spikes[:, j], 0):
+            sure[a : b + 1, j] = turned[a : b + 1].max() >= least
+    if sure.mean() >= MANY_SPIKES:
+        sure |= _small_spikes(rot, sure, clip.fps)
+    out += [
+        ("spike", int(j), a, b) for j in np.flatnonzero(sure.any(0)) for a, b in find_runs(sure[:, j], 0)
+    ]
     still = (rot[1:] == rot[:-1]).all(-1)
     step, reach = np.linalg.norm(np.diff(rot, axis=0), axis=-1), max(3, round(0.2 * clip.fps))
     for j in np.flatnonzero(still.any(0) & ~still.all(0)):
@@ -182,6 +191,59 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
             if len(near) and step[last + 1, j] > max(LEAPS * np.median(near), 0.5 * LEAP_RAD):
                 out.append(("held", int(j), first + 1, last + 1))
     return out
+
+
+def _continuous(rot: np.ndarray) -> np.ndarray:
+    """Rotations `(T, J, 4)` continuous in sign; a frame that leaps by a half turn does not exchange the
+    sign of those after it, as it may in `unwrap_quats`."""
+    out, before = np.array(rot), np.array(rot[:1])
+    for t in range(1, len(out)):
+        away = (before * out[t]).sum((0, -1)) < 0
+        out[t, away] *= -1.0
+        before = out[max(0, t - 2) : t + 1]
+    return out
+
+
+def _small_spikes(rot: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
+    """`(T, J)` bool, spikes of a frame that are too small to be sure of in a motion without larger ones.
+
+    A frame that leaps alone by s leaves fourth differences s (1, -4, 6, -4, 1): it stands out of the
+    second around it, and its neighbours point the other way. known: `(T, J)`, the larger ones.
+    """
+    from scipy.ndimage import median_filter
+
+    found, reach = known.copy(), 2 * max(2, round(0.5 * fps)) + 1
+    for _ in range(SPIKE_ROUNDS):
+        calm = np.stack([filled(rot[:, j], ~found[:, j], fps) for j in range(rot.shape[1])], 1)
+        rough = np.zeros_like(calm)
+        rough[2:-2] = np.diff(calm, n=4, axis=0) / 6.0
+        size = np.linalg.norm(rough, axis=-1)
+        usual = median_filter(size, (reach, 1), mode="nearest")
+        beside = np.stack([(rough[2:-2] * rough[2 + k : len(rough) - 2 + k]).sum(-1) for k in (-1, 1)])
+        tall = (size[2:-2] > np.maximum(SMALL_TIMES * usual[2:-2], 0.5 * SMALL_RAD)) & (beside < 0).all(
+            0
+        )
+        peak = np.stack([size[2 + k : len(size) - 2 + k] for k in (-2, -1, 0, 1, 2)]).argmax(0) == 2
+        fresh = np.zeros_like(found)
+        fresh[2:-2] = tall & peak
+        if not (fresh & ~found).any():
+            break
+        found |= fresh
+    for j in range(rot.shape[1]):
+        for way in (1, -1):
+            found[::way, j][:2] |= _spikes_at_start(rot[::way, j], found[::way, j], fps)
+    return found
+
+
+def _spikes_at_start(y: np.ndarray, known: np.ndarray, fps: float) -> np.ndarray:
+    """`(2)` bool, which of the first two frames of `y (T, 4)` must leap for the rest to be smooth."""
+    seen = known.copy()
+    for leaps in ((False, False), (True, False), (False, True), (True, True)):
+        seen[:2] = known[:2] | np.array(leaps)
+        rough = np.linalg.norm(np.diff(filled(y, ~seen, fps), n=3, axis=0), axis=-1)
+        if rough[:3].max() <= max(SMALL_TIMES * np.median(rough[:60]), SMALL_RAD):
+            return np.array(leaps)
+    return np.zeros(2, dtype=bool)
 
 
 def _reach(skeleton: Skeleton) -> np.ndarray:
