@@ -5,10 +5,10 @@
     earlier = fading.before()    # the samples before it, by all that has come since
 
 A channel is taken as z = x + n + e: motion x, a tremble n of one frequency, white noise e of variance R.
-The stream itself tells the sizes of n and e (`StreamNoise`). x moves on by its velocity, which is driven by white
-noise of power R dt (2 pi c)^4, so that c Hz is where a smoother by the same model lets half pass. Kalman
-filters of several c run side by side; every group of channels takes the mean of them, each weighted by
-how likely it made the group's last samples (Magill 1965, with a memory that fades):
+The stream itself tells the sizes of n and e (`StreamNoise`). x moves on by its velocity, which is driven
+by white noise of power R dt (2 pi c)^4, so that c Hz is where a smoother by the same model lets half
+pass. Kalman filters of several c run side by side; every group of channels takes the mean of them, each
+weighted by how likely it made the group's last samples (Magill 1965, with a memory that fades):
 
     log w <- e^(-dt / tau) log w - |z - H x'|^2 / (2 R S) - d / 2 log S.
 
