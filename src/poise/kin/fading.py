@@ -33,7 +33,7 @@ WANDER_HZ = 0.15
 #: White noise of a pure tremble, as a share of its variance.
 LEAST = 0.02
 #: s in which smoothing fades in and out; s of which samples are kept to be known better.
-FADE_S, KEPT_S = 0.3, 0.1
+FADE_S, KEPT_S = 0.3, 0.07
 #: s by which a stream that trembles is kept back: one control step, since the sample before the newest
 #: is known better by a third, and the one before that hardly more.
 LATE_S = 1.0 / 30.0
