@@ -80,11 +80,11 @@ def rotations(truth: Clip, kind: str, mm: float, seed: int) -> dict[str, np.ndar
             key=lambda x: off_mm(x[:, None], truth.root_pos[:, None], late, fps),
         )
         euro[late] = by_rot.replaced(root_pos=by_root).positions()
-    steady, newest, late = Steady(truth.skeleton), list[Pose](), list[Pose]()
+    steady, newest, later = Steady(truth.skeleton), list[Pose](), list[Pose]()
     for t in range(len(rot)):
         newest.append(steady(t / fps, root[t], rot[t]) or (root[t], rot[t]))
         before = steady.before()
-        late.append(before[0][1:] if before else (root[max(t - 1, 0)], rot[max(t - 1, 0)]))
+        later.append(before[0][1:] if before else (root[max(t - 1, 0)], rot[max(t - 1, 0)]))
 
     def places(poses: list[Pose]) -> np.ndarray:
         at, turn = zip(*poses, strict=True)
@@ -95,7 +95,7 @@ def rotations(truth: Clip, kind: str, mm: float, seed: int) -> dict[str, np.ndar
         "one-euro": euro[0],
         "one-euro late": euro[1],
         "newest": places(newest),
-        "live": places(late),
+        "live": places(later),
     }
 
 

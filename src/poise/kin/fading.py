@@ -4,11 +4,11 @@
     x = fading(z, dt)            # the newest sample as it is now known
     earlier = fading.before()    # the samples before it, by all that has come since
 
-A channel is taken as z = x + n + e: motion x, a tremble n of one frequency, white noise e of variance R,
-whose sizes the stream itself tells (`StreamNoise`). x moves on by its velocity, which is driven by white
-noise of power R dt (2 pi c)^4, so that c Hz is where a smoother by the same model lets half pass. Kalman
-filters of several c run side by side; every group of channels takes the mean of them, each weighted by
-how likely it made the group's last samples (Magill 1965, with a memory that fades):
+A channel is taken as z = x + n + e: motion x, a tremble n of one frequency, white noise e of variance R.
+The stream itself tells the sizes of n and e (`StreamNoise`). x moves on by its velocity, which is driven
+by white noise of power R dt (2 pi c)^4, so that c Hz is where a smoother by the same model lets half
+pass. Kalman filters of several c run side by side; every group of channels takes the mean of them, each
+weighted by how likely it made the group's last samples (Magill 1965, with a memory that fades):
 
     log w <- e^(-dt / tau) log w - |z - H x'|^2 / (2 R S) - d / 2 log S.
 
@@ -33,22 +33,13 @@ WANDER_HZ = 0.15
 #: White noise of a pure tremble, as a share of its variance.
 LEAST = 0.02
 #: s in which smoothing fades in and out; s of which samples are kept to be known better.
-FADE_S, KEPT_S = 0.3, 0.1
+FADE_S, KEPT_S = 0.3, 0.07
 #: s by which a stream that trembles is kept back: one control step, since the sample before the newest
 #: is known better by a third, and the one before that hardly more.
 LATE_S = 1.0 / 30.0
 #: Squares of an error, by their expected sum, beyond which a group did not move but is elsewhere.
-ELSEWHERE = 25.0
+ELSEWHERE = 9.0
 _STATES = 4
-
-
-class Tremble(NamedTuple):
-    """What a stream was found to do: mm that it trembles by, 0 for one that passes as it is; Hz of a
-    tremble of one frequency; s by which it is kept back to be smoothed."""
-
-    mm: float = 0.0
-    hz: float | None = None
-    late_s: float = 0.0
 
 
 class _Past(NamedTuple):
@@ -70,7 +61,7 @@ class FadingFilter:
         cutoff_hz: smooths by this alone, whether the stream trembles or not; None: by what it trembles.
 
     Attributes:
-        tremble: what the stream does now.
+        noise: what the stream does now.
         share: 0 to 1, how far smoothing has faded in.
     """
 
@@ -84,7 +75,7 @@ class FadingFilter:
         self.groups = np.asarray(groups)
         self.noise = StreamNoise(self.groups, weights, places)
         self.fixed = cutoff_hz is not None
-        self.share, self.tremble = float(self.fixed), Tremble()
+        self.share = float(self.fixed)
         self._cutoffs = np.array(CUTOFFS if cutoff_hz is None else (cutoff_hz,))
         self._member = self.noise.member
         self._freedom = np.minimum(self._member.sum(0), 3.0)
@@ -92,6 +83,11 @@ class FadingFilter:
         self._past: deque[_Past] = deque()
         self._hz: float | None = None
         self._model: tuple[tuple[float, float | None, float], np.ndarray, np.ndarray] | None = None
+
+    @property
+    def late_s(self) -> float:
+        """s by which the stream is best kept back: `LATE_S` while it is smoothed, else none."""
+        return LATE_S if self.share > 0.0 else 0.0
 
     def __call__(self, z: np.ndarray, dt: float) -> np.ndarray:
         """The newest sample, `dt` s after the one before; `z` itself where nothing trembles."""
@@ -104,10 +100,8 @@ class FadingFilter:
         on = self.fixed or noise.trembles
         if not on and self.share == 0.0:
             self._past.clear()
-            self.tremble = Tremble()
             return z
         self.share = min(max(self.share + (dt if on else -dt) / FADE_S, 0.0), 1.0)
-        self.tremble = Tremble(noise.mm, noise.hz, LATE_S)
         self._step(z, dt)
         return self._mixed(z, self._past[-1].state)
 

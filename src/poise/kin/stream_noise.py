@@ -25,8 +25,8 @@ MEDIAN = 0.789
 ASKED, AGAIN = 48, 75
 #: Share of `WHITE_MM` below which a stream that trembled does no more.
 CALMS = 0.7
-#: Samples in whose spectrum a tremble is looked for, how often that is, and looks in vain after which
-#: it is gone; mixtures of all channels that are looked at.
+#: Samples of a spectrum in which a tremble is looked for, how often that is, and looks in vain until it
+#: is gone; mixtures of all channels that are looked at.
 LONG, EVERY, PATIENCE, MIXED = 128, 12, 4, 12
 #: The slowest tremble (Hz) that is told from motion in so short a time; mm that it has at least.
 SLOWEST_HZ, LEAST_MM = 2.5, 2.0

@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from poise.kin.fading import Tremble
+from poise.live.packet import Earlier, Tremble
 from poise.live.quats import slerp
-from poise.live.steady import Earlier, leapt
 
 #: s of the buffer that even out how packets come at least, and share of it that does where that is more;
 #: the rest may be looked ahead at.
@@ -21,6 +20,8 @@ FADE_S = 0.1
 STALLS_S = 0.2
 #: s a second by which motion that begins to tremble is kept back more and more.
 KEEPS_BACK = 0.15
+#: m/s and m beyond which a person did not move but is elsewhere, or is another one.
+JUMP, LEAP_M = 12.0, 0.4
 #: Packets by which the way's shortest time is known, and those that are kept.
 SEEN, KEPT = 240, 320
 
@@ -30,6 +31,12 @@ NONE = Tremble()
 def margin(delay_s: float) -> float:
     """s by which motion is read later than it comes, of a buffer of `delay_s`."""
     return min(delay_s, max(MARGIN_S, MARGIN * delay_s))
+
+
+def leapt(before: np.ndarray, root_pos: np.ndarray, dt: float) -> bool:
+    """Whether a root that was at `before (3)` m, `dt` s ago, did not move to `root_pos`."""
+    far = float(np.linalg.norm(root_pos - before))
+    return far > LEAP_M and far > JUMP * dt
 
 
 class Pose(NamedTuple):

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from poise.kin.fading import Tremble
 from poise.live.aims import Aims
-from poise.live.packet import Inbox
+from poise.live.packet import Inbox, Tremble
 from poise.live.people import STAND
 
 #: Steps of which figures are made.

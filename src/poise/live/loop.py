@@ -18,6 +18,7 @@ from poise.live.figures import Times, figures
 from poise.live.orders import Orders
 from poise.live.packet import Inbox
 from poise.live.phase import Phase
+from poise.live.steady import Steady
 from poise.live.world import Seen, World
 from poise.synth.generator import Kinematic
 
@@ -61,7 +62,7 @@ class Live:
         generator: Kinematic | None = None,
     ):
         self.config = c = config or LiveConfig()
-        self.tracker, self.inbox, self.shows = tracker, inbox or Inbox(), list(shows)
+        self.tracker, self.inbox, self.shows = tracker, inbox or Inbox(Steady), list(shows)
         ahead, beside = tuple(range(c.lookahead)), executor is not None
         self.world = World(tracker, c.characters, executor, ahead, c.seed, beside)
         self.aims = Aims(self.world, c, executor, generator)

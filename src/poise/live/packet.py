@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.kin.fading import Tremble
 from poise.live.quats import normalized
-from poise.live.steady import Earlier, Steady
 from poise.motion import Clip, Skeleton
 
 #: Packets of one person that wait at most; the newest win.
@@ -22,6 +22,23 @@ PEOPLE = 32
 FAR_M = 1000.0
 #: Letters of a person's name.
 NAME = 64
+
+
+class Tremble(NamedTuple):
+    """What a person was found to do: mm that it trembles by, 0 for one that is left as it is; Hz of a
+    tremble of one frequency; s by which it is read later, to be smoothed."""
+
+    mm: float = 0.0
+    hz: float | None = None
+    late_s: float = 0.0
+
+
+class Earlier(NamedTuple):
+    """When a pose was, its root `(3)` m and local rotations `(J, 4)` as they are known later."""
+
+    time_s: float
+    root_pos: np.ndarray
+    rot: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +96,33 @@ def checked(packet: Packet) -> Packet:
     return replace(packet, rot=normalized(packet.rot))
 
 
+class Smooths(Protocol):
+    """What smooths the poses of one person, in the order in which they come."""
+
+    skeleton: Skeleton
+
+    @property
+    def tremble(self) -> Tremble:
+        """What the person does now."""
+        ...
+
+    def __call__(
+        self, time_s: float, root: np.ndarray, rot: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """The pose as it is known, None where a newer one came before it."""
+        ...
+
+    def before(self) -> list[Earlier]:
+        """Those before it, from the latest on."""
+        ...
+
+
 class Inbox:
     """Packets on their way from the sources' threads to the loop; neither waits for the other.
 
-    Poses are smoothed on the way in, in the source's thread, as much as their person trembles.
+    Args:
+        steady: makes what smooths the poses of a skeleton, on the way in and in the source's thread;
+            None lets them be.
 
     Attributes:
         received: packets that were taken.
@@ -91,13 +131,14 @@ class Inbox:
         standing: people of keypoints that are measured yet, and how far that is, 0 to 1.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, steady: Callable[[Skeleton], Smooths] | None = None) -> None:
         self.received, self.crowded = 0, 0
         self.refused: Counter[str] = Counter()
         self.standing = dict[str, float]()
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[tuple[float, Packet]]] = {}
-        self._steady: dict[str, Steady] = {}
+        self._make = steady
+        self._steady: dict[str, Smooths] = {}
 
     def refuse(self, reason: str) -> None:
         """Counts something that is no packet."""
@@ -125,12 +166,12 @@ class Inbox:
 
     def _smoothed(self, packet: Packet) -> Packet:
         """The packet as its person is now known; one that comes late is left as it is."""
-        if packet.tremble is not None:
+        if packet.tremble is not None or self._make is None:
             return packet
         with self._lock:
             steady = self._steady.pop(packet.person, None)
             if steady is None or steady.skeleton is not packet.skeleton:
-                steady = Steady(packet.skeleton)
+                steady = self._make(packet.skeleton)
             # Those that were heard of last are the last.
             self._steady[packet.person] = steady
             while len(self._steady) > PEOPLE:

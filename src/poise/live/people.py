@@ -7,10 +7,9 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
-from poise.kin.fading import Tremble
 from poise.live.buffer import JitterBuffer, Pose
 from poise.live.calibration import OntoBody, Standing
-from poise.live.packet import PEOPLE, Packet
+from poise.live.packet import PEOPLE, Packet, Tremble
 
 #: s without a packet after which a person is away, and after which it is forgotten.
 AWAY_S, FORGET_S = 1.0, 20.0

@@ -14,15 +14,16 @@ import numpy as np
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
-from poise.kin.fading import FadingFilter, Tremble, of_points
+from poise.kin.fading import FadingFilter, of_points
 from poise.kin.retarget.keypoint_body import PointBody
 from poise.kin.retarget.keypoint_stream import Gaps
 from poise.live.calibration import FEWEST, STAND_S, STILL_M
-from poise.live.packet import PEOPLE, Inbox, Packet
+from poise.live.packet import PEOPLE, Inbox, Packet, Tremble
 from poise.live.people import FORGET_S
 from poise.live.sources.keypoints import Frame
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
+from poise.motion.noise import hold_missing
 from poise.motion.points.fit import fit_clip
 
 #: s between frames that are fitted at least, frames that wait, m/s beyond which a keypoint is missing.
@@ -100,12 +101,13 @@ class Performer:
         if not 0.0 < dt < 1.0:
             self._times.clear()
         self._times.appendleft(time_s)
-        points, steady = self._steady(whole.ravel(), dt), self._steady
-        tremble, earlier = steady.tremble, [points, *steady.before()]
+        steady = self._steady
+        known = [steady(whole.ravel(), dt), *steady.before()]
         # Of the frames that are known, the one that is kept back by most nearly as much.
-        late = [time_s - t for t in list(self._times)[: len(earlier)]]
-        k = int(np.abs(np.array(late) - tremble.late_s).argmin())
-        return earlier[k].reshape(-1, 3), time_s - late[k], tremble._replace(late_s=late[k])
+        late = [time_s - t for t in list(self._times)[: len(known)]]
+        k = int(np.abs(np.array(late) - steady.late_s).argmin())
+        tremble = Tremble(steady.noise.mm, steady.noise.hz, late[k])
+        return known[k].reshape(-1, 3), self._times[k], tremble
 
     def _measure(self, frame: Frame) -> None:
         seen = self._seen
@@ -125,7 +127,8 @@ class Performer:
         if not len(kept):
             raise PoiseError("keypoints are missing", self.person)
         names, rate = tuple(self.names[k] for k in kept), (len(stood) - 1) / long
-        points = Keypoints(names, every[:, kept], rate, self.person)
+        # The body is measured on frames without gaps.
+        points = Keypoints(names, hold_missing(every[:, kept]), rate, self.person)
         try:
             body = PointBody.calibrate(points, self._onto, self._table)
             self._whole = fit_clip(points)

@@ -26,6 +26,7 @@ from poise.live.sinks.vmc import OwnPuppet, VmcSink
 from poise.live.sources.door import StreamDoor
 from poise.live.sources.file import FileSource
 from poise.live.sources.vmc import VmcSource
+from poise.live.steady import Steady
 from poise.motion import Clip
 from poise.synth.generator import Kinematic
 
@@ -70,7 +71,7 @@ class Session:
 
     def __init__(self, tracker: Tracker, config: LiveConfig, wanted: Wanted):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="poise-live")
-        self.inbox, clock = Inbox(), time.perf_counter
+        self.inbox, clock = Inbox(Steady), time.perf_counter
         made = generator_for(tracker)
         self.live = Live(tracker, config, self.inbox, executor=self._pool, clock=clock, generator=made)
         world = self.live.world

@@ -4,33 +4,18 @@ from __future__ import annotations
 
 from collections import deque
 from threading import Lock
-from typing import NamedTuple
 
 import numpy as np
 
-from poise.kin.fading import FadingFilter, Tremble
+from poise.kin.fading import FadingFilter
 from poise.live import quats as q
+from poise.live.buffer import leapt
+from poise.live.packet import Earlier, Tremble
 from poise.live.passage import doublings, world_of
 from poise.motion import Skeleton
 
-#: m/s and m beyond which a person did not move but is elsewhere, or is another one.
-JUMP, LEAP_M = 12.0, 0.4
 #: s by which a clock goes back that began anew.
 ANEW_S = 2.0
-
-
-class Earlier(NamedTuple):
-    """When a pose was, its root `(3)` m and local rotations `(J, 4)` as they are known later."""
-
-    time_s: float
-    root_pos: np.ndarray
-    rot: np.ndarray
-
-
-def leapt(before: np.ndarray, root_pos: np.ndarray, dt: float) -> bool:
-    """Whether a root that was at `before (3)` m, `dt` s ago, did not move to `root_pos`."""
-    far = float(np.linalg.norm(root_pos - before))
-    return far > LEAP_M and far > JUMP * dt
 
 
 class Steady:
@@ -48,7 +33,8 @@ class Steady:
     @property
     def tremble(self) -> Tremble:
         """What the person does now."""
-        return Tremble() if self._fading is None else self._fading.tremble
+        fading = self._fading
+        return Tremble() if fading is None else Tremble(fading.noise.mm, fading.noise.hz, fading.late_s)
 
     def __call__(
         self, time_s: float, root: np.ndarray, rot: np.ndarray
@@ -99,7 +85,8 @@ class Steady:
             while above >= 0:
                 far[above, j] = np.linalg.norm(at[j] - at[above])
                 above = self.skeleton.parents[above]
-        # A turn whose components err by a variance v together moves what is d m away by sqrt(8 v / 3) d.
+        # A turn that errs by a variance v, the sum over its components, moves what is d m away by
+        # sqrt(8 v / 3) d.
         weights = np.append(np.sqrt(8.0 / 3.0 * (far**2).mean(1)), 1.0)
         return FadingFilter(groups, weights, self._places)
 
