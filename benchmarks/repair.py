@@ -2,6 +2,8 @@
 
     python benchmarks/repair.py --data FOLDER [--as keypoints] [--smoke] [--only white tone5] -o FILE.csv
     python benchmarks/repair.py --data FOLDER --live -o results/repair_live.csv
+    python benchmarks/repair.py --data FOLDER --clean -o results/repair_clean.csv
+    python benchmarks/repair.py --data FOLDER --track -o results/repair_track.csv
 
 FOLDER holds the development set. Every clip is dirtied so that its joints are 10 to 100 mm off on
 average, repaired by `heal`, and filtered by zero-phase Butterworth filters, Savitzky-Golay filters and
@@ -23,6 +25,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +33,9 @@ import torch
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 
 from poise.errors import PoiseError
-from poise.kin import heal
+from poise.jobs.track import track
+from poise.kin import examine, heal
+from poise.kin.doctor.doctor import READ_ONLY
 from poise.motion import Clip, read_clip, trim
 from poise.motion.edits import resample
 from poise.motion.keypoints import Keypoints
@@ -46,6 +51,12 @@ KNOWN = (
     "02_01", "02_04", "08_02", "35_17",
 )  # fmt: skip
 SIZES_MM, LONGEST_S, SHORTEST_S, CLIPS = (10.0, 25.0, 50.0, 100.0), 10.0, 1.5, 40
+#: A truth has no faults where a repair moves it by less than this (mm); recordings that are repaired as
+#: they are, and dirty ones that are tracked.
+CLEAN_MM, CLEAN, TRACKED = 1.0, 200, 12
+CLEAN_SETS = (
+    "other/bandai_bvh/**/*.bvh", "cmu_amc/**/*.amc", "cmu_bvh/**/*.bvh", "deepmimic_txt/*.txt",
+)  # fmt: skip
 CUTOFFS = (0.5, 0.7, 1, 1.3, 1.6, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 10, 12)
 WINDOWS = (5, 7, 9, 13, 17, 23, 31)
 
@@ -269,51 +280,125 @@ def fitted_of(clips: Iterable[Clip], count: int) -> Iterator[Clip]:
             return
 
 
-def clips_of(data: Path, count: int) -> Iterator[Clip]:
-    """Clips that nobody tuned on, of Bandai and CMU in turns, drawn by a seed."""
-    sets = [
-        sorted((data / "other/bandai_bvh").rglob("*.bvh")),
-        sorted((data / "cmu_amc").rglob("*.amc")),
-    ]
+def recordings(data: Path, globs: Iterable[str], seed: int = 64) -> Iterator[tuple[Path, Clip]]:
+    """Recordings of several sets in turns, drawn by a seed: the first `LONGEST_S`, at 30 to 60 Hz."""
+    sets = [sorted(data.glob(pattern)) for pattern in globs]
     for files in sets:
-        random.Random(64).shuffle(files)
-    drawn = 0
-    for path in (p for pair in zip(*sets, strict=False) for p in pair):
-        if path.stem in KNOWN:
-            continue
+        random.Random(seed).shuffle(files)
+    for path in (p for row in zip_longest(*sets) for p in row if p is not None):
         try:
             clip = read_clip(path)
         except PoiseError:
             continue
-        if clip.seconds < SHORTEST_S:
+        if clip.seconds >= SHORTEST_S:
+            clip = trim(clip, 0, min(clip.frames, int(LONGEST_S * clip.fps)))
+            yield path, resample(clip, 30.0) if clip.fps > 60 else clip
+
+
+def clips_of(data: Path, count: int) -> Iterator[Clip]:
+    """Clips that nobody tuned on, of Bandai and CMU in turns: those that are as they are after a repair,
+    since the truth must have no faults."""
+    for path, clip in recordings(data, ("other/bandai_bvh/**/*.bvh", "cmu_amc/**/*.amc")):
+        if path.stem in KNOWN:
             continue
-        clip = trim(clip, 0, min(clip.frames, int(LONGEST_S * clip.fps)))
-        yield resample(clip, 30.0) if clip.fps > 60 else clip
-        drawn += 1
-        if drawn == count:
+        whole = heal(clip)
+        if whole.frames == clip.frames and off_mm(whole, clip) <= CLEAN_MM:
+            yield clip
+            count -= 1
+        if not count:
             return
 
 
-def measure_live(data: Path, smoke: bool, out: Path) -> None:
-    """Writes the rows of streams."""
-    import repair_live as live
+def clean_rows(data: Path, count: int) -> Iterator[tuple[str, str, list[float]]]:
+    """What the repair changes in recordings: in those in which the doctor names no fault, and in all."""
+    seen: dict[str, list[tuple[float, float, float]]] = {"no fault named": [], "all": []}
+    for path, clip in recordings(data, CLEAN_SETS):
+        whole = heal(clip)
+        if whole.frames != clip.frames:
+            continue
+        off = 1e3 * np.linalg.norm(whole.positions() - clip.positions(), axis=-1)
+        change = (float(off.mean()), float(off.max()), float(off[-1, 0]))
+        sound = not [f for f in examine(clip).faults if f.kind not in READ_ONLY]
+        seen["all"].append(change)
+        if sound:
+            seen["no fault named"].append(change)
+            if change[0] > 1.0 or change[1] > 20.0:
+                print(path, [round(x, 1) for x in change], file=sys.stderr)
+        if len(seen["all"]) == count:
+            break
+    for name, made in seen.items():
+        for k, metric in enumerate(("mean_mm", "greatest_mm", "end_mm")):
+            yield name, metric, [row[k] for row in made]
+        yield (
+            name,
+            "share of clips with mean <= 1, greatest <= 20, end <= 10 mm",
+            [float(np.mean([m <= 1 and g <= 20 and e <= 10 for m, g, e in made]))],
+        )
 
-    torch.set_num_threads(1)
-    clips = list(clips_of(data, 3 if smoke else live.CLIPS))
+
+def track_rows(
+    clips: list[Clip], kinds: Iterable[str], sizes: Iterable[float]
+) -> Iterator[tuple[str, str, list[float]]]:
+    """What `poise track` makes of dirt: motion done to its end, beside the estimate that it follows."""
+    for kind in kinds:
+        for mm in sizes if kind != "dropouts" else (0.0,):
+            told: dict[str, list[float]] = {}
+            for k, clip in enumerate(clips):
+                broken = dirty(clip, kind, mm, k)
+                made, estimate = track(broken), heal(broken)
+                parts = {"tracked": made.clip, "estimate": estimate, "dirty": broken}
+                told.setdefault("done", []).append(float(not made.failures))
+                for name, one in parts.items():
+                    if one.frames == clip.frames:
+                        for metric, value in measured(one.positions(), clip).items():
+                            told.setdefault(f"{name}: {metric}", []).append(value)
+            told["done"] = [float(np.mean(told["done"]))]
+            for metric, values in told.items():
+                yield (f"{kind} {mm:g} mm" if mm else kind), metric, values
+
+
+def write(out: Path, rows: Iterable[tuple[str, str, list[float]]], command: str) -> None:
+    """The rows: the median of the values, and their quartiles."""
     show = ["git", "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(show, capture_output=True, text=True).stdout.strip()
-    command = "python benchmarks/repair.py --data FOLDER --live -o results/repair_live.csv"
     out.parent.mkdir(parents=True, exist_ok=True)
     with out.open("w", newline="") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
-        for subject, metric, values in live.live_rows(clips, (25.0,) if smoke else live.SIZES_MM):
+        for subject, metric, values in rows:
             low, middle, high = np.nanquantile(values, (0.25, 0.5, 0.75))
             spread = f"{low:.3g} to {high:.3g}"
             writer.writerow(
                 (subject, metric, f"{middle:.4g}", spread, len(values), 1, "", commit, command)
             )
+            file.flush()
             print(subject, metric, f"{middle:.4g}", spread, file=sys.stderr)
+
+
+def dirt_rows(
+    clips: list[Clip], kinds: Iterable[str], sizes: Iterable[float], points: bool
+) -> Iterator[tuple[str, str, list[float]]]:
+    """What is left of dirt: of the dirty clip, after the best filter, after the repair."""
+    try_out = attempts_at_points if points else attempts
+    for kind in kinds:
+        for mm in sizes if kind != "dropouts" else (0.0,):
+            left: dict[str, list[dict[str, float]]] = {"null": [], "best filter": [], "repair": []}
+            for k, clip in enumerate(clips):
+                made = try_out(clip, kind, mm, k)
+                if made is None:
+                    continue
+                for name, places in zip(left, made, strict=True):
+                    left[name].append(measured(places, clip))
+            subject = (f"{kind} {mm:g} mm" if mm else kind) + (" of keypoints" if points else "")
+            ratio = [
+                a["distance_mm"] / b["distance_mm"]
+                for a, b in zip(left["repair"], left["best filter"], strict=True)
+            ]
+            yield subject, "distance over best filter's", ratio
+            yield subject, "share above 1.25", [float(np.mean([r > 1.25 for r in ratio]))]
+            for name, made in left.items():
+                for metric in made[0]:
+                    yield subject, f"{name}: {metric}", [r[metric] for r in made]
 
 
 def main() -> None:
@@ -328,58 +413,35 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=CLIPS)
     parser.add_argument("--smoke", action="store_true", help="three clips, one size")
     parser.add_argument("--live", action="store_true", help="streams, see repair_live.py")
+    parser.add_argument("--clean", action="store_true", help="recordings as they are")
+    parser.add_argument("--track", action="store_true", help="what a body makes of dirt")
     parser.add_argument("-o", "--out", type=Path, required=True)
-    options = parser.parse_args()
-    if options.live:
-        measure_live(options.data, options.smoke, options.out)
-        return
+    o = parser.parse_args()
     torch.set_num_threads(1)
-    if options.smoke:
-        options.clips, options.sizes = 3, (25.0,)
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
-    ).stdout.strip()
-    points = options.form == "keypoints"
-    try_out, kinds = attempts, [*KINDS, "dropouts", "all"]
-    clips: Iterable[Clip] = clips_of(options.data, options.clips)
-    if points:
-        try_out, kinds = attempts_at_points, ["white", "tone5", "tone2", "spikes", "dropouts"]
-        clips = fitted_of(clips_of(options.data, 2 * options.clips), options.clips)
-    clips = list(clips)
-    rows = []
-    for kind in options.only or kinds:
-        for mm in options.sizes if kind != "dropouts" else (0.0,):
-            left: dict[str, list[dict[str, float]]] = {"null": [], "best filter": [], "repair": []}
-            for k, clip in enumerate(clips):
-                made = try_out(clip, kind, mm, k)
-                if made is None:
-                    continue
-                for name, places in zip(left, made, strict=True):
-                    left[name].append(measured(places, clip))
-            subject = (f"{kind} {mm:g} mm" if mm else kind) + (" of keypoints" if points else "")
-            ratio = [
-                a["distance_mm"] / b["distance_mm"]
-                for a, b in zip(left["repair"], left["best filter"], strict=True)
-            ]
-            told = {f"{name}: {m}": [r[m] for r in made] for name, made in left.items() for m in made[0]}
-            told |= {"distance over best filter's": ratio}
-            told |= {"share above 1.25": [float(np.mean([r > 1.25 for r in ratio]))]}
-            for metric, values in told.items():
-                low, middle, high = np.nanquantile(values, (0.25, 0.5, 0.75))
-                spread = f"{low:.3g} to {high:.3g}"
-                rows.append((subject, metric, f"{middle:.4g}", spread, len(ratio), 1, "", commit))
-            print(
-                subject,
-                f"{np.median(ratio):.2f}",
-                f"{np.mean([r > 1.25 for r in ratio]):.2f}",
-                file=sys.stderr,
-            )
-    command = f"python benchmarks/repair.py --data FOLDER --as {options.form} -o {options.out.name}"
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    with options.out.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows((*row, command) for row in rows)
+    count, sizes = (3, (25.0,)) if o.smoke else (o.clips, o.sizes)
+    command = "python benchmarks/repair.py --data FOLDER"
+    if o.live:
+        import repair_live as live
+
+        clips = list(clips_of(o.data, min(count, live.CLIPS)))
+        rows, command = live.live_rows(clips, sizes if o.smoke else live.SIZES_MM), f"{command} --live"
+    elif o.clean:
+        rows, command = clean_rows(o.data, count if o.smoke else CLEAN), f"{command} --clean"
+    elif o.track:
+        clips = list(clips_of(o.data, min(count, TRACKED)))
+        rows = track_rows(clips, o.only or ("white", "tone5", "all"), sizes)
+        command = f"{command} --track"
+    else:
+        points = o.form == "keypoints"
+        kinds = ["white", "tone5", "tone2", "spikes", "dropouts"]
+        clips = list(
+            fitted_of(clips_of(o.data, 2 * count), count) if points else clips_of(o.data, count)
+        )
+        rows = dirt_rows(
+            clips, o.only or (kinds if points else [*KINDS, "dropouts", "all"]), sizes, points
+        )
+        command = f"{command} --as {o.form}"
+    write(o.out, rows, f"{command} -o results/{o.out.name}")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 White noise is what high differences are made of: those of order k of white noise of variance s^2 have
 (2k choose k) s^2, while motion all but vanishes in them. Medians over time leave out its bursts. A
-tremble stands out of the octaves below and above it, as in `doctor.noise`.
+tremble stands out of the octaves below and above it, as in `motion.spectrum`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from poise.kin.doctor.noise import ABOVE, HIGHEST_HZ, MOST, TREMBLES, WHITE_HZ, WHITE_MM
+from poise.motion.spectrum import ABOVE, HIGHEST_HZ, QUIETEST, TREMBLES, WHITE_HZ, WHITE_MM
 
 #: Samples a second that are measured about; least s between two of them; s of gaps that are bridged.
 RATE, APART_S, BRIDGED_S = 30.0, 0.7 / 30.0, 0.3
@@ -30,8 +30,9 @@ CALMS = 0.7
 LONG, EVERY, PATIENCE, MIXED = 128, 12, 4, 12
 #: The slowest tremble (Hz) that is told from motion in so short a time; mm that it has at least.
 SLOWEST_HZ, LEAST_MM = 2.5, 2.0
-#: How clear a tremble is in the mixtures for the channels to be asked.
-MAY = 0.6
+#: How far a tremble stands out of the octaves below and above in all mixtures but this share, for the
+#: channels to be asked.
+MAY, MOST = (0.25, 2.0), 0.4
 #: Peaks that are looked at, those with the fastest motion.
 FEW = 6
 
@@ -211,32 +212,49 @@ def _spectrum(steps: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
     return hz, power / (2.0 * np.sin(np.pi * hz[:, None] / rate)) ** 2
 
 
-def _clear(hz: np.ndarray, power: np.ndarray, k: int, many: int) -> float:
-    """How far the peak at `hz[k]` stands out in most channels, 1 for what is a tremble."""
-    rate = hz[0] * 2 * LONG
-    gap = max(2.0 * rate / many, 0.12 * hz[k])
+def _octaves(hz: np.ndarray, k: int, many: int) -> tuple[slice, slice] | None:
+    """The bins of the octave below the peak at `hz[k]` and of that above, None where there are none."""
+    gap = max(2.0 * hz[0] * 2 * LONG / many, 0.12 * hz[k])
     # Bins are hz[0] apart, from hz[0] on.
     edges = np.array([hz[k] / 2.2, hz[k] - gap, hz[k] + gap, 2.3 * hz[k]]) / hz[0] - 1.0
     a, b, c, d = np.ceil(edges).astype(int)
-    if b <= a or c >= min(d, len(hz)):
+    return None if b <= a or c >= min(d, len(hz)) else (slice(a, b), slice(c, d))
+
+
+def _clear(hz: np.ndarray, power: np.ndarray, k: int, many: int) -> float:
+    """How far the peak at `hz[k]` stands out in the quietest channels, 1 for what is a tremble."""
+    octaves = _octaves(hz, k, many)
+    if octaves is None:
         return 0.0
-    peak = power[k - 1 : k + 2].max(0)
-    over, under = peak / (power[a:b].max(0) + 1e-300), peak / (power[c:d].max(0) + 1e-300)
-    most = int(MOST * len(peak))
-    clear = min(np.partition(over, most)[most], np.partition(under, most)[most] / ABOVE)
+    peak = np.quantile(power[k - 1 : k + 2].max(0), QUIETEST)
+    over, under = (
+        peak / (np.quantile(power[span], QUIETEST, axis=1).max(1) + 1e-300) for span in octaves
+    )
     starts, limits = np.array(TREMBLES).T
-    return float(clear / limits[np.searchsorted(starts, hz[k] + 1e-9) - 1])
+    limit = limits[np.searchsorted(starts, hz[k] + 1e-9) - 1]
+    return float((np.minimum(over, under / ABOVE) / limit).max())
 
 
 def _clearest(hz: np.ndarray, power: np.ndarray, rate: float, many: int) -> int | None:
-    """Index of the peak of `power (F, N)` that stands out most; None where none may be a tremble."""
+    """Index of the peak of mixtures `power (F, N)` that stands out most; None where none may be a
+    tremble."""
     whole = power.sum(1)
     top = (hz >= SLOWEST_HZ) & (hz <= min(HIGHEST_HZ, 0.42 * rate))
     peaks = np.flatnonzero(top[1:-1]) + 1
     peaks = peaks[(whole[peaks] > whole[peaks - 1]) & (whole[peaks] > whole[peaks + 1])]
     peaks = peaks[np.argsort(-whole[peaks] * hz[peaks] ** 2)[:FEW]]
-    clear = [_clear(hz, power, int(k), many) for k in peaks]
-    return int(peaks[int(np.argmax(clear))]) if clear and max(clear) >= MAY else None
+    best: tuple[float, int | None] = (1.0, None)
+    for k in peaks:
+        octaves = _octaves(hz, int(k), many)
+        if octaves is None:
+            continue
+        peak = power[k - 1 : k + 2].max(0)
+        clear = min(
+            float(np.quantile(peak / (power[span].max(0) + 1e-300), MOST)) / may
+            for span, may in zip(octaves, MAY, strict=True)
+        )
+        best = max(best, (clear, int(k)), key=lambda found: found[0])
+    return best[1]
 
 
 def _peak(hz: np.ndarray, power: np.ndarray, k: int) -> float:
