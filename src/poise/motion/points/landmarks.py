@@ -183,7 +183,7 @@ def _filled(tracks: dict[str, np.ndarray], fps: float) -> dict[str, np.ndarray]:
 
 def _curved(values: np.ndarray, fps: float) -> np.ndarray:
     """Values `(T, C)` with gaps on the smoothest curve; at the ends they hold."""
-    known = ~np.isnan(values).any(-1)
+    known = ~np.asarray(np.isnan(values).any(-1))
     at = np.flatnonzero(known)
     if len(at) == len(known) or len(at) < 4:
         return fill(values)
