@@ -163,7 +163,7 @@ def without_still_root(clip: Clip) -> Clip:
     ends = tuple((j - 1, tip) for j, tip in s.ends if j > 0)
     # The channels of a file belong to its own joints, so the short skeleton does not keep them.
     short = Skeleton(s.names[1:], parents, offsets, ends)
-    return clip.replaced(skeleton=short, rot=clip.rot[:, 1:])
+    return clip.replaced(skeleton=short, rot=clip.rot[:, 1:], contacts=())
 
 
 def foot_joints(skeleton: Skeleton) -> tuple[int, ...]:

@@ -55,7 +55,7 @@ def interpolated(own: Clip, root: Tensor, rot: Tensor, gaps: list[Gap]) -> Clip:
     root, rot = root.clone(), rot.clone()
     for gap in gaps:
         root[gap.a + 1 : gap.b], rot[gap.a + 1 : gap.b] = straight(root, rot, gap)
-    return own.replaced(root_pos=root.numpy(), rot=rot.numpy())
+    return own.replaced(root_pos=root.numpy(), rot=rot.numpy(), contacts=())
 
 
 def straight(root: Tensor, rot: Tensor, gap: Gap) -> tuple[Tensor, Tensor]:

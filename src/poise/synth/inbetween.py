@@ -184,4 +184,4 @@ def _as_clip(clip: Clip, root: Tensor, rot: Tensor, name: str) -> Clip:
     turned = rot.numpy()
     if still_root(clip):
         turned = np.concatenate((np.array(clip.rot[:, :1]), turned), 1)
-    return clip.replaced(root_pos=root.numpy(), rot=turned, name=name, cyclic=False)
+    return clip.replaced(root_pos=root.numpy(), rot=turned, name=name, cyclic=False, contacts=())

@@ -60,4 +60,6 @@ def retimed(
     places.append(np.arange(keys[-1], clip.frames, dtype=float))
     root, rot = clip.tensors()
     new = sampled(root, rot, torch.tensor(np.concatenate(places)))
-    return clip.replaced(root_pos=new[0].numpy(), rot=new[1].numpy(), cyclic=False), tuple(at)
+    return clip.replaced(root_pos=new[0].numpy(), rot=new[1].numpy(), cyclic=False, contacts=()), tuple(
+        at
+    )

@@ -152,4 +152,4 @@ def _cut(root: Tensor, rot: Tensor, gap: Gap) -> Motion:
 
 
 def _clip(filler: Filler, root: Tensor, rot: Tensor) -> Clip:
-    return filler.own.replaced(root_pos=root.numpy(), rot=rot.numpy())
+    return filler.own.replaced(root_pos=root.numpy(), rot=rot.numpy(), contacts=())

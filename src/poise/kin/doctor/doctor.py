@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,8 +75,10 @@ def examine(clip: Clip) -> Examination:
     if travel is not None:
         support = support_of(travelled(clip, travel.level), anatomy)
     cleaned, report = clean_clip(clip, anatomy, rougher=False)
-    # What is to stay is told all the same.
-    noise = noise_faults(clip)[0] if clip.skeleton.source.raw else report.noise
+    noise = report.noise
+    if clip.skeleton.source.raw:
+        # It is told all the same.
+        noise = [replace(f, detail=f"{f.detail} (stays: raw)".strip()) for f in noise_faults(clip)[0]]
     faults = [*timing_faults(clip), *_joint_faults(report, clip), *noise]
     faults += [*jitter_faults(cleaned), *limit_faults(clip), *read_faults(clip)]
     if support is not None:

@@ -183,10 +183,11 @@ def _filled(tracks: dict[str, np.ndarray], fps: float) -> dict[str, np.ndarray]:
 
 def _curved(values: np.ndarray, fps: float) -> np.ndarray:
     """Values `(T, C)` with gaps on the smoothest curve; at the ends they hold."""
-    known = ~np.isnan(values).any(-1)
-    if known.all() or known.sum() < 4:
+    known = ~np.asarray(np.isnan(values).any(-1))
+    at = np.flatnonzero(known)
+    if len(at) == len(known) or len(at) < 4:
         return fill(values)
-    first, last = np.flatnonzero(known)[[0, -1]]
+    first, last = int(at[0]), int(at[-1])
     out = fill(values)
     inside = slice(first, last + 1)
     out[inside] = filled(out[inside], known[inside], fps)

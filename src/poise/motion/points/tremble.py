@@ -16,6 +16,7 @@ import numpy as np
 from poise.motion.points.labels import SIDES
 from poise.motion.smoothing import faded, pieces, smoothed, tremble_of
 from poise.motion.spectrum import (
+    HIGHEST_HZ,
     LINES,
     RESOLVED,
     SHORTEST,
@@ -85,7 +86,10 @@ def _piece(
     found: Tremble | None = None
     for _ in range(LINES):
         spectrum = Spectrum.of(calm, fps, groups)
-        told = _tone(spectrum, calm.reshape(places.shape), bones)
+        # Of a tremble that is gone the bones keep what their turning made of it, at other frequencies.
+        told = _tone(
+            spectrum, calm.reshape(places.shape), bones, HIGHEST_HZ if found is None else SURE_HZ
+        )
         if told is None:
             break
         hz, size = told
@@ -100,14 +104,14 @@ def _piece(
 
 
 def _tone(
-    spectrum: Spectrum, places: np.ndarray, bones: list[tuple[int, int]]
+    spectrum: Spectrum, places: np.ndarray, bones: list[tuple[int, int]], top: float
 ) -> tuple[float, float] | None:
     """The frequency (Hz) at which the keypoints tremble, and the variance of that (m^2, all axes); None
-    where they do not."""
+    where they do not. Up to `top` (Hz) the bones alone may tell it."""
     hz = spectrum.tremble()
     lengths = np.stack([np.linalg.norm(places[:, a] - places[:, b], axis=-1) for a, b in bones], -1)
     of_bones = Spectrum.of(lengths, spectrum.fps, np.arange(len(bones)))
-    for one in (hz, _clearest(of_bones)):
+    for one in (hz, _clearest(of_bones, top)):
         if one is None:
             continue
         moves, changes = spectrum.tone(one)[0], of_bones.tone(one)[0]
@@ -123,7 +127,7 @@ def _tone(
     return None
 
 
-def _clearest(lengths: Spectrum) -> float | None:
+def _clearest(lengths: Spectrum, top: float) -> float | None:
     """The frequency (Hz) at which the bones' lengths change most, None where they have no such."""
     low, high = max(TREMBLES[0][0], RESOLVED * lengths.width), 0.42 * lengths.fps
     band = (lengths.hz >= low) & (lengths.hz <= high)
@@ -134,8 +138,7 @@ def _clearest(lengths: Spectrum) -> float | None:
     peak = int(every.argmax())
     hz = float(lengths.hz[band][peak])
     clear = every[peak] >= CLEAR * np.median(every) and 0 < peak < len(every) - 1
-    # What is faster is told by the places themselves.
-    return hz if clear and hz < SURE_HZ else None
+    return hz if clear and hz < top else None
 
 
 def _size(tremble: Tremble) -> float:
