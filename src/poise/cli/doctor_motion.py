@@ -87,6 +87,7 @@ def run_on(path: Path, options: Options) -> Answer:
     left = examine(again)
     facts["fixed"] = {"clip": str(target), "frames": again.frames, **left.to_dict()}
     facts["fixed"]["root_moved"] = moved
+    facts["fixed"]["detail"] = _detail(clip, healed)
     facts["fixed"]["worse"] = worsened(found, left) if fix else []
     if rest:
         facts["fixed"]["rest_pose"] = said
@@ -94,6 +95,9 @@ def run_on(path: Path, options: Options) -> Answer:
     if not fix:
         return Answer(facts, {"clip": target}, told, outcome=outcome, said=told)
     _compare(found, left)
+    if kept := facts["fixed"]["detail"]:
+        told = ", ".join(f"{100 * share:.0f} % at {band}" for band, share in kept.items())
+        say(f"Of the movement is left: {told}.")
     if worse := facts["fixed"]["worse"]:
         say(f"Mending made these figures worse: {', '.join(worse)}.")
     if rate := _hidden_rate(found, left):
@@ -184,6 +188,17 @@ def _root_moved(clip: Clip, healed: Clip) -> dict[str, Any] | None:
 
     way = np.linalg.norm(healed.root_pos - clip.root_pos, axis=-1) * 1000
     return {"max_mm": float(way.max()), "frame": int(way.argmax()), "end_mm": float(way[-1])}
+
+
+def _detail(clip: Clip, healed: Clip) -> dict[str, float]:
+    """How much of the movement is left by frequency; empty where nothing was changed, or frames were."""
+    if clip is healed or clip.frames != healed.frames:
+        return {}
+    import torch
+
+    from poise.metrics import detail
+
+    return detail(*(torch.tensor(c.positions()) for c in (healed, clip)), clip.fps)
 
 
 def _written(clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:

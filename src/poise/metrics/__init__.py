@@ -5,6 +5,7 @@ from poise.metrics.inbetween import l2p, l2q, npss, physics
 from poise.metrics.masking import masked_mean, masked_quantile, span_mask
 from poise.metrics.plausibility import (
     ballistic,
+    detail,
     float_gaps,
     floating,
     foot_contacts,
@@ -45,6 +46,7 @@ __all__ = [
     "acceleration_error",
     "ballistic",
     "centre_of_mass",
+    "detail",
     "fallen",
     "first_lasting",
     "float_gaps",

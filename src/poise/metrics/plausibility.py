@@ -203,6 +203,40 @@ def jerk(pos: Tensor, fps: float) -> Tensor:
     return torch.diff(pos, n=3, dim=-3).norm(dim=-1).mean(-1) * fps**3
 
 
+#: Bands (Hz) of `detail`: steps, gestures, what is quick.
+DETAIL_HZ = ((0.5, 1.5), (1.5, 3.0), (3.0, 6.0), (6.0, 12.0))
+
+
+def detail(pos: Tensor, ref: Tensor, fps: float) -> dict[str, float]:
+    """How much of the reference's movement is left at each frequency: the ratio of the energies of
+    bodies `(T, B, 3)` m about the root (body 0), by band ("1.5-3 Hz"). 1 keeps it, less is stiffer, more
+    trembles.
+
+    Energies are those of a Hann periodogram without the straight trend. A band that the clip is too
+    short or too slow to tell is left out.
+    """
+    frames = len(pos)
+    hz = torch.fft.rfftfreq(frames, 1.0 / fps) if frames > 3 else torch.zeros(1)
+    t = torch.linspace(-1.0, 1.0, frames, dtype=pos.dtype)
+    basis = torch.stack((torch.ones_like(t), t), 1)
+
+    def power(p: Tensor) -> Tensor:
+        y = (p[:, 1:] - p[:, :1]).reshape(frames, -1)
+        y = y - basis @ torch.linalg.lstsq(basis, y).solution
+        window = torch.hann_window(frames + 2, periodic=False, dtype=p.dtype)[1:-1, None]
+        return torch.fft.rfft(y * window, dim=0).abs().square().sum(1)
+
+    out = dict[str, float]()
+    if frames < 4:
+        return out
+    made, asked = power(pos), power(ref.to(pos.dtype))
+    for low, high in DETAIL_HZ:
+        band = (hz >= low) & (hz < min(high, 0.5 * fps))
+        if high - low > 2.0 * fps / frames and bool(band.any()) and float(asked[band].sum()) > 0.0:
+            out[f"{low:g}-{high:g} Hz"] = float(made[band].sum() / asked[band].sum())
+    return out
+
+
 def smoothness(pos: Tensor, fps: float = PHC_FPS) -> Tensor:
     """Skeleton2Humanoid's SM: mean joint step, mm per frame at 30 Hz; `(..., T - 1)`.
 
