@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.signal import butter, sosfiltfilt
 
+from poise.errors import PoiseError
 from poise.kin import examine, heal
 from poise.kin.doctor.estimate import denoise, find_lost, refill
 from poise.motion import Clip, read_clip
@@ -173,3 +174,49 @@ def test_trembling_feet_do_not_move_the_path(walk: Clip) -> None:
 def test_clean_runs_keep_their_path(data_dir: Path, name: str) -> None:
     run = read_clip(next((data_dir / "other/bandai_bvh").rglob(f"{name}.bvh")))
     np.testing.assert_allclose(heal(run).root_pos[:, :2], run.root_pos[:, :2], atol=1e-9)
+
+
+def test_a_tremble_as_slow_as_steps_is_told_under_a_gait(walk: Clip) -> None:
+    broken = dirty(walk, 25.0, tone(2.0))
+    found = [f for f in examine(broken).faults if f.kind == "tremble"]
+    assert len(found) == 1 and 5.0 < found[0].size < 40.0
+    assert float(found[0].detail.split()[1]) == pytest.approx(2.0, abs=0.15)
+    # The gait's own 2 Hz stay: the rest is nearer than any low-pass that cuts them.
+    assert off_mm(denoise(broken), walk) < 0.9 * filtered(broken, walk)
+
+
+def test_cycles_that_repeat_have_no_tremble(walk: Clip) -> None:
+    # A bounce of all joints in each cycle is the motion's own, since it comes back exactly.
+    cycle = dirty(walk, 25.0, tone(4.0))
+    first = cycle.rot[:30]
+    again = cycle.replaced(rot=np.tile(first, (4, 1, 1)), root_pos=np.tile(cycle.root_pos[:30], (4, 1)))
+    assert not [f for f in examine(again).faults if "Hz" in f.detail]
+
+
+def test_small_spikes_are_found_where_there_are_large_ones(walk: Clip) -> None:
+    rng = np.random.default_rng(5)
+    hit = rng.random((walk.frames, len(walk.skeleton), 1)) < 0.02
+    # One in the first and one in the last frame, and one of half a turn.
+    hit[0, 3] = hit[-1, 4] = hit[40, 5] = True
+    turn = 0.6 * rng.standard_normal((walk.frames, len(walk.skeleton), 3)) * hit
+    turn[40, 5] = (0.0, 3.1, 0.0)
+    rot = quat_mul(torch.tensor(walk.rot), rotvec_to_quat(torch.tensor(turn)))
+    broken = walk.replaced(rot=rot.numpy())
+    assert off_mm(broken, walk) > 20.0
+    assert off_mm(refill(broken), walk) < 2.0
+
+
+def test_feet_that_trembled_stand_again(walk: Clip) -> None:
+    before, after = (
+        examine(c).figures["sole_slide_mm_per_s"] for c in (walk, heal(dirty(walk, 25.0, white)))
+    )
+    assert before is not None and after is not None and after < before + 20.0
+
+
+def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:
+    rng = np.random.default_rng(0)
+    rot = rng.standard_normal(walk.rot.shape)
+    rot /= np.linalg.norm(rot, axis=-1, keepdims=True)
+    nothing = walk.replaced(rot=rot, root_pos=rng.standard_normal((walk.frames, 3)))
+    with pytest.raises(PoiseError, match="no motion to be told"):
+        heal(nothing)

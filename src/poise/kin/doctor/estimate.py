@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from poise.errors import PoiseError
 from poise.kin.doctor.faults import Fault
 from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
@@ -42,6 +43,8 @@ SPIKE_RAD, SPIKE_M = 0.35, 0.06
 MANY_SPIKES, SMALL_TIMES, SMALL_RAD, SPIKE_ROUNDS = 1e-3, 5.0, 0.02, 3
 #: A tremble is looked for in what is faster than this (Hz), of axes that turn by more than this (rad).
 SLOW_HZ, STILL_RAD = 0.7, 1e-5
+#: White noise (mm) that leaves nothing of a motion.
+NOTHING_MM = 300.0
 #: Cycles are the same where they are apart by less than this share of their energy.
 REPEATED = 1e-4
 
@@ -69,6 +72,13 @@ def denoise(clip: Clip) -> Clip:
     positions, world = clip.positions(), unwrap_quats(torch.tensor(clip.world()[1])).numpy()
     out_root, out_rot, changed = root.copy(), rot.copy(), False
     for here in pieces(clip.frames, clip.fps):
+        if (white := white_mm(positions[here], clip.fps)) > NOTHING_MM:
+            raise PoiseError(
+                f"frames {here.start} to {here.stop - 1} jump about by {white / 1e3:.2g} m each: there "
+                "is no motion to be told",
+                clip.name,
+                "Cut them off; --raw takes the file as it is",
+            )
         found = _piece(clip, root[here], rot[here], world[here], positions[here])
         if found is None:
             continue
