@@ -20,6 +20,7 @@ from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import drifts, mend_path, mend_slides
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
+from poise.kin.feet.hold import FIRM
 from poise.kin.hinges import chain_angles
 from poise.kin.loops import best_period, overlap_of, repeated
 from poise.kin.rate.judge import judge_rate
@@ -32,8 +33,9 @@ from poise.motion import Clip
 BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
-#: What trembled is held from this share of a slide on, and stays as high as it is up to this (m).
-SHAKEN, UNSURE_M = 0.5, 0.06
+#: Feet that trembled are held from this share of a slide on, and may roll as feet do (see `Standing`);
+#: the clip stays as high as it is up to this (m).
+SHAKEN, SHAKEN_FIRM, UNSURE_M = 0.5, 0.3, 0.06
 #: Periods of a loop that are mended, of which one is taken.
 HEALED = 3
 
@@ -141,7 +143,7 @@ def _healed(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
     support = support_of(clip, anatomy)
     if support is not None and (not shaken or abs(support.off_m) > UNSURE_M):
         clip = set_on_floor(clip, support)
-    clip = _locked(clip, anatomy, path, SHAKEN if shaken else 1.0)
+    clip = _locked(clip, anatomy, path, shaken)
     support = support_of(clip, anatomy)
     return clip if support is None else set_on_floor(clip, support, whole=False)
 
@@ -169,16 +171,17 @@ def set_on_floor(clip: Clip, support: Support, whole: bool = True) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy, path: bool | None, share: float) -> Clip:
-    """The clip without sliding feet. path: see `heal`. share: see `slide_faults`."""
-    for step in (mend_path, *[mend_slides] * SLIDE_ROUNDS):
+def _locked(clip: Clip, anatomy: Anatomy, path: bool | None, shaken: bool) -> Clip:
+    """The clip without sliding feet. path: see `heal`. shaken: whether they trembled."""
+    for step in range(1 + SLIDE_ROUNDS):
         support = support_of(clip, anatomy)
-        faults = slide_faults(clip, support, share) if support is not None else []
+        faults = slide_faults(clip, support, SHAKEN if shaken else 1.0) if support is not None else []
         if support is None or not faults:
             return clip
-        if step is mend_path and not (drifts(support) if path is None else path):
-            continue
-        clip = step(clip, support, faults)
+        if step > 0:
+            clip = mend_slides(clip, support, faults, SHAKEN_FIRM if shaken else FIRM)
+        elif drifts(support) if path is None else path:
+            clip = mend_path(clip, support, faults)
     return clip
 
 
