@@ -11,7 +11,7 @@ from poise.body import BodyConfig, BodyTable, Humanoid, read_mjcf
 from poise.errors import PoiseError
 from poise.kin.coords import clip_to_qpos
 from poise.kin.cycle import Cycle, join_cycle
-from poise.kin.doctor.clean import CleanReport, clean_clip
+from poise.kin.doctor.clean import CleanReport, clean_clip, without_noise
 from poise.kin.feet.level import Levelled, level_feet
 from poise.kin.fk import Kinematics
 from poise.kin.ground import GroundFit, fit_ground
@@ -29,7 +29,8 @@ CYCLE_SINK_M = 0.1
 class OnBody:
     """A clip on a body.
 
-    moved: the clip on the body's skeleton, at its own rate, neither cleaned nor levelled.
+    moved: the clip on the body's skeleton, at its own rate, without its noise, else neither cleaned nor
+        levelled.
     clip: the same, cleaned and levelled as was asked for.
     qpos: `(T, 7 + hinges)`, in the body's coordinates at the rate that was asked for, on the floor.
     retargeting: how it came onto the skeleton, None where its bones are the body's.
@@ -84,12 +85,15 @@ def place_on_body(
         PoiseError: a skeleton that is no human's, or coordinates that are not finite.
     """
     known = clip.skeleton.source.ground_m is not None if known is None else known
-    moved, retargeting = clip, None
+    # Noise goes first: joints without a body ride along as they are in what is moved over.
+    calm, noise = without_noise(clip) if clean else (clip, CleanReport())
+    moved, retargeting = calm, None
     skeleton = onto.skeleton if isinstance(onto, Clip) else onto
     if onto is not None and skeleton is not None and not clip.skeleton.same_bones(skeleton):
-        moved, retargeting = retarget(clip, onto, config=how, example=example)
+        moved, retargeting = retarget(calm, onto, config=how, example=example)
     raw = clip.skeleton.source.raw
     made, cleaned = clean_clip(moved, raw=raw) if clean else (moved, CleanReport())
+    cleaned = replace(cleaned, noise=(*noise.noise, *cleaned.noise))
     turned = level_feet(made, table) if level else Levelled({})
     made = turned.onto(made)
     timed = made if rate_hz is None else resample(made, rate_hz)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from poise.body import Humanoid
-from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget
+from poise.kin import FitReport, RetargetConfig, RetargetReport, place_on_body, retarget, without_noise
 from poise.kin.doctor.faults import Fault, read_faults
 from poise.kin.feet.level import Levelled
 from poise.kin.fit import ClipFit
@@ -43,6 +44,11 @@ class Placed:
     moved: RetargetReport | None
     level: Levelled
     notes: tuple[str, ...]
+
+    @cached_property
+    def calm(self) -> Clip:
+        """The source without the noise that was taken off: joints without a body move as in it."""
+        return without_noise(self.source)[0] if self.report.clips[0].clean.noise else self.source
 
 
 def place(clip: Clip, tracker: Tracker) -> Placed:
@@ -123,7 +129,8 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
     if placed.moved is None:
         return motion
     config = replace(tracker.onto or RetargetConfig(), scale=1.0 / placed.moved.scale)
-    back, report = retarget(motion, placed.source, config=config, example=tracker.example)
+    source = placed.calm
+    back, report = retarget(motion, source, config=config, example=tracker.example)
     moved = {row.target for row in report.joints.rows if row.source}
     moved |= {j for _, j in report.joints.direct}
     skeleton, rot = back.skeleton, back.rot.copy()
@@ -133,11 +140,11 @@ def home(motion: Clip, placed: Placed, tracker: Tracker) -> Clip:
         if j in carries and skeleton.parents[j] >= 0:
             carries.add(skeleton.parents[j])
     own = [j for j in range(len(skeleton)) if j not in carries]
-    frames = min(back.frames, placed.source.frames)
-    rot[:frames, own] = placed.source.rot[:frames, own]
-    back = back.replaced(rot=rot, name=placed.source.name)
+    frames = min(back.frames, source.frames)
+    rot[:frames, own] = source.rot[:frames, own]
+    back = back.replaced(rot=rot, name=source.name)
     still = [report.joints.target.joint(role) for role in config.rigid]
-    return _turned_under(back, placed.source, [j for j in still if j is not None])
+    return _turned_under(back, source, [j for j in still if j is not None])
 
 
 def _turned_under(clip: Clip, source: Clip, joints: Sequence[int]) -> Clip:
