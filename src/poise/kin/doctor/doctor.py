@@ -138,10 +138,10 @@ def _healed(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
         return clip
     support = support_of(clip, anatomy)
     clip = clip if support is None else mend_drift(clip, support.sole_low)
-    # Feet that trembled still do a little where they stand, and tell less well how high the floor is.
+    # Feet that trembled still do a little where they stand; noise hides how high the floor is.
     shaken = any(f.kind == "tremble" for f in report.noise)
     support = support_of(clip, anatomy)
-    if support is not None and (not shaken or abs(support.off_m) > UNSURE_M):
+    if support is not None and (not report.noise or abs(support.off_m) > UNSURE_M):
         clip = set_on_floor(clip, support)
     clip = _locked(clip, anatomy, path, shaken)
     support = support_of(clip, anatomy)
