@@ -159,7 +159,7 @@ def test_flipped_feet_of_another_skeleton_are_turned_back(data_dir, take, foot, 
 
 
 @pytest.mark.parametrize(
-    ("clip_name", "foot", "least"), [("90_11", "rfoot", 170), ("05_06", "lfoot", 600)]
+    ("clip_name", "foot", "least"), [("90_11", "rfoot", 165), ("05_06", "lfoot", 600)]
 )
 def test_the_feet_of_real_clips_are_turned_back(data_dir, clip_name, foot, least):
     folder = data_dir / "cmu_amc/rfc"
