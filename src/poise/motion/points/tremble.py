@@ -36,6 +36,8 @@ BONES = (
 #: of two ends that tremble by themselves has a third of their variances, and is to have this share of it
 #: on average.
 SURE_HZ, IN_BONES = 3.5, 0.4
+#: With a smaller share the bones stay as they are: a rigid body moves so, if it trembles, as joints do.
+RIGID = 0.05
 #: A smaller tremble (mm) at a frequency is none.
 LEAST_MM = 3.0
 #: A frequency is clear at which the bones change by this times the median power.
@@ -116,10 +118,11 @@ def _tone(
             continue
         moves, changes = spectrum.tone(one)[0], of_bones.tone(one)[0]
         both = np.array([moves[a] + moves[b] for a, b in bones]) / 3.0
-        if np.minimum(changes / np.maximum(both, 1e-300), 2.0).mean() >= IN_BONES:
+        in_bones = float(np.minimum(changes / np.maximum(both, 1e-300), 2.0).mean())
+        if in_bones >= IN_BONES:
             # What the body itself does at that frequency is no tremble.
             size = min(1.5 * float(changes.mean()), float(moves.mean()))
-        elif one >= SURE_HZ:
+        elif one >= SURE_HZ and in_bones >= RIGID:
             size = float(moves.mean())
         else:
             continue
