@@ -55,8 +55,11 @@ SIZES_MM, LONGEST_S, SHORTEST_S, CLIPS = (10.0, 25.0, 50.0, 100.0), 10.0, 1.5, 4
 #: they are, and dirty ones that are tracked.
 CLEAN_MM, CLEAN, TRACKED = 1.0, 200, 12
 CLEAN_SETS = (
-    "other/bandai_bvh/**/*.bvh", "cmu_amc/**/*.amc", "cmu_bvh/**/*.bvh", "deepmimic_txt/*.txt",
-)  # fmt: skip
+    "other/bandai_bvh/**/*.bvh",
+    "cmu_amc/**/*.amc",
+    "cmu_bvh/**/*.bvh",
+    "deepmimic_txt/*.txt",
+)
 CUTOFFS = (0.5, 0.7, 1, 1.3, 1.6, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 10, 12)
 WINDOWS = (5, 7, 9, 13, 17, 23, 31)
 
@@ -222,7 +225,7 @@ def filtered(clip: Clip, one: Callable[[np.ndarray], np.ndarray]) -> Clip:
 
 
 def measured(here: np.ndarray, truth: Clip) -> dict[str, float]:
-    """What is left in joints' places `(T, J, 3)` m: distance, end of the path, slide of feet that stand
+    """The errors of joints' places `(T, J, 3)` m: distance, end of the path, slide of feet that stand
     in truth, share of its jerk."""
     feet = [j for j, n in enumerate(truth.skeleton.names) if "foot" in n.lower() or "toe" in n.lower()]
     there = truth.positions()
@@ -310,7 +313,7 @@ def clips_of(data: Path, count: int) -> Iterator[Clip]:
 
 
 def clean_rows(data: Path, count: int) -> Iterator[tuple[str, str, list[float]]]:
-    """What the repair changes in recordings: in those in which the doctor names no fault, and in all."""
+    """The repair's changes of recordings: of those without a fault that the doctor names, and of all."""
     seen: dict[str, list[tuple[float, float, float]]] = {"no fault named": [], "all": []}
     for path, clip in recordings(data, CLEAN_SETS):
         whole = heal(clip)
@@ -339,7 +342,7 @@ def clean_rows(data: Path, count: int) -> Iterator[tuple[str, str, list[float]]]
 def track_rows(
     clips: list[Clip], kinds: Iterable[str], sizes: Iterable[float]
 ) -> Iterator[tuple[str, str, list[float]]]:
-    """What `poise track` makes of dirt: motion done to its end, beside the estimate that it follows."""
+    """Dirt that `poise track` follows: motion done to its end, beside the estimate that it follows."""
     for kind in kinds:
         for mm in sizes if kind != "dropouts" else (0.0,):
             told: dict[str, list[float]] = {}
@@ -378,7 +381,7 @@ def write(out: Path, rows: Iterable[tuple[str, str, list[float]]], command: str)
 def dirt_rows(
     clips: list[Clip], kinds: Iterable[str], sizes: Iterable[float], points: bool
 ) -> Iterator[tuple[str, str, list[float]]]:
-    """What is left of dirt: of the dirty clip, after the best filter, after the repair."""
+    """The errors of the dirty clip, of the best filter's and of the repaired one."""
     try_out = attempts_at_points if points else attempts
     for kind in kinds:
         for mm in sizes if kind != "dropouts" else (0.0,):

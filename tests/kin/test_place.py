@@ -18,6 +18,8 @@ from poise.kin import (
 )
 from poise.kin.hinges import within_turns
 from poise.motion import Clip, resample
+from poise.motion.spectrum import white_mm
+from poise.spatial import quat_mul, rotvec_to_quat
 from toy_human import human, swing
 
 
@@ -78,3 +80,19 @@ def test_a_cycle_is_joined_where_that_is_asked_for():
     ends = [float(torch.tensor(q[-1, 7:] - q[0, 7:]).abs().max()) for q in (on.qpos, once.qpos)]
     assert ends[0] <= ends[1] + 1e-12
     assert len(motions[0]) < clip.frames
+
+
+def test_joints_without_a_body_lose_the_noise_of_the_file_too():
+    clip = walk()
+    table = generate_table(clip.skeleton, None, [clip])
+    rng = np.random.default_rng(0)
+    turn = torch.tensor(0.06 * rng.standard_normal((clip.frames, len(clip.skeleton), 3)))
+    noisy = clip.replaced(rot=quat_mul(torch.tensor(clip.rot), rotvec_to_quat(turn)).numpy())
+    on = place_on_body(noisy, table)
+    assert white_mm(noisy.positions(), clip.fps) > 10.0
+    # All joints of what is carried along are calm, and the noise is told once.
+    assert white_mm(on.moved.positions(), clip.fps) < 3.0
+    assert [f.kind for f in on.cleaned.noise if f.kind == "tremble"] == ["tremble"]
+    kept = place_on_body(noisy.replaced(skeleton=noisy.skeleton.with_source(raw=True)), table)
+    np.testing.assert_array_equal(kept.moved.rot, noisy.rot)
+    assert not kept.cleaned.noise

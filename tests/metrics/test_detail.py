@@ -1,4 +1,4 @@
-"""What is left of a movement, by frequency."""
+"""The share of a movement that is left, by frequency."""
 
 from __future__ import annotations
 

@@ -91,9 +91,8 @@ def place_on_body(
     skeleton = onto.skeleton if isinstance(onto, Clip) else onto
     if onto is not None and skeleton is not None and not clip.skeleton.same_bones(skeleton):
         moved, retargeting = retarget(calm, onto, config=how, example=example)
-    raw = clip.skeleton.source.raw
-    made, cleaned = clean_clip(moved, raw=raw) if clean else (moved, CleanReport())
-    cleaned = replace(cleaned, noise=(*noise.noise, *cleaned.noise))
+    made, cleaned = clean_clip(moved, raw=True) if clean else (moved, CleanReport())
+    cleaned = replace(cleaned, noise=noise.noise)
     turned = level_feet(made, table) if level else Levelled({})
     made = turned.onto(made)
     timed = made if rate_hz is None else resample(made, rate_hz)

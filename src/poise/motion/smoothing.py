@@ -86,7 +86,7 @@ def tremble_of(
     size, beside = found.tone(hz)
     floor, clear = found.floor(), size / np.maximum(beside, 1e-300)
     if hz < STEPS_HZ:
-        # What a group has beyond that is a step of its own, and as narrow as a tremble: the power of
+        # A group with more than that steps by itself, and as narrowly as a tremble: the power of
         # either at hz is its variance times fps / (pi WANDER_HZ).
         usual = UNEVEN * float(np.quantile(size, QUIET, method="lower"))
         own = np.maximum(size - usual, 0.0) * found.fps / (np.pi * WANDER_HZ)

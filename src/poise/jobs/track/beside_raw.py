@@ -39,7 +39,7 @@ class BesideRaw:
         }
 
     def sentence(self) -> str:
-        """What the score is against, in words."""
+        """The motion that the score is against, in words."""
         beside = ""
         if math.isfinite(self.mpjpe_mm):
             beside = f"; the character is {self.mpjpe_mm:.0f} mm from the motion with it"

@@ -93,8 +93,8 @@ def learn(
     Raises:
         PoiseError: a policy of primitives, which cannot go on, or a folder with another run.
     """
-    raw = placed.source.skeleton.source.raw
-    clip = placed.level.onto(clean_clip(placed.clip, raw=raw)[0]).replaced(cyclic=False)
+    # Its noise went before it was placed.
+    clip = placed.level.onto(clean_clip(placed.clip, raw=True)[0]).replaced(cyclic=False)
     held = help_of(folder) if (folder / RUN_FILE).exists() else help_n
     config = settings(tracker.config, seed, starts)
     config = helped(config, held) if held else config

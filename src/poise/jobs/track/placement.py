@@ -67,7 +67,7 @@ def place(clip: Clip, tracker: Tracker) -> Placed:
 
 
 def _read_noise(clip: Clip) -> tuple[str, ...]:
-    """What reading took off its keypoints."""
+    """Sentences on the noise that reading took off a clip's keypoints."""
     return tuple(
         f"The keypoints tremble by {f.size:.0f} mm {f.detail}: the tremble is taken off."
         for f in noise_read(clip)

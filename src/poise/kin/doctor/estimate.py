@@ -38,7 +38,7 @@ HELD_S, LEAPS, LEAP_RAD = 0.08, 3.0, 0.03
 #: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
 #: toes snap by nearly as much in kicks and dashes.
 SPIKE_RAD, SPIKE_M = 0.35, 0.06
-#: Where this share of all joints and frames leaps for certain, smaller spikes are told as well: so many
+#: Smaller spikes are told as well if this share of all joints and frames leaps for certain: so many
 #: times the usual roughness, this angle (rad) at least, in so many rounds.
 MANY_SPIKES, SMALL_TIMES, SMALL_RAD, SPIKE_ROUNDS = 1e-3, 5.0, 0.02, 3
 #: A tremble is looked for in what is faster than this (Hz), of axes that turn by more than this (rad).
@@ -153,7 +153,7 @@ def _piece(
     quats = calm["own" if own else "world"]
     y = np.concatenate((quats.reshape(frames, -1), calm_root), 1)
     groups = _groups(joints)
-    # What a tremble alone shook is left without it; smoothing takes white noise.
+    # Smoothing is for white noise; a motion that a tremble alone shook is still without it.
     if not tones or _white_of(clip, calm_root, calm["own"]) >= WHITE_MM:
         y = smoothed(y, clip.fps, groups, Spectrum.of(y, clip.fps, groups).floor())
     out = normalize(torch.tensor(y[:, : 4 * joints].reshape(quats.shape)))

@@ -46,7 +46,7 @@ CLEAR = 6.0
 
 @dataclass(frozen=True)
 class Tremble:
-    """What was taken off: size in mm (rms over places), frequency in Hz, None from frame to frame."""
+    """A tremble that was taken off: mm (rms over places), and Hz, None from frame to frame."""
 
     size_mm: float
     hz: float | None
@@ -120,7 +120,7 @@ def _tone(
         both = np.array([moves[a] + moves[b] for a, b in bones]) / 3.0
         in_bones = float(np.minimum(changes / np.maximum(both, 1e-300), 2.0).mean())
         if in_bones >= IN_BONES:
-            # What the body itself does at that frequency is no tremble.
+            # The body's own motion at that frequency is no tremble.
             size = min(1.5 * float(changes.mean()), float(moves.mean()))
         elif one >= SURE_HZ and in_bones >= RIGID:
             size = float(moves.mean())

@@ -267,9 +267,10 @@ class Perpetual:
             raise PoiseError(what, hint="Each of them is another network; leave one out")
         if not self.progressive and self.combine != "product":
             raise PoiseError(
-                "primitives that learn with their composer are combined as a product", "Perpetual",
+                "primitives that learn with their composer are combined as a product",
+                "Perpetual",
                 "Set combine='product'",
-            )  # fmt: skip
+            )
         if not self.progressive and self.max_primitives < 2:
             raise PoiseError("a composer without progressive training needs at least 2 primitives")
 

@@ -51,9 +51,16 @@ def feature_points(table: np.ndarray, path: Path, options: ReadOptions = UNSTATE
     joints = np.concatenate((root[:, None], about), 1)
     raw = joint_points(joints, path, options)
     return RawPoints(
-        "humanml3d", path, HUMANML3D, raw.positions, raw.fps, 1.0, "Y",
-        notes=raw.notes, rates=raw.rates,
-    )  # fmt: skip
+        "humanml3d",
+        path,
+        HUMANML3D,
+        raw.positions,
+        raw.fps,
+        1.0,
+        "Y",
+        notes=raw.notes,
+        rates=raw.rates,
+    )
 
 
 def _turned(v: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -160,7 +160,7 @@ def _all_parts(
         place, turn, scale = _parts(local.reshape(-1, 4, 4), "", np.repeat(codes, joints))
         parts = [x.reshape(frames, joints, -1).swapaxes(0, 1) for x in (place, turn, scale)]
     except PoiseError:
-        # Which joint it is, is said one by one.
+        # One by one, so that the refusal names the joint.
         each = [_parts(local[:, j], place, codes) for j, place in enumerate(where)]
         parts = [np.stack(x) for x in zip(*each, strict=True)]
     return list(parts[0]), list(parts[1]), list(parts[2])
