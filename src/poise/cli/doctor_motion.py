@@ -198,7 +198,7 @@ def _detail(clip: Clip, healed: Clip) -> dict[str, float]:
 
     from poise.metrics import detail
 
-    return detail(*(torch.tensor(c.positions()) for c in (healed, clip)), clip.fps)
+    return detail(torch.tensor(healed.positions()), torch.tensor(clip.positions()), clip.fps)
 
 
 def _written(clip: Clip, healed: Clip, found: Examination, left: Examination) -> None:
