@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from poise.metrics import detail
+from poise.metrics import detail, deviations
 
 
 def waves(*parts: tuple[float, float], seconds: float = 8.0, fps: float = 30.0) -> torch.Tensor:
@@ -40,3 +40,24 @@ def test_what_a_clip_cannot_tell_is_left_out():
     assert detail(short[:3], short[:3], 30.0) == {}
     slow = waves((1.0, 0.1), fps=8.0)
     assert "6-12 Hz" not in detail(slow, slow, 8.0)
+
+
+def test_the_spell_that_physics_changed_most_is_told_by_body_and_time():
+    ref = torch.zeros(60, 4, 3)
+    ref[:, 1:, 0] = 0.3
+    pos = ref.clone()
+    pos[:, 1:, 1] += 0.01
+    # Body 2 is 0.2 m off for 0.3 s; body 3 for a single frame; the root's own way does not count.
+    pos[12:21, 2, 2] = 0.2
+    pos[40, 3, 2] = 0.5
+    pos = pos + torch.linspace(0.0, 1.0, 60)[:, None, None]
+    (one,) = deviations(pos, ref, 30.0)
+    assert one.told(("hips", "a", "left_foot", "b"))["body"] == "left_foot"
+    assert (one.start_s, one.stop_s) == pytest.approx((0.4, 0.7))
+    assert one.most_mm == pytest.approx(200.2, abs=0.1)
+    assert deviations(ref, ref, 30.0) == []
+    # The largest three, in the order of time.
+    many = ref.clone()
+    for k, size in enumerate((0.1, 0.3, 0.2, 0.4)):
+        many[10 * k + 5 : 10 * k + 10, 1, 2] = size
+    assert [round(d.most_mm) for d in deviations(many, ref, 30.0)] == [300, 200, 400]

@@ -46,7 +46,8 @@ class ScoreCard:
     `kin.doctor.needs`. `raw` is there where the motion came with noise that was taken off: the error
     beside what came in (`mpjpe_mm`, `mpjpe_global_mm`), and that noise (`noise_mm`, and `noise_hz`, NaN
     from frame to frame). `detail` is what is left of the reference's movement at each frequency, of one
-    clip that is tracked, see `metrics.detail`. `variants` holds the tracking figures by weighting
+    clip that is tracked, see `metrics.detail`, and `changed` its spells that physics changed most, see
+    `metrics.deviations`. `variants` holds the tracking figures by weighting
     ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all frames, those
     after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success and tracking
     figures of action 0 from the same starts, `spread` their standard deviations over `starts` perturbed
@@ -78,6 +79,7 @@ class ScoreCard:
     needs: tuple[Mapping[str, Any], ...] = ()
     raw: Mapping[str, float] = field(default_factory=dict)
     detail: Mapping[str, float] = field(default_factory=dict)
+    changed: tuple[Mapping[str, Any], ...] = ()
     reference: Mapping[str, float] = field(default_factory=dict)
     per_clip: tuple[Mapping[str, Any], ...] = ()
     weighting: Weighting = "frame"
@@ -100,9 +102,9 @@ class ScoreCard:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values with the keys in field order; what is not finite becomes None. `raw` and
-        `detail` are left out where they are empty."""
-        return {k: v for k, v in plain(self).items() if v or k not in ("raw", "detail")}
+        """Plain JSON values with the keys in field order; what is not finite becomes None. `raw`,
+        `detail` and `changed` are left out where they are empty."""
+        return {k: v for k, v in plain(self).items() if v or k not in ("raw", "detail", "changed")}
 
 
 def write_score(card: ScoreCard, path: str | Path) -> Path:

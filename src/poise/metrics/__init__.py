@@ -4,8 +4,10 @@ from poise.metrics.help import HelpAudit, help_audit
 from poise.metrics.inbetween import l2p, l2q, npss, physics
 from poise.metrics.masking import masked_mean, masked_quantile, span_mask
 from poise.metrics.plausibility import (
+    Deviation,
     ballistic,
     detail,
+    deviations,
     float_gaps,
     floating,
     foot_contacts,
@@ -40,6 +42,7 @@ __all__ = [
     "LASTING_S",
     "LOST",
     "RULES",
+    "Deviation",
     "HelpAudit",
     "Shapes",
     "SuccessRule",
@@ -47,6 +50,7 @@ __all__ = [
     "ballistic",
     "centre_of_mass",
     "detail",
+    "deviations",
     "fallen",
     "first_lasting",
     "float_gaps",

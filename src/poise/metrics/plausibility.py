@@ -6,6 +6,7 @@ are metres above the ground, Z up; results are millimetres, or as stated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -235,6 +236,48 @@ def detail(pos: Tensor, ref: Tensor, fps: float) -> dict[str, float]:
         if high - low > 2.0 * fps / frames and bool(band.any()) and float(asked[band].sum()) > 0.0:
             out[f"{low:g}-{high:g} Hz"] = float(made[band].sum() / asked[band].sum())
     return out
+
+
+class Deviation(NamedTuple):
+    """A spell in which a body is far from where the reference has it, as seen from the root.
+
+    start_s, stop_s: s. body: its index. most_mm: the largest distance.
+    """
+
+    start_s: float
+    stop_s: float
+    body: int
+    most_mm: float
+
+    def told(self, names: Sequence[str]) -> dict[str, float | str]:
+        """The score card's entry of `changed`, the body by its name."""
+        return {**self._asdict(), "body": names[self.body]}
+
+
+#: A deviation is at least so large (mm) and so many times the median distance, and lasts so long (s).
+CHANGE_MM, CHANGE_TIMES, CHANGE_S = 60.0, 2.0, 0.1
+
+
+def deviations(pos: Tensor, ref: Tensor, fps: float, most: int = 3) -> list[Deviation]:
+    """The largest spells in which bodies `(T, B, 3)` m are not where `ref` has them, about body 0, the
+    root, in the order of time: each over twice the median distance and `CHANGE_MM`, one body a spell.
+
+    most: how many are given at most; spells of other bodies at the same time belong to the larger one.
+    """
+    off = ((pos - pos[:, :1]) - (ref - ref[:, :1])).norm(dim=-1) * MM
+    if not off.numel():
+        return []
+    least = max(CHANGE_MM, CHANGE_TIMES * float(off[:, 1:].median()))
+    found: list[Deviation] = []
+    far, worst = off.max(1)
+    edge = torch.nn.functional.pad((far > least).to(torch.int8), (1, 1)).diff()
+    begins, ends = (edge.eq(k).nonzero()[:, 0].tolist() for k in (1, -1))
+    for start, stop in zip(begins, ends, strict=True):
+        if stop - start >= CHANGE_S * fps:
+            at = start + int(far[start:stop].argmax())
+            found.append(Deviation(start / fps, stop / fps, int(worst[at]), float(far[at])))
+    largest = sorted(found, key=lambda c: -c.most_mm)[:most]
+    return sorted(largest, key=lambda c: c.start_s)
 
 
 def smoothness(pos: Tensor, fps: float = PHC_FPS) -> Tensor:

@@ -58,8 +58,17 @@ def _error(report: Report) -> Figure:
         colors=colors,
         inline=True,
     )
-    text = "Mean distance between the joints of simulation and reference."
+    text = f"Mean distance between the joints of simulation and reference.{_changed(report)}"
     return Figure(title, text, body, tuple(zip(names, colors, strict=True)), "s", True)
+
+
+def _changed(report: Report) -> str:
+    """The spells that physics changed most, by body; the replay leads there by its time."""
+    told = [
+        f"{c['body']} by up to {c['most_mm']:.0f} mm at {c['start_s']:.1f} to {c['stop_s']:.1f} s"
+        for c in report.score.get("changed") or ()
+    ]
+    return f" Physics changed most: {'; '.join(told)}." if told else ""
 
 
 def _help(report: Report) -> Figure:

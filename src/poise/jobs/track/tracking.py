@@ -39,7 +39,7 @@ from poise.jobs.tracker import Tracker
 from poise.kin.fit import widen
 from poise.kin.rate.reading import settled
 from poise.kin.supports import Support
-from poise.metrics import detail, has_lost, mpjpe_global
+from poise.metrics import detail, deviations, has_lost, mpjpe_global
 from poise.motion import Clip, ClipLibrary, read_clip
 from poise.motion.io.raw import ReadOptions
 from poise.motion.keypoints import Keypoints
@@ -163,8 +163,9 @@ def track(
     else:
         card = replace(card, needs=tuple(n.to_dict() for n in needs_of(imitation, supports)))
         seen = done.judged.mask[0]
-        left = detail(rollouts.pos[0][seen], rollouts.ref_pos[0][seen], imitation.reference.rate_hz)
-        card = replace(card, detail=left)
+        beside = rollouts.pos[0][seen], rollouts.ref_pos[0][seen], imitation.reference.rate_hz
+        far = [c.told(imitation.humanoid.bodies) for c in deviations(*beside)]
+        card = replace(card, detail=detail(*beside), changed=tuple(far))
         raw = beside_raw(tracker, points or given, placed, rollouts.pos[0], done.judged.mask[0])
         if raw is not None:
             card = replace(card, raw=raw.figures)
