@@ -36,6 +36,7 @@ from poise.jobs.warm_start import SMALL_STEP, widened
 from poise.learn import ConvergenceConfig, Until
 from poise.plan import TrajOptConfig
 from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual.config import PushPlan
 
 #: Dances, a kick, boxing and exercises.
 HELD_OUT = ("cmu 05$", "cmu 11$", "cmu 14$")
@@ -112,6 +113,7 @@ def finer(tracker: Tracker, options: argparse.Namespace) -> Perpetual:
         evaluate_every=a.every,
         cooling=a.cooling,
         noise=tuple(a.noise),
+        pushes=PushPlan() if a.pushes else kept.pushes,
         ppo=ppo,
     )
 
@@ -141,6 +143,7 @@ def main() -> None:
     parser.add_argument("--slide", type=float, default=0.2, help="price of feet that slide")
     parser.add_argument("--quick", action="store_true", help="see RecoveryPlan.quick")
     parser.add_argument("--noise", type=float, nargs="*", default=[], help="see Perpetual.noise")
+    parser.add_argument("--pushes", action="store_true", help="see Perpetual.pushes")
     parser.add_argument("--smooth", type=float, default=0.0, help="see PPOConfig.smooth_weight")
     parser.add_argument("--damping", type=float, help="of the servos, kd / kp in s; else the policy's")
     parser.add_argument("--hold-out", nargs="*", default=HELD_OUT, help="none: all is learned")

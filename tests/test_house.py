@@ -1,4 +1,4 @@
-"""House rules that no linter knows: short files, quiet libraries, safe loading, clean text."""
+"""House rules that no linter knows: quiet libraries, safe loading, clean text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "poise"
-LONGEST_FILE = 400
 
 _MACHINE = tuple(
     rf"(?<![\w.$}}>)~])/{path}" for path in ("work/", "root/", "home/[a-z]", "tmp/", "opt/")
@@ -54,11 +53,6 @@ def _calls(file: Path) -> list[tuple[int, str]]:
     """Line and dotted name of every call in a file."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     return [(n.lineno, ast.unparse(n.func)) for n in ast.walk(tree) if isinstance(n, ast.Call)]
-
-
-def test_no_file_holds_two_things() -> None:
-    lengths = {f.relative_to(ROOT): len(f.read_text(encoding="utf-8").splitlines()) for f in _python()}
-    assert {name: n for name, n in lengths.items() if n > LONGEST_FILE} == {}
 
 
 def test_only_the_command_line_prints() -> None:

@@ -108,6 +108,24 @@ def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
     other.close()
 
 
+def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> None:
+    given = Pushes((100.0, 100.0), (0.1, 0.1), (0.1, 2.0), impulse_ns=20.0, share=0.5, seed=4)
+    env = pushed(task, given).env(400, 1, False, threads=1)
+    plugin = env.plugin(Pushing)
+    assert plugin is not None
+    env.reset()
+    lasts, size = plugin.lasts / 30, plugin.force.norm(dim=-1)
+    assert float(lasts.min()) >= 0.1 and float(lasts.max()) <= 2.0
+    # Evenly in the logarithm: half of them are shorter than the geometric mean.
+    assert float((lasts < 0.447).float().mean()) == pytest.approx(0.5, abs=0.1)
+    # 20 N s: the whole 100 N for up to 0.2 s.
+    assert size[lasts < 0.19].allclose(torch.tensor(100.0).double())
+    torch.testing.assert_close((size * lasts)[lasts > 0.3], torch.full_like(size, 20.0)[lasts > 0.3],
+                               rtol=0.12, atol=0.0)  # fmt: skip
+    assert float((plugin.left > 10**6).float().mean()) == pytest.approx(0.5, abs=0.1)
+    env.close()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -115,6 +133,8 @@ def test_pushes_are_part_of_what_is_copied_and_resumed(task: Imitation) -> None:
         ({"every_s": (-1.0, 1.0)}, "every_s must rise from at least 0"),
         ({"lasts_s": 0.0}, "must be above 0"),
         ({"bodies": ()}, "at least one body"),
+        ({"lasts_s": (0.5, 0.2)}, "must be above 0"),
+        ({"share": 1.5}, "share must lie in 0 to 1"),
     ],
 )
 def test_mistakes(settings: dict, message: str) -> None:

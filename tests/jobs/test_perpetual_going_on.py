@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from poise.body import BodyConfig
+from poise.env.yielding import Yielding
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.perpetual.run import begin, going_on, train
@@ -20,6 +21,7 @@ from poise.learn import Until, Value
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build
+from poise.recipes.perpetual.config import PushPlan
 from poise.spatial import quat_mul
 from toy_human import swing
 from toy_library import library, tiny
@@ -140,6 +142,42 @@ def test_a_wider_observation_changes_nothing_at_first(policy: Path, tmp_path: Pa
         widened(again, wider(again, window=(2,)))
     with pytest.raises(PoiseError, match="observes 'rotation_goal'"):
         widened(tracker, wider(tracker, goal="keypoints"))
+
+
+def test_a_policy_goes_on_while_it_is_pushed_and_sees_its_goal_give_way(
+    policy: Path, tmp_path: Path
+) -> None:
+    tracker = load_tracker(policy)
+    plan = PushPlan(newtons=(30.0, 60.0), every_s=(0.03, 0.1), level=(0.1, 0.2))
+    task = wider(tracker, pushes=plan)
+    start = widened(tracker, task)
+    # Evaluations are without pushes, so that nothing gives way.
+    assert task.task.compliance is None and not task.task.plugins
+    env = task.env(3, threads=1, auto_reset=False)
+    columns = env.obs_widths["yielding"]
+    assert columns == 4 + len(task.humanoid.hinges)
+    zero = torch.zeros(3, dtype=torch.long)
+    obs = env.reset_to(zero, zero)
+    assert not obs[:, -columns:].any()
+    env.close()
+    # In training some is measured and seen: levels as they were drawn, and the displaced goal.
+    assert float(start.policy.norm.std[-columns]) > 0.01
+    write = begin(tmp_path, library(), task.config, earlier=tracker)
+    stages = StageTrainer(write, tmp_path, Until(iterations=1), 1, tensorboard=False, trained=start)
+    stages.iterate()
+    env = stages.trainer.env
+    yielding = env.plugin(Yielding)
+    assert (
+        yielding is not None and 0.1 <= float(yielding.level.min()) < float(yielding.level.max()) <= 0.2
+    )
+    assert len(yielding.level.unique()) > 1 and bool(yielding.goal.offset.any())
+    seen = env.observe()[:, -columns:]
+    torch.testing.assert_close(seen[:, 0], yielding.level.float())
+    torch.testing.assert_close(seen[:, 4:], yielding.goal.offset[:, 6:].float())
+    stages.save()
+    stages.close()
+    again = open_run(tmp_path).tracker
+    assert again.config.pushes == plan and again.policy.num_obs == start.policy.num_obs
 
 
 def test_servos_of_more_damping_on_the_same_body(policy: Path, tmp_path: Path) -> None:

@@ -72,6 +72,8 @@ class Compliance:
         return_hz: how fast u goes back to 0 where nothing acts: the undamped frequency of a critically
             damped spring; after 1 s at 1 Hz 1.4 % are left.
         least_n: N, weaker forces count as none.
+        drawn: between which the level of each episode is drawn, evenly, for training; None: all have
+            `level`.
     """
 
     level: float = 0.16
@@ -83,9 +85,11 @@ class Compliance:
     root: bool = True
     return_hz: float = 1.0
     least_n: float = 1.0
+    drawn: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        check_level(self.level)
+        for level in (self.level, *(self.drawn or ())):
+            check_level(level)
         if self.law not in ("eq8", "algorithm1"):
             raise PoiseError(f"the law is eq8 or algorithm1, got '{self.law}'", "Compliance")
         if self.weighting not in ("inverse", "printed"):

@@ -99,7 +99,10 @@ class ImitationEnv:
     def _make_terms(self, fused: bool) -> Terms:
         task, model, here = self.task, self.backend.model, self.device
         named = {**observables.STANDARD, **task.observables}
+        u = torch.zeros(self.num_envs, 6 + self.hinges, dtype=torch.float64, device=here)
         held = {"action": self.action, "age": self.age, **self.controls.sources()}
+        # Where nothing gives way, u is 0.
+        held |= {"compliance/u": u, "compliance/level": u[:, 0]}
         for plugin in self.plugins:
             named |= plugin.observables
             held |= plugin.sources()

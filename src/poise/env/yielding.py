@@ -25,7 +25,7 @@ from poise.control.compliance import (
 )
 from poise.env.goals.displaced import DisplacedGoal
 from poise.env.goals.goal import Goal
-from poise.env.plugins import Felt, Plugin
+from poise.env.plugins import Felt, Plugin, Start
 from poise.errors import PoiseError
 from poise.sim import Backend, CharacterRows, Drive, Mechanics
 from poise.spatial import quat_conj, quat_rotate
@@ -107,8 +107,18 @@ class Yielding(Plugin):
         self.goal = goal
 
     def sources(self) -> Mapping[str, Tensor]:
-        """u, for terms of a policy that learns with it."""
-        return {"compliance/u": self.goal.offset}
+        """u and the dial, for terms of a policy that learns with them."""
+        return {"compliance/u": self.goal.offset, "compliance/level": self.level}
+
+    def start(
+        self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
+    ) -> Start:
+        """Draws the levels of new episodes, where they are drawn."""
+        if isinstance(self.given, Compliance) and self.given.drawn is not None:
+            rows, (low, high) = self._rows[:, 0] if ids is None else ids, self.given.drawn
+            drawn = torch.rand(len(rows), generator=rng, dtype=torch.float64).to(self.level.device)
+            self.level[rows] = low + (high - low) * drawn
+        return start
 
     def rows(self) -> dict[str, Tensor]:
         return {"compliance/level": self.level}

@@ -34,7 +34,7 @@ from poise.learn.policy import spread
 from poise.nets import RunningNorm
 from poise.plan import Expert, LqrTeacher, Plan, Trajectories, TrajOptStats, make_plan
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual.task import stage_task
+from poise.recipes.perpetual.task import pushed, stage_task
 from poise.sim import UnstableError
 
 if TYPE_CHECKING:
@@ -204,7 +204,9 @@ def _observed(imitation: Imitation) -> dict[str, Tensor]:
 
 def _measure(policy: PolicyBundle, imitation: Imitation, columns: Tensor, steps: int) -> None:
     """Sets mean and deviation of the inputs beside `columns` to those of what the policy meets."""
-    env = imitation.env(MEASURED_IN, threads=1, help_scale=0.0, guard=False)
+    # What pushes do is only seen where they act.
+    task = pushed(imitation.task, imitation.config, imitation.humanoid)
+    env = replace(imitation, task=task).env(MEASURED_IN, threads=1, help_scale=0.0, guard=False)
     norm = RunningNorm(env.num_obs)
     try:
         obs = env.reset()

@@ -13,6 +13,9 @@ from poise.env.plugins import Felt, Plugin, Start
 from poise.errors import PoiseError
 from poise.sim import Backend, Drive
 
+#: Control steps until a push of an episode that has none.
+NEVER = 10**9
+
 
 @dataclass(frozen=True)
 class Pushes:
@@ -22,7 +25,9 @@ class Pushes:
     Attributes:
         newtons: between which the force is drawn, N.
         every_s: between which the time from one push's end to the next one's begin is drawn, s.
-        lasts_s: how long each lasts, s.
+        lasts_s: how long each lasts, s; two: between which that is drawn, evenly in its logarithm.
+        share: of the episodes that have pushes.
+        impulse_ns: N s that none has more of; long pushes are as much weaker.
         bodies: rows of the body table of which one is pushed at its inertial centre.
         control_hz: control steps per second.
         seed: of the draws.
@@ -30,20 +35,31 @@ class Pushes:
 
     newtons: tuple[float, float] = (50.0, 200.0)
     every_s: tuple[float, float] = (1.0, 3.0)
-    lasts_s: float = 0.2
+    lasts_s: float | tuple[float, float] = 0.2
     bodies: tuple[int, ...] = (0,)
     control_hz: float = 30.0
     seed: int = 0
+    share: float = 1.0
+    impulse_ns: float = float("inf")
 
     def __post_init__(self) -> None:
         for name in ("newtons", "every_s"):
             low, high = getattr(self, name)
             if not 0.0 <= low <= high < float("inf"):
                 raise PoiseError(f"{name} must rise from at least 0, got {low:g} to {high:g}", "Pushes")
-        if not (self.lasts_s > 0.0 and self.control_hz > 0.0):
-            raise PoiseError("lasts_s and control_hz must be above 0", "Pushes")
+        low, high = self.lasting
+        if not (0.0 < low <= high and self.control_hz > 0.0 and self.impulse_ns > 0.0):
+            raise PoiseError("lasts_s, control_hz and impulse_ns must be above 0", "Pushes")
+        if not 0.0 <= self.share <= 1.0:
+            raise PoiseError(f"share must lie in 0 to 1, got {self.share:g}", "Pushes")
         if not self.bodies:
             raise PoiseError("pushes need at least one body", "Pushes")
+
+    @property
+    def lasting(self) -> tuple[float, float]:
+        """The least and the most s that a push lasts."""
+        given = self.lasts_s
+        return given if isinstance(given, tuple) else (given, given)
 
     def __call__(self, goal: Goal, backend: Backend) -> Pushing:
         """The plug-in of an environment."""
@@ -55,6 +71,7 @@ class Pushing(Plugin):
 
     Attributes:
         left: `(N,)` control steps until a push begins; from 0 down those that it has lasted.
+        lasts: `(N,)` control steps of the next or present push.
         force: `(N, 3)` N of the next or present push, world axes.
         body: `(N,)` MuJoCo's body that it is on.
     """
@@ -63,8 +80,8 @@ class Pushing(Plugin):
         self.pushes, n, here = pushes, backend.num_envs, backend.device
         self._backend = backend
         self._rng = torch.Generator().manual_seed(pushes.seed)
-        self._lasts = max(1, round(pushes.lasts_s * pushes.control_hz))
         self.left = torch.zeros(n, dtype=torch.long, device=here)
+        self.lasts = torch.zeros_like(self.left)
         self.body = torch.zeros(n, dtype=torch.long, device=here)
         self.force = torch.zeros(n, 3, dtype=backend.drive.xfrc_applied.dtype, device=here)
         self._draw(torch.arange(n, device=here))
@@ -77,8 +94,12 @@ class Pushing(Plugin):
     def start(
         self, ids: Tensor | None, kind: Tensor | None, start: Start, rng: torch.Generator
     ) -> Start:
-        """Episodes begin with a time without a push."""
-        self._draw(torch.arange(len(self.left), device=self.left.device) if ids is None else ids)
+        """Episodes begin with a time without a push; some have none at all."""
+        rows = torch.arange(len(self.left), device=self.left.device) if ids is None else ids
+        self._draw(rows)
+        if self.pushes.share < 1.0:
+            none = torch.rand(len(rows), generator=self._rng) >= self.pushes.share
+            self.left[rows[none.to(rows.device)]] = NEVER
         return start
 
     def push(self, drive: Drive) -> None:
@@ -95,10 +116,15 @@ class Pushing(Plugin):
     def tick(self) -> None:
         """Counts down, and draws the next push where one is over."""
         self.left -= 1
-        self._draw((self.left <= -self._lasts).nonzero().squeeze(-1))
+        self._draw((self.left <= -self.lasts).nonzero().squeeze(-1))
 
     def rows(self) -> dict[str, Tensor]:
-        return {"push/left": self.left, "push/body": self.body, "push/force": self.force}
+        return {
+            "push/left": self.left,
+            "push/lasts": self.lasts,
+            "push/body": self.body,
+            "push/force": self.force,
+        }
 
     def state(self) -> dict[str, Tensor]:
         """The pushes, and the generator of those to come."""
@@ -109,7 +135,8 @@ class Pushing(Plugin):
         """Goes on with the same pushes; from a task without pushes with those it has."""
         if "push/rng" in state:
             for name, value in self.rows().items():
-                value.copy_(state[name])
+                if name in state:
+                    value.copy_(state[name])
             self._rng.set_state(state["push/rng"])
 
     def _draw(self, ids: Tensor) -> None:
@@ -119,7 +146,13 @@ class Pushing(Plugin):
         wait = p.every_s[0] + (p.every_s[1] - p.every_s[0]) * unit[0]
         size = p.newtons[0] + (p.newtons[1] - p.newtons[0]) * unit[1]
         angle = 2 * torch.pi * unit[2]
+        low, high = p.lasting
+        lasts = torch.full((n,), low)
+        if high > low:
+            lasts = low * (high / low) ** torch.rand(n, generator=self._rng)
+        size = size.clamp_max(p.impulse_ns / lasts)
         force = torch.stack((size * angle.cos(), size * angle.sin(), 0 * size), 1)
         self.left[ids] = (wait * p.control_hz).round().long().clamp_min(1).to(self.left.device)
+        self.lasts[ids] = (lasts * p.control_hz).round().long().clamp_min(1).to(self.left.device)
         self.force[ids] = force.to(self.force)
         self.body[ids] = (torch.tensor(p.bodies)[pick] + 1).to(self.body.device)

@@ -8,6 +8,7 @@ ours, which see later ones, too.
 | s^g-kp, goal of keypoints              | `keypoint_goal`   | 9 B (216)                            |
 | -, a frame of the reference later on   | `goal_later`      | 3 K + 5                              |
 | -, what the filter of actions keeps    | `last_action`     | n                                    |
+| -, how the goal gives way to forces    | `yielding`        | 4 + n                                |
 | beta, limb lengths (and masses)        | `shape`           | 2 B - 1                              |
 | what the discriminator sees of a frame | `motion_features` | 13 + 3 K + 6 J + n (196)             |
 
@@ -23,6 +24,9 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env.frame import Frame, ObsTerm, Pose
 from poise.spatial import into_heading, quat_between, quat_conj, quat_mul, quat_to_sixd
+
+#: The dial that a policy sees of a commanded stiffness, which is no level of compliance.
+YIELDS = 0.1
 
 
 def self_state(frame: Frame) -> Tensor:
@@ -94,6 +98,17 @@ def goal_later(frame: Frame, step: int, bodies: Tensor, turns: bool = True) -> T
         # Of the turn's double angle, whichever sign the quaternion has.
         out = torch.cat((out, torch.stack((w * w - z * z, 2 * w * z), -1)), -1)
     return out if frame.point is None else torch.where(frame.point.far.unsqueeze(-1), 0.0, out)
+
+
+def yielding(frame: Frame) -> Tensor:
+    """How the goal gives way `(N, 1 + 3 + n)`: the dial, the root's displacement in the character's
+    heading frame, m, and those of the hinges, rad; all 0 where nothing gives way (u of Eq. 8 of Deep
+    Compliant Control). A commanded stiffness shows as the dial `YIELDS`.
+    """
+    u, level = frame.source("compliance/u").float(), frame.source("compliance/level").float()
+    root = into_heading(frame.sim.heading, u[:, None, :3]).flatten(1)
+    level = torch.where(level > 1.0, YIELDS, level)
+    return torch.cat((level.unsqueeze(1), root, u[:, 6:]), 1)
 
 
 def last_action(frame: Frame) -> Tensor:

@@ -31,7 +31,7 @@ from poise.learn.state import State, make_generator
 from poise.nets import Composer
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual.recovery import walking_clips
-from poise.recipes.perpetual.task import Perpetual, stage_task
+from poise.recipes.perpetual.task import Perpetual, pushed, stage_task
 from poise.sim import UnstableError
 
 #: The folder in a run folder with worlds that went bad.
@@ -227,7 +227,8 @@ def make_trainer(
     # Another stage draws other starts and noise.
     seed = (config.seed + 1_000_003 * (stage.number - 1)) % 2**31
     own = staged(practised(imitation, stage), stage)
-    own = replace(own, config=replace(config, seed=seed, ppo=_sized(config, stage)))
+    config = replace(config, seed=seed, ppo=_sized(config, stage))
+    own = replace(own, config=config, task=pushed(own.task, config, own.humanoid))
     ppo = critic_first(own.ppo()) if warm else own.ppo()
     lessons = None
     if config.teacher is not None:

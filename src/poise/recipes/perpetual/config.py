@@ -78,6 +78,31 @@ class RecoveryPlan:
 
 
 @dataclass(frozen=True)
+class PushPlan:
+    """Pushes in training, to which goals give way by Deep Compliant Control's law.
+
+    Attributes:
+        share: of the episodes that are pushed.
+        newtons, every_s, lasts_s, impulse_ns: see `env.events.Pushes`.
+        parts: kinds of bodies of which one is pushed.
+        level: between which the level of compliance is drawn in each episode.
+    """
+
+    share: float = 0.5
+    newtons: tuple[float, float] = (20.0, 200.0)
+    every_s: tuple[float, float] = (0.3, 2.0)
+    lasts_s: tuple[float, float] = (0.1, 2.0)
+    impulse_ns: float = 50.0
+    parts: tuple[str, ...] = ("pelvis", "spine", "head", "hand", "upper_arm")
+    level: tuple[float, float] = (0.0, 0.2)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if not 0.0 < self.share <= 1.0 or not self.parts:
+            raise PoiseError(f"pushes need a share above 0 and parts, got {self.share:g}", "PushPlan")
+
+
+@dataclass(frozen=True)
 class Perpetual:
     """Settings of one run.
 
@@ -105,6 +130,8 @@ class Perpetual:
             with several bodies the soles are those of the first.
         noise: each clip is learned once more with so many times a video estimator's noise, such as
             (0.25, 0.5), of which the policy is told, and is judged by the clean clip, see `noisy`.
+        pushes: a share of the episodes is pushed, and goals give way; the policy observes how, see
+            `phc_obs.yielding`. None: neither.
         style: the motion prior, None for none.
         termination: mean distance without the feet ("relaxed"), of "all" bodies, or any body's as in the
             "code".
@@ -164,6 +191,7 @@ class Perpetual:
     acceleration: float = 0.0
     foot_slide: float = 0.0
     noise: tuple[float, ...] = ()
+    pushes: PushPlan | None = None
     style: AmpConfig | None = field(default_factory=AmpConfig)
     termination: Literal["relaxed", "all", "code"] = "relaxed"
     first: float = 0.1

@@ -32,8 +32,9 @@ import torch
 from torch import Tensor
 
 from poise.body import BodyTable, Humanoid
-from poise.control import ImplicitResidual, PDTargets, SuccessHelp, range_scale
+from poise.control import Compliance, ImplicitResidual, PDTargets, SuccessHelp, range_scale
 from poise.env import DoneTerm, ObsTerm, Recovery, RewardTerm, TaskConfig
+from poise.env.events.pushes import Pushes
 from poise.env.recovery.clips import RecoveryClips
 from poise.env.terms import done, phc_obs, phc_reward, reward
 from poise.env.terms.phc_reward import recovery_terms
@@ -108,7 +109,22 @@ def _more_seen(config: Perpetual, humanoid: Humanoid) -> tuple[ObsTerm, ...]:
         ObsTerm(f"goal_in_{k}", phc_obs.goal_later, {"step": i, **given})
         for i, k in enumerate(config.window)
     )
-    return (*((ObsTerm("last_action", phc_obs.last_action),) if config.filter else ()), *later)
+    last = (ObsTerm("last_action", phc_obs.last_action),) if config.filter else ()
+    yields = (ObsTerm("yielding", phc_obs.yielding),) if config.pushes else ()
+    return (*last, *later, *yields)
+
+
+def pushed(task: TaskConfig, config: Perpetual, humanoid: Humanoid) -> TaskConfig:
+    """The task of a training in which characters are pushed; as it is without `Perpetual.pushes`."""
+    plan = config.pushes
+    if plan is None:
+        return task
+    rows = tuple(humanoid.rows_of(*plan.parts))
+    event = Pushes(
+        plan.newtons, plan.every_s, plan.lasts_s, rows, config.sim.control_hz, config.seed, plan.share,
+        plan.impulse_ns,
+    )  # fmt: skip
+    return replace(task, plugins=(*task.plugins, event), compliance=Compliance(drawn=plan.level))
 
 
 def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[RewardTerm, ...]:
