@@ -118,9 +118,9 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
         if hz is not None:
             found = Spectrum.of(places.reshape(len(places), -1), clip.fps, groups)
             size = 1e3 * math.sqrt(float(found.tone(hz)[0].mean()))
-            trembles.append(Fault("tremble", "", first, last, size, f"at {hz:.1f} Hz"))
+            trembles.append(Fault.tremble(first, last, size, hz))
         elif (white := white_mm(places, clip.fps)) >= WHITE_MM:
-            trembles.append(Fault("tremble", "", first, last, white, "from frame to frame"))
+            trembles.append(Fault.tremble(first, last, white, None))
     if trembles:
         worst = max(trembles, key=lambda f: f.size)
         out.append(replace(worst, start=trembles[0].start, stop=trembles[-1].stop))
