@@ -13,6 +13,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
 from poise.kin import examine, heal
+from poise.kin.doctor import clean
 from poise.kin.doctor.estimate import denoise, find_lost, refill
 from poise.motion import Clip, read_clip
 from poise.motion.smoothing import filled
@@ -220,3 +221,24 @@ def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:
     nothing = walk.replaced(rot=rot, root_pos=rng.standard_normal((walk.frames, 3)))
     with pytest.raises(PoiseError, match="no motion to be told"):
         heal(nothing)
+
+
+def test_what_the_doctor_found_is_not_looked_for_again(
+    walk: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[Clip] = []
+
+    def counting(clip: Clip) -> Clip:
+        counted.append(clip)
+        return denoise(clip)
+
+    monkeypatch.setattr(clean, "denoise", counting)
+    broken = dirty(walk, 25.0, white)
+    found = examine(broken)
+    healed = heal(broken, found=found)
+    assert len(counted) == 1
+    by_itself = heal(broken)
+    np.testing.assert_array_equal(healed.rot, by_itself.rot)
+    np.testing.assert_array_equal(healed.root_pos, by_itself.root_pos)
+    # What is known of another clip is not taken.
+    np.testing.assert_array_equal(heal(walk, found=found).rot, heal(walk).rot)

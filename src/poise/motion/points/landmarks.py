@@ -44,11 +44,11 @@ def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
         PoiseError: a needed place has no keypoint, or a keypoint that is never seen.
     """
     # A label that is never seen still says what the others mean, and tells no place.
-    there = ~np.isnan(points.positions).any(-1).all(0)
+    there = np.asarray(~np.isnan(points.positions).any(-1)).any(0).tolist()
     found = {p: [k for k in ks if there[k]] for p, ks in find_places(points.names).items()}
     tracks = {place: points.positions[:, ks].mean(1) for place, ks in found.items() if ks}
     seen = [name for name, known in zip(points.names, there, strict=True) if known]
-    marked, notes = marker_places(seen, points.positions[:, there], tracks)
+    marked, notes = marker_places(seen, points.positions[:, np.array(there)], tracks)
     # Joints that are named outright win over estimates from surface markers.
     tracks = {**marked, **tracks}
     unseen = [name for name in points.names if name not in seen]
