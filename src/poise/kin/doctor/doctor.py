@@ -49,8 +49,8 @@ READ_ONLY = ("bone drift", "quaternion length", "rest frame", "limit")
 class Examination:
     """What was found in a clip. figures: numbers to compare before and after a repair, None where
     they cannot be told. judged: whether the body could be told, so that feet and joints were judged.
-    travel: what was taken out of a clip in place; its feet are judged with it. cleaned: the clip and what
-    `clean_clip` says of it, which `heal` goes on from."""
+    travel: what was taken out of a clip in place; its feet are judged with it. cleaned: the clip and
+    what `clean_clip` makes of it, from which `heal` goes on."""
 
     faults: tuple[Fault, ...]
     figures: dict[str, float | None]

@@ -44,7 +44,7 @@ def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
         PoiseError: a needed place has no keypoint, or a keypoint that is never seen.
     """
     # A label that is never seen still says what the others mean, and tells no place.
-    there = np.asarray(~np.isnan(points.positions).any(-1)).any(0).tolist()
+    there = [not np.isnan(points.positions[:, k, 0]).all() for k in range(len(points.names))]
     found = {p: [k for k in ks if there[k]] for p, ks in find_places(points.names).items()}
     tracks = {place: points.positions[:, ks].mean(1) for place, ks in found.items() if ks}
     seen = [name for name, known in zip(points.names, there, strict=True) if known]
