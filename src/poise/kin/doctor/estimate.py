@@ -19,7 +19,7 @@ from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
 from poise.motion.points.clean import drop_spikes
 from poise.motion.skeleton import posed
-from poise.motion.smoothing import faded, filled, pieces, smoothed, spline, tremble_of
+from poise.motion.smoothing import faded, filled, pieces, smoothed, tremble_of
 from poise.motion.spectrum import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
 from poise.spatial import (
     normalize,
@@ -299,29 +299,20 @@ def _repeats(y: np.ndarray) -> bool:
 
 
 def _turns(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
-    """`(T, J, 3)` rad, the small turns from the motion below `hz` to `rot (T, J, 4)`, in their axes.
+    """`(T, J, 3)` rad, the small turns from the motion below `hz` to `rot (T, J, 4)`, in their axes."""
+    return quat_to_rotvec(quat_mul(quat_conj(_slow(rot, fps, hz)), torch.tensor(rot))).numpy()
 
-    The motion below is a smoothing spline's, turned about its ends: clean clips need not wait for SciPy.
-    """
+
+def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
+    """`(T, J, 4)` the motion of rotations below a frequency: that of a smoothing spline by its gain,
+    turned about its ends. Its bands would need SciPy, for which clean clips need not wait."""
     flat = rot.reshape(len(rot), -1)
     line = flat[0] + np.linspace(0.0, 1.0, len(rot))[:, None] * (flat[-1] - flat[0])
     both = np.concatenate((flat - line, -(flat - line)[-2:0:-1]))
     wave = 2 * np.sin(np.pi * np.arange(len(both) // 2 + 1) / len(both))
     gain = 1.0 / (1.0 + (wave / (2 * np.sin(np.pi * hz / fps))) ** 6)
     slow = line + np.fft.irfft(gain[:, None] * np.fft.rfft(both, axis=0), len(both), axis=0)[: len(rot)]
-    base = normalize(torch.tensor(slow.reshape(rot.shape)))
-    return quat_to_rotvec(quat_mul(quat_conj(base), torch.tensor(rot))).numpy()
-
-
-def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
-    """`(T, J, 4)` the motion of rotations below a frequency."""
-    # SciPy takes 0.3 s to load, which is spared where nothing asks for it.
-    from scipy.linalg import cho_solve_banded
-
-    frames = len(rot)
-    stiff = float((2 * np.sin(np.pi * hz / fps)) ** -6)
-    slow = cho_solve_banded((spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
-    return normalize(torch.tensor(slow))
+    return normalize(torch.tensor(slow.reshape(rot.shape)))
 
 
 def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
