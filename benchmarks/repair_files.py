@@ -15,7 +15,8 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.kin import examine, heal
-from poise.kin.doctor.doctor import READ_ONLY, Examination
+from poise.kin.doctor.doctor import READ_ONLY
+from poise.kin.doctor.faults import read_faults
 from poise.motion import Clip, read_clip
 
 FILES = (
@@ -27,12 +28,15 @@ TAKES = 10
 FIGURES = ("sole_slide_mm_per_s", "jerk_m_per_s3")
 
 
-def figures(found: Examination) -> dict[str, float]:
-    """Slide, jerk, faults of all kinds, and mm of a tremble (0 without one)."""
+def figures(clip: Clip) -> dict[str, float]:
+    """Slide, jerk, faults of all kinds, and mm of a tremble (0 without one); what reading mended is no
+    fault of the clip."""
+    found, mended = examine(clip), read_faults(clip)
+    faults = [f for f in found.faults if f.kind not in READ_ONLY and f not in mended]
     told = {name: found.figures.get(name) for name in FIGURES}
     out = {name: float("nan") if value is None else float(value) for name, value in told.items()}
-    out["faults"] = float(sum(f.kind not in READ_ONLY for f in found.faults))
-    out["tremble_mm"] = max((f.size for f in found.faults if f.kind == "tremble"), default=0.0)
+    out["faults"] = float(len(faults))
+    out["tremble_mm"] = max((f.size for f in faults if f.kind == "tremble"), default=0.0)
     return out
 
 
@@ -59,7 +63,7 @@ def file_rows(data: Path, few: bool = False) -> Iterator[tuple[str, str, list[fl
         told: dict[str, list[float]] = {}
         for before, after in pairs:
             for when, clip in (("before", before), ("after", after)):
-                for metric, value in figures(examine(clip)).items():
+                for metric, value in figures(clip).items():
                     told.setdefault(f"{when}: {metric}", []).append(value)
             if before.frames == after.frames:
                 off = np.linalg.norm(after.positions() - before.positions(), axis=-1)

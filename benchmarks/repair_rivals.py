@@ -30,7 +30,7 @@ def filters(fps: float, frames: int) -> Iterator[tuple[str, Callable[[np.ndarray
             lambda x, sos=sos: sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * fps))),
         )
     for window in (w for w in WINDOWS if w <= frames):
-        yield "savitzky-golay", lambda x, w=window: savgol_filter(x, w, 3, axis=0)
+        yield "savitzky-golay", lambda x, w=window: np.asarray(savgol_filter(x, w, 3, axis=0))
     for hz in (0.5, 1.0, 2.0, 4.0, 8.0):
         for beta in (0.0, 0.5, 2.0):
             yield "one-euro", lambda x, hz=hz, beta=beta: one_euro(x, fps, hz, beta)
