@@ -13,6 +13,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
 from poise.kin import examine, heal
+from poise.kin.doctor import clean
 from poise.kin.doctor.estimate import denoise, find_lost, refill
 from poise.motion import Clip, read_clip
 from poise.motion.smoothing import filled
@@ -220,3 +221,58 @@ def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:
     nothing = walk.replaced(rot=rot, root_pos=rng.standard_normal((walk.frames, 3)))
     with pytest.raises(PoiseError, match="no motion to be told"):
         heal(nothing)
+
+
+def test_what_the_doctor_found_is_not_looked_for_again(
+    walk: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[Clip] = []
+
+    def counting(clip: Clip) -> Clip:
+        counted.append(clip)
+        return denoise(clip)
+
+    monkeypatch.setattr(clean, "denoise", counting)
+    broken = dirty(walk, 25.0, white)
+    found = examine(broken)
+    healed = heal(broken, found=found)
+    assert len(counted) == 1
+    by_itself = heal(broken)
+    np.testing.assert_array_equal(healed.rot, by_itself.rot)
+    np.testing.assert_array_equal(healed.root_pos, by_itself.root_pos)
+    # What is known of another clip is not taken.
+    np.testing.assert_array_equal(heal(walk, found=found).rot, heal(walk).rot)
+
+
+def test_a_twist_that_the_next_joint_undoes_is_no_spike(walk: Clip) -> None:
+    skeleton, rot = walk.skeleton, torch.tensor(walk.rot)
+    arm, fore = skeleton.index("LeftArm"), skeleton.index("LeftForeArm")
+    hand = skeleton.index("LeftHand")
+    bone = torch.tensor(skeleton.offsets[fore] / np.linalg.norm(skeleton.offsets[fore]))
+    turned = rot.clone()
+    for frame in (20, 41, 60):
+        turned[frame, arm] = quat_mul(rot[frame, arm], rotvec_to_quat(1.2 * bone))
+        turned[frame, fore] = quat_mul(rotvec_to_quat(-1.2 * bone), rot[frame, fore])
+    twisted = walk.replaced(rot=unwrap_quats(turned).numpy())
+    np.testing.assert_allclose(twisted.positions(), walk.positions(), atol=1e-9)
+    assert not find_lost(twisted, unwrap_quats(turned).numpy())
+    assert np.abs(refill(twisted).positions() - walk.positions())[:, hand].max() < 1e-9
+    # The same leap of the arm alone is one.
+    leaping = turned.clone()
+    leaping[:, fore] = rot[:, fore]
+    alone = walk.replaced(rot=unwrap_quats(leaping).numpy())
+    lost = find_lost(alone, unwrap_quats(leaping).numpy())
+    assert {("spike", arm, t, t) for t in (20, 41, 60)} <= set(lost)
+
+
+def test_keypoints_that_were_cleaned_are_not_made_worse(data_dir: Path) -> None:
+    folder = data_dir / "noisy/pose2sim/single"
+    read, pair = (
+        read_clip(folder / f"S00_P00_T01_BalancingTrial_0-100{end}.trc")
+        for end in ("", "_filt_butterworth")
+    )
+    hand = read.skeleton.index("LeftHand")
+    there = pair.positions()[:, hand] - pair.root_pos
+    for clip in (read, heal(read)):
+        off = np.linalg.norm(clip.positions()[:, hand] - clip.root_pos - there, axis=-1)
+        assert 1e3 * off.mean() < 13.0 and 1e3 * off.max() < 130.0
