@@ -14,8 +14,8 @@ row does nothing. Slide is the horizontal speed of ankles and toes in frames in 
 the truth's own stand: within 5 cm of their lowest and slower than 0.1 m/s.
 
 As keypoints the joints of a clip, onto which a skeleton was fitted, are its keypoints: the dirt moves
-each by itself, drop-outs are missing for 0.3 s, and repaired is the clip that reading them gives.
-The filters act on their places, gaps interpolated.
+each by itself, drop-outs are missing for 0.3 s, and repaired is what `poise doctor --fix` makes of the
+clip that reading them gives. The filters act on their places, gaps interpolated.
 
 Files are motion from video and from text whose truth nobody knows, see `repair_files.py`.
 """
@@ -230,7 +230,7 @@ def attempts(clip: Clip, kind: str, mm: float, seed: int) -> dict[str, np.ndarra
 def attempts_at_points(clip: Clip, kind: str, mm: float, seed: int) -> dict[str, np.ndarray] | None:
     """The same for the clip's joints as keypoints, which have no legs to lock."""
     broken, there = seen(clip, kind, mm, seed), clip.positions()
-    fixed = fit_clip(broken)
+    fixed = heal(fit_clip(broken))
     if fixed.frames != clip.frames:
         return None
     whole = smoothed(broken, lambda x: x)

@@ -14,8 +14,11 @@ from scipy.signal import butter, sosfiltfilt
 from poise.errors import PoiseError
 from poise.kin import examine, heal
 from poise.kin.doctor import clean
-from poise.kin.doctor.estimate import denoise, find_lost, refill
+from poise.kin.doctor.clean import clean_clip
+from poise.kin.doctor.estimate import denoise, find_lost, noise_faults, refill
 from poise.motion import Clip, read_clip
+from poise.motion.keypoints import Keypoints
+from poise.motion.points import fit_clip
 from poise.motion.smoothing import filled
 from poise.motion.spectrum import Spectrum, white_mm
 from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
@@ -212,6 +215,39 @@ def test_feet_that_trembled_stand_again(walk: Clip) -> None:
         examine(c).figures["sole_slide_mm_per_s"] for c in (walk, heal(dirty(walk, 25.0, white)))
     )
     assert before is not None and after is not None and after < before + 20.0
+
+
+@pytest.mark.parametrize("mm", [10.0, 50.0])
+def test_feet_of_trembling_keypoints_stand_again(walk: Clip, mm: float) -> None:
+    truth = fit_clip(Keypoints(walk.skeleton.names, walk.positions(), walk.fps))
+    rng = np.random.default_rng(0)
+    off = rng.standard_normal((*truth.rot.shape[:2], 3))
+    places = truth.positions() + mm / 1e3 * off / np.linalg.norm(off, axis=-1).mean()
+    fitted = fit_clip(Keypoints(truth.skeleton.names, places, truth.fps))
+    healed = heal(fitted)
+    # The points were freed of noise: no joint of the bones between them is lost.
+    assert [f for f in noise_faults(fitted)[0] if f.kind != "tremble"] == []
+    assert off_mm(healed, truth) < 1.3 * off_mm(fitted, truth)
+    before, loose, after = (_ankle_slide(c, truth) for c in (truth, fitted, healed))
+    assert after < before + 20.0 and after - before < 0.3 * (loose - before)
+
+
+def _ankle_slide(clip: Clip, truth: Clip) -> float:
+    """mm/s of ankles and toes that stand in truth."""
+    feet = [j for j, n in enumerate(truth.skeleton.names) if "Foot" in n or "Toe" in n]
+    path, there = clip.positions()[:, feet], truth.positions()[:, feet]
+    stands = np.linalg.norm(np.diff(there, axis=0), axis=-1) * truth.fps < 0.1
+    stands &= there[1:, :, 2] < there[..., 2].min(0) + 0.05
+    speed = np.linalg.norm(np.diff(path[..., :2], axis=0), axis=-1) * clip.fps
+    return 1e3 * float(speed[stands].mean())
+
+
+def test_a_foot_that_trembles_little_keeps_its_roll(walk: Clip) -> None:
+    broken = dirty(walk, 10.0, white)
+    held, loose = heal(broken), clean_clip(broken, rougher=False)[0]
+    assert off_mm(held, walk) < 1.1 * off_mm(loose, walk)
+    before, after = (_ankle_slide(c, walk) for c in (walk, held))
+    assert after < before + 20.0
 
 
 def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:

@@ -19,9 +19,9 @@ from poise.kin.doctor.faults import KINDS, Fault, by_kind, read_faults, spell_fa
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import drifts, mend_path, mend_slides
+from poise.kin.doctor.stance import steadied
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
-from poise.kin.feet.hold import FIRM
 from poise.kin.hinges import chain_angles
 from poise.kin.loops import best_period, overlap_of, repeated
 from poise.kin.rate.judge import judge_rate
@@ -34,9 +34,8 @@ from poise.motion import Clip
 BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
-#: Feet that trembled are held from this share of a slide on, and may roll as feet do (see `Standing`);
-#: the clip stays as high as it is up to this (m).
-SHAKEN, SHAKEN_FIRM, UNSURE_M = 0.5, 0.3, 0.06
+#: The same of feet that trembled (`steadied`); the clip stays as high as it is up to this (m).
+SHAKEN_ROUNDS, UNSURE_M = 2, 0.06
 #: Periods of a loop that are mended, of which one is taken.
 HEALED = 3
 
@@ -165,9 +164,10 @@ def _healed(
     support = of(clip)
     clip = clip if support is None else mend_drift(clip, support.sole_low)
     # Feet that trembled still do a little where they stand; noise hides how high the floor is.
-    shaken = any(f.kind == "tremble" for f in report.noise)
+    noise = [*report.noise, *(f for f in read_faults(clip) if f.kind == "tremble")]
+    shaken = any(f.kind == "tremble" for f in noise)
     support = of(clip)
-    if support is not None and (not report.noise or abs(support.off_m) > UNSURE_M):
+    if support is not None and (not noise or abs(support.off_m) > UNSURE_M):
         clip = set_on_floor(clip, support)
     clip = _locked(clip, of, path, shaken)
     support = of(clip)
@@ -202,13 +202,15 @@ def _locked(clip: Clip, of: Callable[[Clip], Support | None], path: bool | None,
     trembled."""
     for step in range(1 + SLIDE_ROUNDS):
         support = of(clip)
-        faults = slide_faults(clip, support, SHAKEN if shaken else 1.0) if support is not None else []
-        if support is None or not faults:
+        if support is None:
             return clip
-        if step > 0:
-            clip = mend_slides(clip, support, faults, SHAKEN_FIRM if shaken else FIRM)
-        elif drifts(support) if path is None else path:
+        faults = slide_faults(clip, support)
+        if step == 0 and faults and (drifts(support) if path is None else path):
             clip = mend_path(clip, support, faults)
+        elif step > 0 and shaken and step <= SHAKEN_ROUNDS:
+            clip = steadied(clip, support)
+        elif step > 0 and not shaken and faults:
+            clip = mend_slides(clip, support, faults)
     return clip
 
 

@@ -113,7 +113,10 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     if clip.frames < SHORTEST:
         return [], clip
     rot = _continuous(clip.rot)
-    lost = find_lost(clip, rot)
+    # Trembling keypoints lost their spikes as points. Bones that were fitted to them turn about each
+    # other, and one alone that is filled in would move what it carries.
+    fitted = any(kind == "tremble" for kind, *_ in clip.skeleton.source.mended)
+    lost = [] if fitted else find_lost(clip, rot)
     whole = refill(clip, lost)
     turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
     out = [
