@@ -1,7 +1,7 @@
 """Golden runs: what Poise makes of fixed inputs, kept and compared while the code is moved about.
 
-    python benchmarks/golden.py FOLDER --poise OLD/bin/poise            # made once, by an installed wheel
-    python benchmarks/golden.py OTHER --against FOLDER                  # made again, and compared
+    python benchmarks/golden.py FOLDER --poise OLD/bin/poise     # made once, by an installed wheel
+    python benchmarks/golden.py OTHER --against FOLDER           # made again, and compared
 
 Every run is one command with a seed, on one thread. Compared are the bytes of what it wrote, and where
 these differ the largest difference between numbers in the same place; what tells the time is left out.
@@ -35,9 +35,9 @@ ONE = ["--threads", "1"]
 #: Commands by name; {out} is the run's folder, {tmp} what other runs wrote.
 RUNS: dict[str, list[str]] = {
     "track_policy": ["track", WALK, "-o", "{out}", "--controller", "policy"],
-    "track_lookahead": ["track", DANCE, "-o", "{out}", "--controller", "lookahead", "--budget", "64", *ONE],
+    "track_lookahead": ["track", DANCE, "-o", "{out}", "--controller", "lookahead", "--budget=64", *ONE],
     "track_search": [
-        "track", SPIN, "-o", "{out}", "--controller", "search", "--characters", "64", "--rounds", "1", *ONE,
+        "track", SPIN, "-o", "{out}", "--controller", "search", "--characters=64", "--rounds=1", *ONE,
     ],
     "recover": ["track", SPIN, "-o", "{out}", "--controller", "policy", "--recover"],
     "chain": ["track", WALK, DANCE, "-o", "{out}", "--controller", "policy"],
@@ -58,7 +58,7 @@ RUNS: dict[str, list[str]] = {
         "--single", "--no-style", *ONE,
     ],
     "perpetual_stages": [
-        "train", "perpetual", "--library", "{lib}", "-o", "{out}", "--iterations", "5", "--envs", "64", *ONE,
+        "train", "perpetual", "--library", "{lib}", "-o", "{out}", "--iterations=5", "--envs=64", *ONE,
     ],
     "inbetween": ["inbetween", WALK, "-o", "{out}/walk.bvh", "--keyframes", "0,30,60,89"],
     "complete": [
@@ -66,7 +66,7 @@ RUNS: dict[str, list[str]] = {
     ],
     "dream": ["dream", "-o", "{out}", "--seconds", "20", "--controller", "policy", "--seed", "3"],
     "door": ["play", "compliant", "door", "-o", "{out}", "--controller", "policy", "--count", "2", *ONE],
-    "hands": ["play", "compliant", "hands", "-o", "{out}", "--controller", "policy", "--count", "2", *ONE],
+    "hands": ["play", "compliant", "hands", "-o", "{out}", "--controller", "policy", "--count=2", *ONE],
     "doctor": ["doctor", DANCE, "--fix", "-o", "{out}/mended.bvh"],
     "retarget": ["retarget", DANCE, "--onto", WALK, "-o", "{out}/moved.bvh"],
 }  # fmt: skip
