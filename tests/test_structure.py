@@ -32,9 +32,6 @@ EXPLAINED = {
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
         "jobs/tracker.py:Tracker.with_damping",
         "papers/compliant/throw_figures.py:throws",
-        "learn/next_frame.py:NextFrameObjective", "nets/next_frame.py:NextFrameConfig.aclstm",
-        "nets/next_frame.py:NextFrameConfig.egopose", "nets/next_frame.py:NextFrameConfig.erd",
-        "synth/next_frames.py:NextFrames",
     ),
     "analytic inverse kinematics, which keyframes will need": (
         "kin/ik/analytic.py:clip_ik",

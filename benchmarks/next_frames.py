@@ -11,16 +11,21 @@ All predict how a frame changes, in deviations, so that a fresh network stands n
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from poise.errors import PoiseError
+from poise.learn.cvae import Frames
 from poise.settings import validate
+from poise.synth.place_free import coordinates, past_features
 
 #: Least deviation of a number.
 _MIN_STD = 1e-2
+#: Norm to which gradients are scaled down.
+_GRAD_NORM = 1.0
 #: What changes in a frame is about so many deviations.
 _CHANGE = 0.1
 
@@ -152,3 +157,80 @@ def _layers(sizes: tuple[int, ...], bent: bool) -> nn.Sequential:
         if bent or k < len(sizes) - 2:
             out.append(nn.ReLU())
     return nn.Sequential(*out)
+
+
+class NextFrameObjective:
+    """Loss and update; see `learn.inbetween.InbetweenTrainer`.
+
+    Args:
+        batch: windows in a step. lr: Adam's step size.
+    """
+
+    def __init__(self, net: NextFrame, batch: int = 64, lr: float = 1e-3):
+        self.net, self.batch = net, batch
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            "net": torch.optim.Adam(net.parameters(), lr=lr)
+        }
+
+    def modules(self) -> Mapping[str, torch.nn.Module]:
+        """What is trained, by name."""
+        return {"net": self.net}
+
+    def step(self, sampler: Frames, step: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """One update; the loss."""
+        window = self.net.config.past + self.net.config.future
+        x = self.net.scaled(sampler.draw(self.batch, window, generator))
+        made = self.net.trained(x[:, :-1], generator)
+        loss = (made - x[:, 1:]).square().mean()
+        optimizer = self.optimizers["net"]
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), _GRAD_NORM)
+        optimizer.step()
+        return {"loss": loss.detach()}
+
+
+class NextFrames:
+    """Makes the next segment of motion frame by frame (`env.goals.generator.MotionGenerator`).
+
+    Args:
+        net: the trained network.
+        seeds: `(S, p, 7 + n)` pasts from which motions begin.
+        fps: frames a second.
+        bounds: `(2, n)` rad, least and most of each hinge; None leaves angles as they are made.
+    """
+
+    def __init__(self, net: NextFrame, seeds: Tensor, fps: float, bounds: Tensor | None = None):
+        if seeds.ndim != 3 or seeds.shape[1] != net.config.past or not len(seeds):
+            raise PoiseError(
+                f"seeds must be pasts of {net.config.past} frames, got {tuple(seeds.shape)}",
+                "NextFrames",
+            )
+        self.net, self.seeds, self.fps, self.bounds = net.eval(), seeds.double(), fps, bounds
+        self.past, self.future = net.config.past, net.config.future
+
+    def begin(self, count: int, rng: torch.Generator) -> Tensor:
+        """`(count, past, 7 + n)` of the seeds, drawn evenly, set to the origin."""
+        frames = self.seeds[torch.randint(len(self.seeds), (count,), generator=rng)].clone()
+        frames[..., :2] -= frames[:, -1:, :2].clone()
+        return frames
+
+    def generate(self, past: Tensor, ids: Tensor, rng: torch.Generator) -> Tensor:
+        """`(n, future, 7 + n)` after `past (n, past, 7 + n)`."""
+        return self.propose(past, rng, 1)[:, 0]
+
+    @torch.no_grad()
+    def propose(self, past: Tensor, rng: torch.Generator, count: int) -> Tensor:
+        """`(n, count, future, 7 + n)`: futures differ by the noise that training had; without any they
+        are the same."""
+        frames = past_features(past.double(), self.fps).float().repeat_interleave(count, 0)
+        noise = self.net.config.noise * torch.randn(len(frames), 1, frames.shape[-1], generator=rng)
+        made = self.net.continued(frames, noise if self.net.config.noise else None).double()
+        out = coordinates(made, past[:, -1].double().repeat_interleave(count, 0), self.fps)
+        if self.bounds is not None:
+            out[..., 7:] = out[..., 7:].clamp(*self.bounds)
+        return out.unflatten(0, (len(past), count))
+
+    def rows(self) -> Mapping[str, Tensor]:
+        """It remembers nothing but the past that it is given."""
+        return {}

@@ -9,9 +9,9 @@ import torch
 from poise.control import LinearHelp
 from poise.env.terms import done, next_frames
 from poise.errors import PoiseError
+from poise.papers.skeleton2humanoid.recipe import FALLS, INITIAL, LEFT, Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.skeleton_to_humanoid import FALLS, INITIAL, LEFT, Budget, build, settings
 from poise.spatial import quat_conj, quat_mul, quat_rotate
 from toy_human import swing
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from next_frames import NextFrame, NextFrameConfig, NextFrameObjective, NextFrames
 
 from poise.errors import PoiseError
 from poise.learn.cvae import Frames
 from poise.learn.inbetween import InbetweenTrainer
-from poise.learn.next_frame import NextFrameObjective
-from poise.nets.next_frame import NextFrame, NextFrameConfig
-from poise.synth.next_frames import NextFrames
 from poise.synth.place_free import ROOT
 
 HINGES = 3
