@@ -4,16 +4,20 @@
     python benchmarks/repair.py --data FOLDER --live -o results/repair_live.csv
     python benchmarks/repair.py --data FOLDER --clean -o results/repair_clean.csv
     python benchmarks/repair.py --data FOLDER --track -o results/repair_track.csv
+    python benchmarks/repair.py --data FOLDER --files -o results/repair_files.csv
 
 FOLDER holds the development set. Every clip is dirtied so that its joints are 10 to 100 mm off on
 average, repaired by `heal`, and filtered by zero-phase Butterworth filters, Savitzky-Golay filters and
 the one-euro filter with the setting that an oracle chooses for the clip: the one that comes nearest to
-the truth. The null row does nothing. Slide is the horizontal speed of ankles and toes in frames in which
+the truth; a foot lock that is told the true contacts goes on from either (`repair_rivals.py`). The null
+row does nothing. Slide is the horizontal speed of ankles and toes in frames in which
 the truth's own stand: within 5 cm of their lowest and slower than 0.1 m/s.
 
 As keypoints the joints of a clip, onto which a skeleton was fitted, are its keypoints: the dirt moves
-each by itself, drop-outs are missing for 0.3 s, and repaired is the clip that reading them gives.
-The filters act on their places, gaps interpolated.
+each by itself, drop-outs are missing for 0.3 s, and repaired is what `poise doctor --fix` makes of the
+clip that reading them gives. The filters act on their places, gaps interpolated.
+
+Files are motion from video and from text whose truth nobody knows, see `repair_files.py`.
 """
 
 from __future__ import annotations
@@ -30,7 +34,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.signal import butter, savgol_filter, sosfiltfilt
+from repair_rivals import filtered, filters, foot_lock, standing
+from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
 from poise.jobs.track import track
@@ -60,8 +65,6 @@ CLEAN_SETS = (
     "cmu_bvh/**/*.bvh",
     "deepmimic_txt/*.txt",
 )
-CUTOFFS = (0.5, 0.7, 1, 1.3, 1.6, 2, 2.5, 3, 3.5, 4, 5, 6, 8, 10, 12)
-WINDOWS = (5, 7, 9, 13, 17, 23, 31)
 
 Noise = tuple[np.ndarray, np.ndarray]
 """Turns `(T, J, 3)` rad about a joint's own axes, moves `(T, 3)` m of the root, both of size one."""
@@ -167,35 +170,6 @@ def off_mm(a: Clip, b: Clip) -> float:
     return 1e3 * float(np.linalg.norm(a.positions() - b.positions(), axis=-1).mean())
 
 
-def filters(fps: float, frames: int) -> Iterator[tuple[str, Callable[[np.ndarray], np.ndarray]]]:
-    """Every filter that the oracle may choose."""
-    for hz in (c for c in CUTOFFS if c < 0.49 * fps):
-        sos = butter(4, hz, fs=fps, output="sos")
-        yield (
-            "butterworth",
-            lambda x, sos=sos: sosfiltfilt(sos, x, axis=0, padlen=min(len(x) - 1, int(3 * fps))),
-        )
-    for window in (w for w in WINDOWS if w <= frames):
-        yield "savitzky-golay", lambda x, w=window: savgol_filter(x, w, 3, axis=0)
-    for hz in (0.5, 1.0, 2.0, 4.0, 8.0):
-        for beta in (0.0, 0.5, 2.0):
-            yield "one-euro", lambda x, hz=hz, beta=beta: one_euro(x, fps, hz, beta)
-
-
-def one_euro(x: np.ndarray, fps: float, hz: float, beta: float) -> np.ndarray:
-    """Casiez et al. 2012: a first-order low-pass whose cut-off grows with speed; it delays."""
-
-    def share(cutoff: np.ndarray | float) -> np.ndarray | float:
-        return 1.0 / (1.0 + fps / (2 * np.pi * cutoff))
-
-    out, speed = x.copy(), np.zeros_like(x[0])
-    for k in range(1, len(x)):
-        speed += share(1.0) * ((x[k] - x[k - 1]) * fps - speed)
-        a = share(hz + beta * np.abs(speed))
-        out[k] = a * x[k] + (1 - a) * out[k - 1]
-    return out
-
-
 def seen(clip: Clip, kind: str, mm: float, seed: int) -> Keypoints:
     """The clip's joints as keypoints with dirt of a kind, each `mm` off on average."""
     rng, pos = np.random.default_rng(seed), clip.positions()
@@ -217,20 +191,12 @@ def smoothed(points: Keypoints, one: Callable[[np.ndarray], np.ndarray]) -> np.n
     return one(whole.reshape(len(whole), -1)).reshape(whole.shape)
 
 
-def filtered(clip: Clip, one: Callable[[np.ndarray], np.ndarray]) -> Clip:
-    """The clip with the filter on the components of its quaternions and on its root."""
-    rot = one(np.array(clip.rot).reshape(clip.frames, -1)).reshape(clip.rot.shape)
-    rot = rot / np.maximum(np.linalg.norm(rot, axis=-1, keepdims=True), 1e-9)
-    return clip.replaced(rot=rot, root_pos=one(np.array(clip.root_pos)))
-
-
 def measured(here: np.ndarray, truth: Clip) -> dict[str, float]:
     """The errors of joints' places `(T, J, 3)` m: distance, end of the path, slide of feet that stand
     in truth, share of its jerk."""
     feet = [j for j, n in enumerate(truth.skeleton.names) if "foot" in n.lower() or "toe" in n.lower()]
     there = truth.positions()
-    speed = np.linalg.norm(np.diff(there[:, feet], axis=0), axis=-1) * truth.fps
-    stands = (there[1:, feet, 2] < there[:, feet, 2].min(0) + 0.05) & (speed < 0.1)
+    stands = standing(there[:, feet], truth.fps)
 
     def slide(p: np.ndarray) -> float:
         step = np.linalg.norm(np.diff(p[:, feet, :2], axis=0), axis=-1) * truth.fps
@@ -245,30 +211,32 @@ def measured(here: np.ndarray, truth: Clip) -> dict[str, float]:
     }
 
 
-def attempts(clip: Clip, kind: str, mm: float, seed: int) -> list[np.ndarray] | None:
-    """Places `(T, J, 3)` m of the dirty clip, of the best filter's and of the repaired one, None where
-    the repair has other frames."""
-    broken, there = dirty(clip, kind, mm, seed), clip.positions()
+def attempts(clip: Clip, kind: str, mm: float, seed: int) -> dict[str, np.ndarray] | None:
+    """Places `(T, J, 3)` m of the dirty clip, of the best filter's, of the repaired one, and of a foot
+    lock with true contacts on the first two; None where the repair has other frames."""
+    broken = dirty(clip, kind, mm, seed)
     fixed = heal(broken)
     if fixed.frames != clip.frames:
         return None
-    tried = (filtered(broken, one).positions() for _, one in filters(clip.fps, clip.frames))
-    return [broken.positions(), _nearest(tried, there), fixed.positions()]
+    tried = [filtered(broken, one) for _, one in filters(clip.fps, clip.frames)]
+    best = min(tried, key=lambda one: off_mm(one, clip))
+    out = {"null": broken, "best filter": best, "repair": fixed}
+    for name, one in (("foot lock", broken), ("best filter, then foot lock", best)):
+        if (locked := foot_lock(one, clip)) is not None:
+            out[name] = locked
+    return {name: one.positions() for name, one in out.items()}
 
 
-def attempts_at_points(clip: Clip, kind: str, mm: float, seed: int) -> list[np.ndarray] | None:
-    """The same for the clip's joints as keypoints."""
+def attempts_at_points(clip: Clip, kind: str, mm: float, seed: int) -> dict[str, np.ndarray] | None:
+    """The same for the clip's joints as keypoints, which have no legs to lock."""
     broken, there = seen(clip, kind, mm, seed), clip.positions()
-    fixed = fit_clip(broken)
+    fixed = heal(fit_clip(broken))
     if fixed.frames != clip.frames:
         return None
-    tried = [smoothed(broken, one) for _, one in filters(clip.fps, clip.frames)]
     whole = smoothed(broken, lambda x: x)
-    return [whole, _nearest([*tried, whole], there), fixed.positions()]
-
-
-def _nearest(tried: Iterable[np.ndarray], there: np.ndarray) -> np.ndarray:
-    return min(tried, key=lambda p: float(np.linalg.norm(p - there, axis=-1).mean()))
+    tried = [*(smoothed(broken, one) for _, one in filters(clip.fps, clip.frames)), whole]
+    best = min(tried, key=lambda p: float(np.linalg.norm(p - there, axis=-1).mean()))
+    return {"null": whole, "best filter": best, "repair": fixed.positions()}
 
 
 def fitted_of(clips: Iterable[Clip], count: int) -> Iterator[Clip]:
@@ -385,13 +353,13 @@ def dirt_rows(
     try_out = attempts_at_points if points else attempts
     for kind in kinds:
         for mm in sizes if kind != "dropouts" else (0.0,):
-            left: dict[str, list[dict[str, float]]] = {"null": [], "best filter": [], "repair": []}
+            left: dict[str, list[dict[str, float]]] = {}
             for k, clip in enumerate(clips):
                 made = try_out(clip, kind, mm, k)
                 if made is None:
                     continue
-                for name, places in zip(left, made, strict=True):
-                    left[name].append(measured(places, clip))
+                for name, places in made.items():
+                    left.setdefault(name, []).append(measured(places, clip))
             subject = (f"{kind} {mm:g} mm" if mm else kind) + (" of keypoints" if points else "")
             ratio = [
                 a["distance_mm"] / b["distance_mm"]
@@ -417,6 +385,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="three clips, one size")
     parser.add_argument("--live", action="store_true", help="streams, see repair_live.py")
     parser.add_argument("--clean", action="store_true", help="recordings as they are")
+    parser.add_argument("--files", action="store_true", help="motion from video and from text")
     parser.add_argument("--track", action="store_true", help="what a body makes of dirt")
     parser.add_argument("-o", "--out", type=Path, required=True)
     o = parser.parse_args()
@@ -430,6 +399,10 @@ def main() -> None:
         rows, command = live.live_rows(clips, sizes if o.smoke else live.SIZES_MM), f"{command} --live"
     elif o.clean:
         rows, command = clean_rows(o.data, count if o.smoke else CLEAN), f"{command} --clean"
+    elif o.files:
+        import repair_files as from_video
+
+        rows, command = from_video.file_rows(o.data, o.smoke), f"{command} --files"
     elif o.track:
         clips = list(clips_of(o.data, min(count, TRACKED)))
         rows = track_rows(clips, o.only or ("white", "tone5", "all"), sizes)

@@ -16,7 +16,8 @@ from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
-from repair import KINDS, dirty, one_euro
+from repair import KINDS, dirty
+from repair_rivals import one_euro
 
 from poise.kin.fading import of_points
 from poise.live.sources.file import Loop

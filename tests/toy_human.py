@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from poise.motion import Clip, Skeleton
-from poise.spatial import euler_to_quat, quat_mul, quat_rotate
+from poise.spatial import euler_to_quat, quat_mul, quat_rotate, rotvec_to_quat, unwrap_quats
 
 #: name, parent, offset from the parent (m) of the middle and the left; the right is mirrored.
 _MIDDLE = (("Hips", "", (0, 0, 0)), ("Spine", "Hips", (0, 0, 0.12)), ("Chest", "Spine", (0, 0, 0.2)))
@@ -78,3 +78,10 @@ def swing(
     path = path - path[:1]
     path[:, 2] = 0.9 * scale
     return Clip(skeleton, path.numpy(), rot.numpy(), fps, name, cyclic)
+
+
+def trembling(clip: Clip, rad: float = 0.06, seed: int = 0) -> Clip:
+    """The clip with white noise of deviation `rad` about the axes of all its joints."""
+    turn = rad * np.random.default_rng(seed).standard_normal((clip.frames, len(clip.skeleton), 3))
+    rot = quat_mul(torch.tensor(clip.rot), rotvec_to_quat(torch.tensor(turn)))
+    return clip.replaced(rot=unwrap_quats(rot).numpy())

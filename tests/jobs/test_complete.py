@@ -20,11 +20,12 @@ from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.direction import Direction, Weight, direction_of, rows_of
 from poise.jobs.tracker import Tracker
+from poise.kin import without_noise
 from poise.kin.directed import Pin, TouchPoint, directed, pinned
 from poise.motion import Clip, write_clip
 from poise.plan import LookaheadConfig
 from poise.synth.retime import Retiming, retimed
-from toy_human import swing
+from toy_human import swing, trembling
 from toy_policy import walk
 
 FEW = LookaheadConfig(candidates=12, smoothing=(0.0, 0.5))
@@ -243,3 +244,26 @@ def test_a_config_keeps_its_own_lookahead(tracker: Tracker) -> None:
     config = TrackConfig(lookahead=FEW, controller="policy")
     done = complete(swing(1.0), (0, 29), tracker, replace(config, threads=1), adapt=0)
     assert done.tracked.controller == "policy"
+
+
+def test_a_tremble_is_taken_off_before_keyframes_are_filled_between(
+    tracker: Tracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Clip] = []
+
+    def caught(clip: Clip, *_: object, **__: object) -> None:
+        seen.append(clip)
+        raise PoiseError("enough")
+
+    monkeypatch.setattr(completing, "inbetween", caught)
+    clip = trembling(swing(4.0, speed=0.5))
+    poses = clip.replaced(rot=clip.rot[np.arange(clip.frames) // 15 * 15])
+    for one in (clip, poses, clip.replaced(skeleton=clip.skeleton.with_source(raw=True))):
+        with pytest.raises(PoiseError, match="enough"):
+            complete(one, (0, 30, 60, 90), tracker)
+    calm, cleaned = without_noise(clip)
+    np.testing.assert_array_equal(seen[0].rot, calm.rot)
+    assert seen[0].skeleton.source.raw and cleaned.noise
+    # Poses that are held between keyframes are no noise, and what is raw stays.
+    np.testing.assert_array_equal(seen[1].rot, poses.rot)
+    np.testing.assert_array_equal(seen[2].rot, clip.rot)

@@ -21,7 +21,8 @@ from poise.kin import Kinematics, fit_humanoid
 from poise.kin.coords import clip_to_qpos
 from poise.kin.feet.contact import stance_heights
 from poise.motion import Clip, shifted, write_clip
-from toy_human import human, swing
+from poise.motion.spectrum import white_mm
+from toy_human import human, swing, trembling
 
 
 def write(folder: Path, name: str, clip: Clip) -> Path:
@@ -358,3 +359,16 @@ def test_onto_a_body_that_is_there_already(folder: Path) -> None:
     assert [r.geoms for r in grown.rows] == [r.geoms for r in body.table.rows]
     for new, old in zip(grown.rows, body.table.rows, strict=True):
         assert all(a <= c and b >= d for (a, b), (c, d) in zip(new.ranges, old.ranges, strict=True))
+
+
+def test_noise_of_a_file_is_taken_off_once(tmp_path: Path) -> None:
+    for k in range(2):
+        write(tmp_path, f"02/02_0{k}.bvh", trembling(swing(4.0, speed=0.5), seed=k))
+    library, report = library_of(tmp_path, human(1.1))
+    for note in report.clips:
+        (told,) = (s for s in note.repairs if "trembles" in s)
+        assert "mm from frame to frame: the tremble is taken off." in told
+    # Who learns from it does not judge again, and so changes nothing.
+    assert all(c.skeleton.source.raw for c in library)
+    assert not any(c.clean.noise for c in fit_humanoid(library)[2].clips)
+    assert all(white_mm(c.positions(), c.fps) < 3.0 for c in library)

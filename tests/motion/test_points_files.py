@@ -388,3 +388,71 @@ def test_pose2sim_keypoints_are_followed_within_centimetres(
     clip = fit_clip(points, FitConfig())
     assert (clip.frames, clip.fps, points.source.unit_m, points.source.up_axis) == (100, 60.0, 1.0, "Y")
     assert np.mean([np.nanmean(d) for d in fit_distances(points, clip).values()]) < limit
+
+
+@pytest.mark.parametrize("suffix", [".trc", ".csv", ".npz", ".c3d"])
+@pytest.mark.parametrize("gone", [np.nan, 0.0])
+def test_a_keypoint_that_is_missing_throughout_is_named_or_left_out(
+    tmp_path: Path, suffix: str, gone: float
+) -> None:
+    def read(*lost: str) -> Clip:
+        positions = walking(40)
+        positions[:, [NAMES.index(name) for name in lost]] = gone
+        path = tmp_path / f"x{suffix}"
+        if suffix == ".trc":
+            path.write_text(trc_text(positions))
+        elif suffix == ".c3d":
+            write_c3d(path, positions * 1000, NAMES)
+        elif suffix == ".npz":
+            np.savez(path, positions=positions, names=np.array(NAMES), fps=30.0, unit_m=1.0, up_axis="Y")
+        else:
+            cells = [["" if np.isnan(v) else f"{v:.6f}" for v in row.ravel()] for row in positions]
+            head = ",".join(f"{n}_{a}" for n in NAMES for a in "xyz")
+            rows = "\n".join(",".join(row) for row in cells)
+            path.write_text(f"# unit = m, up = Y, fps = 30\n{head}\n{rows}\n")
+        return read_clip(path)
+
+    whole = read()
+    for lost, said in (
+        (
+            ("LKnee",),
+            r"keypoint 'LKnee' is missing in every frame, and nothing else shows the left knee",
+        ),
+        (
+            ("RHip", "Nose"),
+            r"keypoint 'RHip' is missing in every frame, .* shows the right hip\. Track ",
+        ),
+        (
+            ("LWrist", "LElbow"),
+            r"keypoints 'LElbow', 'LWrist' are missing .* the left elbow, left wrist",
+        ),
+    ):
+        with pytest.raises(PoiseError, match=said):
+            read(*lost)
+    few = read("Nose", "LBigToe")
+    assert "Missing in every frame and left out: LBigToe, Nose" in notes(few)
+    # Arms and legs are where they were.
+    for joint in ("LeftHand", "RightFoot", "LeftFoot"):
+        a, b = (c.positions()[:, c.skeleton.index(joint)] for c in (whole, few))
+        assert np.abs(a - b).max() < 2e-3, joint
+
+
+def test_a_marker_that_is_missing_throughout_is_estimated_from_the_others(data_dir: Path) -> None:
+    raw = trc_points(data_dir / f"{POSE2SIM}_filt_butterworth_LSTM.trc")
+    points = assemble_points(raw, ReadOptions())
+    keep = [k for k, n in enumerate(points.names) if n.endswith("_study")]
+    names, positions = tuple(points.names[k] for k in keep), points.positions[:, keep]
+    whole = fit_clip(points.replaced(names=names, positions=positions))
+
+    def without(name: str) -> Clip:
+        some = np.array(positions)
+        some[:, names.index(name)] = np.nan
+        return fit_clip(points.replaced(names=names, positions=some))
+
+    made = without("L_mknee_study")
+    assert "Missing in every frame and left out: L_mknee_study" in notes(made)
+    assert "Only outer markers show the left knee" in notes(made)
+    a, b = (c.positions()[:, c.skeleton.index("LeftLeg")] for c in (whole, made))
+    assert np.linalg.norm(a - b, axis=-1).mean() < 0.025
+    with pytest.raises(PoiseError, match=r"'L_shoulder_study' is missing .* shows the left shoulder"):
+        without("L_shoulder_study")

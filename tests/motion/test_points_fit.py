@@ -164,9 +164,9 @@ def test_noise_of_a_centimetre_is_taken_off_unless_the_file_is_to_stay() -> None
     assert any("smoothed" in note for note in filtered.skeleton.source.notes)
     told = "The keypoints tremble by 17 mm from frame to frame: the tremble is taken off"
     assert any(note.startswith(told) for note in calm.skeleton.source.notes)
-    ((kind, how, first, last, size),) = calm.skeleton.source.mended
+    ((kind, hz, first, last, size),) = calm.skeleton.source.mended
     # Three axes of 10 mm each.
-    assert (kind, how, first, last) == ("tremble", "from frame to frame", 0, 119)
+    assert (kind, hz, first, last) == ("tremble", "", 0, 119)
     assert size == pytest.approx(0.0173, rel=0.1)
     for clip in (rough, filtered, fit_clip(points)):
         assert not any("tremble" in note for note in clip.skeleton.source.notes)

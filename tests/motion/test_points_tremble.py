@@ -70,13 +70,17 @@ def test_white_noise_on_keypoints_is_taken_off_as_the_best_filter_does(truth: Cl
 def test_a_tremble_of_keypoints_is_told_and_taken_off(truth: Clip, hz: float) -> None:
     seen = shaken(truth, tone(truth, hz), 25.0)
     made = fit_clip(points_of(truth, seen))
-    ((_, how, _, _, size),) = made.skeleton.source.mended
-    assert abs(float(how.split()[1]) - hz) <= 0.1
+    ((_, told, _, _, size),) = made.skeleton.source.mended
+    assert abs(float(told) - hz) <= 0.1
     # 25 mm is the mean distance, whose square mean is a little more.
     assert 1e3 * size == pytest.approx(27.0, rel=0.25)
     assert off_mm(made.positions(), truth.positions()) < best_filter(seen, truth)
     (fault,) = (f for f in examine(made).faults if f.kind == "tremble")
-    assert (fault.joint, fault.detail) == ("", how) and fault.size == pytest.approx(1e3 * size)
+    assert (fault.joint, fault.detail) == (
+        "",
+        f"at {float(told):.1f} Hz",
+    ) and fault.size == pytest.approx(1e3 * size)
+    assert fault.hz == float(told) and fault.to_dict()["hz"] == fault.hz
 
 
 def test_what_the_user_states_goes_before_what_was_measured(truth: Clip) -> None:

@@ -15,10 +15,13 @@ from poise.errors import PoiseError
 from poise.eval import Nothing, run_episodes, start_frames
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate
+from poise.kin import without_noise
+from poise.learn import load_checkpoint, save_checkpoint
 from poise.motion import ClipLibrary, read_clip
 from poise.recipes import RECIPE, ResidualForce, build
 from poise.recipes.residual_force import config_of, most_help, schedule, task
-from toy_human import swing
+from poise.sim.mjcf import write_mjcf
+from toy_human import swing, trembling
 
 #: A setting, a value, and the term that this value brings in and that is not there by default.
 SETTINGS = [
@@ -160,3 +163,30 @@ def test_the_default_takes_the_help_away_and_old_runs_keep_what_they_did():
     then = config_of({"method": "rfc-explicit"})
     assert (then.help_start, then.help_limit) == (None, 100.0) and schedule(then) is None
     assert config_of({"help_limit": 0.0, "help_start": 100.0}) == plain
+
+
+def test_what_is_learned_has_no_noise_in_any_joint_and_that_is_judged_once(tmp_path):
+    clip = swing(4.0, speed=0.5)
+    shaken = trembling(clip)
+    calm, noise = without_noise(shaken)
+    made = build(shaken, ResidualForce(num_envs=2))
+    # Joints without a body ride along in what is delivered: they are those of the calm clip.
+    torch.testing.assert_close(torch.tensor(made.library.clips[0].rot), torch.tensor(calm.rot))
+    assert made.report.clips[0].clean.noise == noise.noise and noise.noise
+    # A body of one's own sees the motion without the noise of the skeleton that came in.
+    path = tmp_path / "body.xml"
+    write_mjcf(made.humanoid, path)
+    there = build(shaken, ResidualForce(num_envs=2, body=BodyConfig(mjcf=str(path))))
+    assert there.report.clips[0].clean.noise == noise.noise
+    # By the user's word all stays as it is.
+    raw = shaken.replaced(skeleton=shaken.skeleton.with_source(raw=True))
+    assert build(raw, ResidualForce(num_envs=2)).library.clips[0] is raw
+    # That is another run, but for a run of a version that did not know the word.
+    folder, library = tmp_path / "run", ClipLibrary.of([shaken])
+    begin(folder, library, ResidualForce(num_envs=2))
+    with pytest.raises(PoiseError, match="holds a run of other clips"):
+        begin(folder, ClipLibrary.of([raw]), ResidualForce(num_envs=2))
+    tensors, meta = load_checkpoint(folder / "run.safetensors")
+    del meta["clips"][0]["source"]["raw"]
+    save_checkpoint(folder / "run.safetensors", tensors, meta)
+    begin(folder, ClipLibrary.of([raw]), ResidualForce(num_envs=2))

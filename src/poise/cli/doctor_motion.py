@@ -62,7 +62,7 @@ def run_on(path: Path, options: Options) -> Answer:
     if target is None:
         return Answer(facts, notes=told, said=told, outcome=outcome)
     free = {"auto": None, "keep": False, "mend": True}[options.path]
-    healed = heal(clip, free) if fix else clip
+    healed = heal(clip, free, found) if fix else clip
     moved = _root_moved(clip, healed)
     if moved is not None and moved["max_mm"] >= TOLD_MM:
         again = (

@@ -35,7 +35,7 @@ class Options:
     """Characters in one world, 1 to 16; by default one for each file."""
     buffer: Annotated[float, arg(metavar="SECONDS")] = 0.1
     """How far behind the stream characters are, 0 to 0.4; more than 0.05 is known ahead, and 0
-    extrapolates the motion. Motion that trembles is smoothed, 0.033 later."""
+    extrapolates the motion. Motion that trembles is smoothed, 0.033 s later."""
     lookahead: Annotated[int, arg(metavar="N")] = 0
     """How many characters look ahead before they act; each costs about half a core."""
     noise: Annotated[float, arg(metavar="0-1")] = 0.0

@@ -26,6 +26,7 @@ from poise.jobs.track.direction import Weight
 from poise.jobs.track.in_place import InPlace, with_travel
 from poise.jobs.track.story import story
 from poise.jobs.tracker import Tracker
+from poise.kin import without_noise
 from poise.kin.rate.judge import judge_rate
 from poise.learn.model import InbetweenModel
 from poise.motion import Clip
@@ -54,7 +55,7 @@ class Completed(Result):
     """What came of keyframes.
 
     Attributes:
-        source: what came in, on the times that were asked for.
+        source: what came in, without a tremble, on the times that were asked for.
         keyframes: frames that are kept, as they were asked for.
         filled: the kinematic stage, on the times of the result.
         tracked: the physical stage.
@@ -164,7 +165,7 @@ def complete(
         config = replace(config, lookahead=replace(LookaheadConfig().with_budget(BUDGET), slack=SLACK))
     if retime and config.retake is not None:
         raise PoiseError("a range has the times of the earlier result", hint="Leave --retime out")
-    source = clip_of(clip)
+    source, said = _calm(clip_of(clip))
     # What is filled or retimed keeps the clip's time only where neither is asked for.
     timed_anew = retime or times is not None
     travel = with_travel(source, config.in_place, repeats=False, returns=not timed_anew)
@@ -203,11 +204,11 @@ def complete(
         tracked = track(
             filled.clip, tracker, replace(how, direction=direction), progress=progress, warn=warn
         )
-        if doubt is not None and doubt not in tracked.notes:
-            tracked = replace(tracked, notes=(doubt, *tracked.notes))
+        more_said = (*said, *(() if doubt is None or doubt in tracked.notes else (doubt,)))
+        tracked = replace(tracked, notes=(*more_said, *tracked.notes))
         done = _completed(source, keys, filled, tracked, at, factors)
-        said = done.retiming and replace(done.retiming, called=asked)
-        done = replace(done, keyframes=asked, retiming=said)
+        retiming = done.retiming and replace(done.retiming, called=asked)
+        done = replace(done, keyframes=asked, retiming=retiming)
         # As attempts are compared everywhere, but that keyframes are to be met and not all frames alike.
         merit = tracked.merit._replace(error=-float(np.mean(done.met_mm)))
         if best is None or merit > best[0]:
@@ -218,6 +219,18 @@ def complete(
         factors = np.where(slow, LONGER * factors, factors)
     assert best is not None
     return best[1] if travel is None else _as_it_came(best[1], travel)
+
+
+def _calm(clip: Clip) -> tuple[Clip, tuple[str, ...]]:
+    """The clip without a tremble, keyframes too, and that in words.
+
+    Where it does not tremble it stays as it is: frames between keyframes that are held, or anything, are
+    no noise. Otherwise its noise has been judged, and what is filled in is not judged again.
+    """
+    calm, cleaned = without_noise(clip)
+    if not any(f.kind == "tremble" for f in cleaned.noise):
+        return clip, ()
+    return calm.replaced(skeleton=calm.skeleton.with_source(raw=True)), tuple(cleaned.noise_sentences())
 
 
 def _as_it_came(done: Completed, travel: InPlace) -> Completed:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -195,11 +195,19 @@ def held_run(
         what = f"the folder holds a run on the library {file.meta.get('source') or 'of a program'}"
         raise PoiseError(what, folder, "Give that library, or choose another folder")
     clips = file.meta["clips"]
-    if library is not None and clips != json.loads(json.dumps(pack_clips(library.clips)[1])):
+    if library is not None and clips != _as_known(clips, library):
         more = f" and {len(clips) - 6} more" if len(clips) > 6 else ""
         what = f"the folder holds a run of other clips ({', '.join(c['name'] for c in clips[:6])}{more})"
         raise PoiseError(what, folder, "Give those clips, or choose another folder")
     return file
+
+
+def _as_known(clips: Sequence[Mapping[str, Any]], library: ClipLibrary) -> list[dict[str, Any]]:
+    """The library packed as `clips` are: a run of an older version knew fewer fields of a source."""
+    here: list[dict[str, Any]] = json.loads(json.dumps(pack_clips(library.clips)[1]))
+    for old, new in zip(clips, here, strict=False):
+        new["source"] = {k: v for k, v in new["source"].items() if k in old["source"]}
+    return here
 
 
 def write_run(

@@ -16,7 +16,7 @@ from poise.body.table import BodyRow
 from poise.kin.cycle import Cycle
 from poise.kin.doctor.clean import CleanReport, clean_clip
 from poise.kin.ground import GroundFit
-from poise.kin.place import on_own_body, place_on_body
+from poise.kin.place import calm_library, on_own_body, place_on_body
 from poise.kin.rate.judge import RateJudgement, judge_rate
 from poise.motion import Clip, ClipLibrary, resample
 from poise.spatial import quat_between, quat_mul, quat_to_euler
@@ -112,6 +112,7 @@ def fit_humanoid(
     rate_hz: float = 30.0,
     table: BodyTable | None = None,
     widens: bool = True,
+    noise: Sequence[CleanReport] | None = None,
 ) -> tuple[Humanoid, list[np.ndarray], FitReport]:
     """A humanoid that can reach every frame of the library.
 
@@ -122,6 +123,7 @@ def fit_humanoid(
         table: a body on the library's skeleton that stays as it is but for its hinges' ranges and for
             pairs of bodies that never collide, both of which only grow; by default one is made.
         widens: whether ranges grow to hold the motion.
+        noise: what was taken off each clip already (`calm_library`); by default it is taken off here.
 
     Returns:
         the humanoid, one `qpos (T, 7 + hinges)` per clip at `rate_hz` standing on the floor, and a
@@ -129,10 +131,12 @@ def fit_humanoid(
     """
     library = ClipLibrary.of(library) if isinstance(library, Clip) else library
     config = config or BodyConfig()
+    if noise is None:
+        library, noise = calm_library(library)
     own = None
     if table is None:
         library, own = on_own_body(library, config)
-    repaired = [clean_clip(c) for c in library]
+    repaired = [clean_clip(c, raw=True) for c in library]
     clips = [resample(c, rate_hz) for c, _ in repaired]
     # A body that is there already keeps its hinges as they are.
     table = table or own or _choose_orders(generate_table(clips[0].skeleton, config, clips), clips)
@@ -145,8 +149,15 @@ def fit_humanoid(
         table = replace(table, contact_exclusions=table.contact_exclusions + overlaps)
         humanoid = make_humanoid(clips[0].skeleton, table)
     fits = (
-        ClipFit(c.name, judge_rate(c, table), found, p.cycle, p.ground, p.joint_error_mm)
-        for c, (_, found), p in zip(library, repaired, placed, strict=True)
+        ClipFit(
+            c.name,
+            judge_rate(c, table),
+            replace(found, noise=n.noise),
+            p.cycle,
+            p.ground,
+            p.joint_error_mm,
+        )
+        for c, (_, found), n, p in zip(library, repaired, noise, placed, strict=True)
     )
     return humanoid, motions, FitReport(tuple(fits), widened, overlaps)
 

@@ -107,6 +107,13 @@ def place_on_body(
     return OnBody(moved, made, qpos, retargeting, cleaned, turned, ground, cycle, error)
 
 
+def calm_library(library: ClipLibrary) -> tuple[ClipLibrary, list[CleanReport]]:
+    """The clips without their noise, which is judged once, on the skeleton that came in, so that joints
+    without a body lose it too (`without_noise`); and what was taken off each."""
+    calm = [without_noise(clip) for clip in library]
+    return replace(library, clips=tuple(clip for clip, _ in calm)), [noise for _, noise in calm]
+
+
 def on_own_body(library: ClipLibrary, config: BodyConfig) -> tuple[ClipLibrary, BodyTable | None]:
     """The clips on the skeleton of `config.mjcf` and its table; without such a file all as it is.
 
@@ -123,12 +130,8 @@ def on_own_body(library: ClipLibrary, config: BodyConfig) -> tuple[ClipLibrary, 
     first = library.clips[0]
     if first.skeleton.names == own.skeleton.names:
         return library, table
-    moved = [retarget(c, own.skeleton, example=first)[0] for c in library]
-    kept = tuple(
-        m.replaced(skeleton=m.skeleton.with_source(raw=True)) if c.skeleton.source.raw else m
-        for m, c in zip(moved, library, strict=True)
-    )
-    return replace(library, clips=kept), table
+    moved = tuple(retarget(c, own.skeleton, example=first)[0] for c in library)
+    return replace(library, clips=moved), table
 
 
 def joint_error(clip: Clip, qpos: np.ndarray, table: BodyTable) -> float:

@@ -47,11 +47,11 @@ class Source:
     evidence: ("unit", sentence) pairs, why a value is what it is: unit, up, fps.
     mended: (kind, joint, first frame, last frame, size) of what the reader had to mend: "bone drift" m,
         "quaternion length" (distance from 1), "rest frame" (frames dropped), "tremble" m of keypoints
-        (with "at 5.0 Hz" or the like for the joint); last frame -1 is the end.
+        (with its frequency, such as "5.0333", or "" for the joint); last frame -1 is the end.
     rates: where neither the file nor the user states a frame rate, those that such files have, frames/s;
         the first was taken.
-    raw: by the user's word the motion is followed as its file has it: neither a tremble is taken off nor
-        are joints that were lost filled in.
+    raw: the motion is followed as it is, by the user's word or as its noise was judged: no tremble is
+        taken off, and joints that were lost are not filled in.
     """
 
     format: str = "poise"

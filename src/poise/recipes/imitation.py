@@ -15,7 +15,7 @@ from poise.env import ImitationEnv, Reference, TaskConfig
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
 from poise.kin import FitReport, fit_humanoid
-from poise.kin.place import on_own_body
+from poise.kin.place import calm_library, on_own_body
 from poise.kin.rate.reading import read_clip
 from poise.learn import Amp, AmpConfig, LessonConfig, PPOConfig, Trainer, VecEnv, WarmStart
 from poise.learn.parallel import ALONE, Comm, rank_seed, share_of
@@ -60,12 +60,13 @@ def as_library(clips: Clips) -> ClipLibrary:
 def fitted(
     clips: Clips, body: BodyConfig, rate_hz: float, table: BodyTable | None = None, widens: bool = True
 ) -> tuple[ClipLibrary, Humanoid, Reference, FitReport]:
-    """Clips on the skeleton of their body, the body, their reference, and what fitting did.
+    """Clips without noise on the skeleton of their body, the body, its reference, and what fitting did.
 
     table, widens: see `fit_humanoid`; by default a body is made, or is that of `body.mjcf`.
     """
-    library, own = on_own_body(as_library(clips), body)
-    humanoid, motions, report = fit_humanoid(library, body, rate_hz, table or own, widens)
+    calm, noise = calm_library(as_library(clips))
+    library, own = on_own_body(calm, body)
+    humanoid, motions, report = fit_humanoid(library, body, rate_hz, table or own, widens, noise)
     return library, humanoid, Reference(humanoid, motions, rate_hz, library.names, report.cyclic), report
 
 

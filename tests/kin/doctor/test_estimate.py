@@ -13,8 +13,12 @@ from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
 from poise.kin import examine, heal
-from poise.kin.doctor.estimate import denoise, find_lost, refill
+from poise.kin.doctor import clean
+from poise.kin.doctor.clean import clean_clip
+from poise.kin.doctor.estimate import denoise, find_lost, noise_faults, refill
 from poise.motion import Clip, read_clip
+from poise.motion.keypoints import Keypoints
+from poise.motion.points import fit_clip
 from poise.motion.smoothing import filled
 from poise.motion.spectrum import Spectrum, white_mm
 from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
@@ -213,6 +217,39 @@ def test_feet_that_trembled_stand_again(walk: Clip) -> None:
     assert before is not None and after is not None and after < before + 20.0
 
 
+@pytest.mark.parametrize("mm", [10.0, 50.0])
+def test_feet_of_trembling_keypoints_stand_again(walk: Clip, mm: float) -> None:
+    truth = fit_clip(Keypoints(walk.skeleton.names, walk.positions(), walk.fps))
+    rng = np.random.default_rng(0)
+    off = rng.standard_normal((*truth.rot.shape[:2], 3))
+    places = truth.positions() + mm / 1e3 * off / np.linalg.norm(off, axis=-1).mean()
+    fitted = fit_clip(Keypoints(truth.skeleton.names, places, truth.fps))
+    healed = heal(fitted)
+    # The points were freed of noise: no joint of the bones between them is lost.
+    assert [f for f in noise_faults(fitted)[0] if f.kind != "tremble"] == []
+    assert off_mm(healed, truth) < 1.3 * off_mm(fitted, truth)
+    before, loose, after = (_ankle_slide(c, truth) for c in (truth, fitted, healed))
+    assert after < before + 20.0 and after - before < 0.3 * (loose - before)
+
+
+def _ankle_slide(clip: Clip, truth: Clip) -> float:
+    """mm/s of ankles and toes that stand in truth."""
+    feet = [j for j, n in enumerate(truth.skeleton.names) if "Foot" in n or "Toe" in n]
+    path, there = clip.positions()[:, feet], truth.positions()[:, feet]
+    stands = np.linalg.norm(np.diff(there, axis=0), axis=-1) * truth.fps < 0.1
+    stands &= there[1:, :, 2] < there[..., 2].min(0) + 0.05
+    speed = np.linalg.norm(np.diff(path[..., :2], axis=0), axis=-1) * clip.fps
+    return 1e3 * float(speed[stands].mean())
+
+
+def test_a_foot_that_trembles_little_keeps_its_roll(walk: Clip) -> None:
+    broken = dirty(walk, 10.0, white)
+    held, loose = heal(broken), clean_clip(broken, rougher=False)[0]
+    assert off_mm(held, walk) < 1.1 * off_mm(loose, walk)
+    before, after = (_ankle_slide(c, walk) for c in (walk, held))
+    assert after < before + 20.0
+
+
 def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:
     rng = np.random.default_rng(0)
     rot = rng.standard_normal(walk.rot.shape)
@@ -220,3 +257,58 @@ def test_frames_that_jump_about_are_no_motion(walk: Clip) -> None:
     nothing = walk.replaced(rot=rot, root_pos=rng.standard_normal((walk.frames, 3)))
     with pytest.raises(PoiseError, match="no motion to be told"):
         heal(nothing)
+
+
+def test_what_the_doctor_found_is_not_looked_for_again(
+    walk: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[Clip] = []
+
+    def counting(clip: Clip) -> Clip:
+        counted.append(clip)
+        return denoise(clip)
+
+    monkeypatch.setattr(clean, "denoise", counting)
+    broken = dirty(walk, 25.0, white)
+    found = examine(broken)
+    healed = heal(broken, found=found)
+    assert len(counted) == 1
+    by_itself = heal(broken)
+    np.testing.assert_array_equal(healed.rot, by_itself.rot)
+    np.testing.assert_array_equal(healed.root_pos, by_itself.root_pos)
+    # What is known of another clip is not taken.
+    np.testing.assert_array_equal(heal(walk, found=found).rot, heal(walk).rot)
+
+
+def test_a_twist_that_the_next_joint_undoes_is_no_spike(walk: Clip) -> None:
+    skeleton, rot = walk.skeleton, torch.tensor(walk.rot)
+    arm, fore = skeleton.index("LeftArm"), skeleton.index("LeftForeArm")
+    hand = skeleton.index("LeftHand")
+    bone = torch.tensor(skeleton.offsets[fore] / np.linalg.norm(skeleton.offsets[fore]))
+    turned = rot.clone()
+    for frame in (20, 41, 60):
+        turned[frame, arm] = quat_mul(rot[frame, arm], rotvec_to_quat(1.2 * bone))
+        turned[frame, fore] = quat_mul(rotvec_to_quat(-1.2 * bone), rot[frame, fore])
+    twisted = walk.replaced(rot=unwrap_quats(turned).numpy())
+    np.testing.assert_allclose(twisted.positions(), walk.positions(), atol=1e-9)
+    assert not find_lost(twisted, unwrap_quats(turned).numpy())
+    assert np.abs(refill(twisted).positions() - walk.positions())[:, hand].max() < 1e-9
+    # The same leap of the arm alone is one.
+    leaping = turned.clone()
+    leaping[:, fore] = rot[:, fore]
+    alone = walk.replaced(rot=unwrap_quats(leaping).numpy())
+    lost = find_lost(alone, unwrap_quats(leaping).numpy())
+    assert {("spike", arm, t, t) for t in (20, 41, 60)} <= set(lost)
+
+
+def test_keypoints_that_were_cleaned_are_not_made_worse(data_dir: Path) -> None:
+    folder = data_dir / "noisy/pose2sim/single"
+    read, pair = (
+        read_clip(folder / f"S00_P00_T01_BalancingTrial_0-100{end}.trc")
+        for end in ("", "_filt_butterworth")
+    )
+    hand = read.skeleton.index("LeftHand")
+    there = pair.positions()[:, hand] - pair.root_pos
+    for clip in (read, heal(read)):
+        off = np.linalg.norm(clip.positions()[:, hand] - clip.root_pos - there, axis=-1)
+        assert 1e3 * off.mean() < 13.0 and 1e3 * off.max() < 130.0

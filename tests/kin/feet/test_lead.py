@@ -16,7 +16,7 @@ def test_the_banded_solution_is_that_of_the_plain_least_squares() -> None:
     ankle = torch.tensor(rng.normal(size=(frames, 3)))
     ends = ankle[:, None] + torch.tensor(rng.normal(size=(frames, 2, 3)))
     weight = rng.uniform(size=(frames - 1, 2))
-    shift, turn, tilt, _ = (x.numpy() for x in lead(Sole(ankle, ends), weight, fps))
+    shift, turn, tilt, _ = (x.numpy() for x in lead(Sole(ankle, ends), weight, fps)[:4])
     length = float(np.linalg.norm((ends[0, 1] - ends[0, 0]).numpy()))
     rows, want = [], []
     arm = (ends - ankle[:, None]).numpy()[..., :2]
@@ -76,3 +76,24 @@ def test_a_rocking_foot_is_laid_flat() -> None:
     # Positive tilt about the axis raises the toe.
     turned = quat_rotate(axis_angle_to_quat(one.axis, one.tilt), toe)
     assert float(torch.diff(turned[:, 2]).abs().max()) < 2e-4
+
+
+def test_an_ankle_that_bears_keeps_the_foot_from_rolling() -> None:
+    frames, fps = 61, 30.0
+    angle = 0.1 * torch.sin(torch.linspace(0.0, 12.0, frames, dtype=torch.float64))
+    along = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(frames, 3)
+    turn = axis_angle_to_quat(along, angle)
+    rest = torch.tensor([[-0.05, 0.0, -0.08], [0.15, 0.0, -0.08]], dtype=torch.float64)
+    ends = quat_rotate(turn[:, None].expand(frames, 2, 4), rest.expand(frames, 2, 3))
+    # It rolls about the line of its sole, which stays: the ankle sways.
+    middle = ends.mean(1) - rest.mean(0)
+    sole = Sole(-middle, ends - middle[:, None])
+    weight = np.full((frames - 1, 2), 100.0)
+    sway = (sole.ankle[:, 1].amax() - sole.ankle[:, 1].amin()).item()
+    assert sway > 0.015
+    loose, held = (lead(sole, weight, fps, flat=flat) for flat in (None, weight[:, 0]))
+    assert loose.roll is None and float(loose.shift.abs().max()) < 1e-3
+    assert held.roll is not None
+    left = sole.ankle + held.shift
+    assert float(left[:, 1].amax() - left[:, 1].amin()) < 0.1 * sway
+    torch.testing.assert_close(held.roll - held.roll.mean(), -(angle - angle.mean()), atol=0.02, rtol=0)

@@ -298,8 +298,10 @@ def _alone(
         if stop - first < _least(clip, config):
             return None, note
         clip = trim(clip, first, stop)
-    # The floor is known now, so that a part of a clip in which no foot stands is not set down anew.
-    made = clip.replaced(skeleton=target.skeleton.with_source(ground_m=0.0), name=note.name)
+    # The floor is known now, so that a part of a clip in which no foot stands is not set down anew, and
+    # its noise was judged as the file has it.
+    source = target.skeleton.with_source(ground_m=0.0, raw=True)
+    made = clip.replaced(skeleton=source, name=note.name)
     kept = ((begins + first) / clip.fps, (begins + stop - 1) / clip.fps)
     state = "cut" if note.rule else "kept"
     return made, replace(note, state=state, kept_s=kept, frames=stop - first)

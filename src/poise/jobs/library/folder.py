@@ -42,7 +42,7 @@ from poise.motion.mirror import mirrored_clip
 from poise.motion.pack import pack_clips, unpack_clips
 
 #: Grows whenever the same files and settings would give other clips.
-VERSION = 3
+VERSION = 4
 
 
 class Split(NamedTuple):

@@ -30,12 +30,11 @@ class BesideRaw:
     @property
     def figures(self) -> dict[str, float]:
         """The score card's `raw`."""
-        words = self.noise.detail.split()
         return {
             "mpjpe_mm": self.mpjpe_mm,
             "mpjpe_global_mm": self.mpjpe_global_mm,
             "noise_mm": self.noise.size,
-            "noise_hz": float(words[1]) if words[-1:] == ["Hz"] else math.nan,
+            "noise_hz": math.nan if self.noise.hz is None else self.noise.hz,
         }
 
     def sentence(self) -> str:

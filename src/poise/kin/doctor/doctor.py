@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,9 @@ from poise.kin.doctor.faults import KINDS, Fault, by_kind, read_faults, spell_fa
 from poise.kin.doctor.jitter import jitter_faults, mend_jitter
 from poise.kin.doctor.sides import exchanged_sides
 from poise.kin.doctor.slides import drifts, mend_path, mend_slides
+from poise.kin.doctor.stance import steadied
 from poise.kin.doctor.support import Support, anatomy_of, height_faults, slide_faults, support_of
 from poise.kin.doctor.timing import body_steps, mend_holds, mend_teleports, timing_faults
-from poise.kin.feet.hold import FIRM
 from poise.kin.hinges import chain_angles
 from poise.kin.loops import best_period, overlap_of, repeated
 from poise.kin.rate.judge import judge_rate
@@ -33,9 +34,8 @@ from poise.motion import Clip
 BEYOND_DEG, LASTING_S = 45.0, 0.1
 #: How often feet are locked: a leg that is led back changes what its sole does.
 SLIDE_ROUNDS = 3
-#: Feet that trembled are held from this share of a slide on, and may roll as feet do (see `Standing`);
-#: the clip stays as high as it is up to this (m).
-SHAKEN, SHAKEN_FIRM, UNSURE_M = 0.5, 0.3, 0.06
+#: The same of feet that trembled (`steadied`); the clip stays as high as it is up to this (m).
+SHAKEN_ROUNDS, UNSURE_M = 2, 0.06
 #: Periods of a loop that are mended, of which one is taken.
 HEALED = 3
 
@@ -48,12 +48,14 @@ READ_ONLY = ("bone drift", "quaternion length", "rest frame", "limit")
 class Examination:
     """What was found in a clip. figures: numbers to compare before and after a repair, None where
     they cannot be told. judged: whether the body could be told, so that feet and joints were judged.
-    travel: what was taken out of a clip in place; its feet are judged with it."""
+    travel: what was taken out of a clip in place; its feet are judged with it. cleaned: the clip and
+    what `clean_clip` makes of it, from which `heal` goes on."""
 
     faults: tuple[Fault, ...]
     figures: dict[str, float | None]
     judged: bool
     travel: Travel | None = None
+    cleaned: tuple[Clip, Clip, CleanReport] | None = field(default=None, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers."""
@@ -93,24 +95,25 @@ def examine(clip: Clip) -> Examination:
         hint = "the joints named left lie on the body's right; --swap-sides exchanges the names"
         faults.append(Fault("sides", "", 0, clip.frames - 1, 1.0, hint))
     ordered = [f for group in by_kind(faults).values() for f in group]
-    return Examination(tuple(ordered), _figures(clip, support), support is not None, travel)
+    known = (clip, cleaned, report)
+    return Examination(tuple(ordered), _figures(clip, support), support is not None, travel, known)
 
 
-def heal(clip: Clip, path: bool | None = None) -> Clip:
+def heal(clip: Clip, path: bool | None = None, found: Examination | None = None) -> Clip:
     """The clip with everything mended that kinematics can mend; a clean clip comes back as it is.
 
     In this order: repeated frames, root teleports, joints that were lost, flips, speeds and noise
     (`clean_clip`), jitter in spells, a drifting height, the height above the floor, sliding feet. A step
     changes nothing if its faults are not there. path: whether the root's path is freed of the slip that
     standing feet have in common, or legs alone hold them; None frees it where both feet tell the same
-    drift (`drifts`).
+    drift (`drifts`). found: what `examine` says of the clip, where that is known already.
 
     A clip in place is mended with its travel, and comes back in place, a loop as a loop.
     """
     anatomy = anatomy_of(clip)
     support = support_of(clip, anatomy)
     if support is None or support.travel is None:
-        return _healed(clip, anatomy, path)
+        return _healed(clip, anatomy, path, found, support)
     travel, overlap = support.travel.level, overlap_of(clip)
     if overlap is None:
         moving = travelled(clip, travel)
@@ -127,24 +130,47 @@ def heal(clip: Clip, path: bool | None = None) -> Clip:
     return best_period(in_place(healed, travel), period, overlap, first=1).replaced(cyclic=clip.cyclic)
 
 
-def _healed(clip: Clip, anatomy: Anatomy, path: bool | None) -> Clip:
+def _supports(anatomy: Anatomy, clip: Clip, support: Support | None) -> Callable[[Clip], Support | None]:
+    """`support_of`, which knows that of the last clip: a step that changes nothing gives it back."""
+    last = [(clip, support)]
+
+    def of(clip: Clip) -> Support | None:
+        if last[0][0] is not clip:
+            last[0] = clip, support_of(clip, anatomy)
+        return last[0][1]
+
+    return of
+
+
+def _healed(
+    clip: Clip,
+    anatomy: Anatomy,
+    path: bool | None,
+    found: Examination | None = None,
+    known: Support | None = None,
+) -> Clip:
+    of = _supports(anatomy, clip, support_of(clip, anatomy) if known is None else known)
     clip = mend_holds(clip)
-    support = support_of(clip, anatomy)
+    support = of(clip)
     low = None if support is None else support.low.min(-1)
     clip = mend_teleports(clip, low)
-    clip, report = clean_clip(clip, anatomy, rougher=False)
+    if found is not None and found.cleaned is not None and found.cleaned[0] is clip:
+        _, clip, report = found.cleaned
+    else:
+        clip, report = clean_clip(clip, anatomy, rougher=False)
     clip = mend_jitter(clip)
     if support is None:
         return clip
-    support = support_of(clip, anatomy)
+    support = of(clip)
     clip = clip if support is None else mend_drift(clip, support.sole_low)
     # Feet that trembled still do a little where they stand; noise hides how high the floor is.
-    shaken = any(f.kind == "tremble" for f in report.noise)
-    support = support_of(clip, anatomy)
-    if support is not None and (not report.noise or abs(support.off_m) > UNSURE_M):
+    noise = [*report.noise, *(f for f in read_faults(clip) if f.kind == "tremble")]
+    shaken = any(f.kind == "tremble" for f in noise)
+    support = of(clip)
+    if support is not None and (not noise or abs(support.off_m) > UNSURE_M):
         clip = set_on_floor(clip, support)
-    clip = _locked(clip, anatomy, path, shaken)
-    support = support_of(clip, anatomy)
+    clip = _locked(clip, of, path, shaken)
+    support = of(clip)
     return clip if support is None else set_on_floor(clip, support, whole=False)
 
 
@@ -171,17 +197,20 @@ def set_on_floor(clip: Clip, support: Support, whole: bool = True) -> Clip:
     return clip.replaced(root_pos=clip.root_pos + lift[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def _locked(clip: Clip, anatomy: Anatomy, path: bool | None, shaken: bool) -> Clip:
-    """The clip without sliding feet. path: see `heal`. shaken: whether they trembled."""
+def _locked(clip: Clip, of: Callable[[Clip], Support | None], path: bool | None, shaken: bool) -> Clip:
+    """The clip without sliding feet. of: see `_supports`. path: see `heal`. shaken: whether they
+    trembled."""
     for step in range(1 + SLIDE_ROUNDS):
-        support = support_of(clip, anatomy)
-        faults = slide_faults(clip, support, SHAKEN if shaken else 1.0) if support is not None else []
-        if support is None or not faults:
+        support = of(clip)
+        if support is None:
             return clip
-        if step > 0:
-            clip = mend_slides(clip, support, faults, SHAKEN_FIRM if shaken else FIRM)
-        elif drifts(support) if path is None else path:
+        faults = slide_faults(clip, support)
+        if step == 0 and faults and (drifts(support) if path is None else path):
             clip = mend_path(clip, support, faults)
+        elif step > 0 and shaken and step <= SHAKEN_ROUNDS:
+            clip = steadied(clip, support)
+        elif step > 0 and not shaken and faults:
+            clip = mend_slides(clip, support, faults)
     return clip
 
 

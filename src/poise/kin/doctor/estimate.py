@@ -19,7 +19,7 @@ from poise.kin.series import find_runs
 from poise.motion import Clip, Skeleton
 from poise.motion.points.clean import drop_spikes
 from poise.motion.skeleton import posed
-from poise.motion.smoothing import faded, filled, pieces, smoothed, spline, tremble_of
+from poise.motion.smoothing import faded, filled, pieces, smoothed, tremble_of
 from poise.motion.spectrum import LINES, SHORTEST, WHITE_MM, Spectrum, white_mm
 from poise.spatial import (
     normalize,
@@ -38,6 +38,8 @@ HELD_S, LEAPS, LEAP_RAD = 0.08, 3.0, 0.03
 #: How far a spike turns its joint (rad) and moves the end of what hangs on it (m) at least: ankles and
 #: toes snap by nearly as much in kicks and dashes.
 SPIKE_RAD, SPIKE_M = 0.35, 0.06
+#: Without a spike the places of what hangs on its joint are smoother by this factor at least.
+CALMER = 0.7
 #: Smaller spikes are told as well if this share of all joints and frames leaps for certain: so many
 #: times the usual roughness, this angle (rad) at least, in so many rounds.
 MANY_SPIKES, SMALL_TIMES, SMALL_RAD, SPIKE_ROUNDS = 1e-3, 5.0, 0.02, 3
@@ -49,18 +51,26 @@ NOTHING_MM = 300.0
 REPEATED = 1e-4
 
 
-def refill(clip: Clip, found: Sequence[tuple[str, int, int, int]] | None = None) -> Clip:
+Lost = tuple[str, int, int, int]
+"""Kind, joint, first and last frame, see `find_lost`."""
+
+
+def refill(clip: Clip, found: Sequence[Lost] | None = None) -> Clip:
     """The clip with every joint that was lost on the smoothest curve through its other frames; one that
     lost none comes back as it is. found: what `find_lost` says, which is asked where it is not given."""
     rot = _continuous(clip.rot)
-    lost = np.zeros(rot.shape[:2], dtype=bool)
-    for _, j, a, b in find_lost(clip, rot) if found is None else found:
+    found = find_lost(clip, rot) if found is None else found
+    return clip if not found else clip.replaced(rot=_filled(rot, found, clip.fps))
+
+
+def _filled(rot: np.ndarray, found: Sequence[Lost], fps: float) -> np.ndarray:
+    """Rotations `(T, J, 4)` with those that were lost on the smoothest curve through the others."""
+    rot, lost = rot.copy(), np.zeros(rot.shape[:2], dtype=bool)
+    for _, j, a, b in found:
         lost[a : b + 1, j] = True
-    if not lost.any():
-        return clip
     for j in np.flatnonzero(lost.any(0)):
-        rot[:, j] = filled(rot[:, j], ~lost[:, j], clip.fps)
-    return clip.replaced(rot=rot / np.linalg.norm(rot, axis=-1, keepdims=True))
+        rot[:, j] = filled(rot[:, j], ~lost[:, j], fps)
+    return rot / np.linalg.norm(rot, axis=-1, keepdims=True)
 
 
 def denoise(clip: Clip) -> Clip:
@@ -103,7 +113,10 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
     if clip.frames < SHORTEST:
         return [], clip
     rot = _continuous(clip.rot)
-    lost = find_lost(clip, rot)
+    # Trembling keypoints lost their spikes as points. Bones that were fitted to them turn about each
+    # other, and one alone that is filled in would move what it carries.
+    fitted = any(kind == "tremble" for kind, *_ in clip.skeleton.source.mended)
+    lost = [] if fitted else find_lost(clip, rot)
     whole = refill(clip, lost)
     turned = np.degrees(quat_distance(torch.tensor(whole.rot), torch.tensor(clip.rot)).numpy())
     out = [
@@ -118,9 +131,9 @@ def noise_faults(clip: Clip) -> tuple[list[Fault], Clip]:
         if hz is not None:
             found = Spectrum.of(places.reshape(len(places), -1), clip.fps, groups)
             size = 1e3 * math.sqrt(float(found.tone(hz)[0].mean()))
-            trembles.append(Fault("tremble", "", first, last, size, f"at {hz:.1f} Hz"))
+            trembles.append(Fault.tremble(first, last, size, hz))
         elif (white := white_mm(places, clip.fps)) >= WHITE_MM:
-            trembles.append(Fault("tremble", "", first, last, white, "from frame to frame"))
+            trembles.append(Fault.tremble(first, last, white, None))
     if trembles:
         worst = max(trembles, key=lambda f: f.size)
         out.append(replace(worst, start=trembles[0].start, stop=trembles[-1].stop))
@@ -170,13 +183,13 @@ def _white_of(clip: Clip, root: np.ndarray, rot: np.ndarray) -> float:
     return white_mm(posed(clip.skeleton.parents, clip.skeleton.offsets, root, unit)[0], clip.fps)
 
 
-def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
+def find_lost(clip: Clip, rot: np.ndarray) -> list[Lost]:
     """(kind, joint, first, last frame) where joints were not seen as they were.
 
     A "spike" lasts a frame or two and turns the joint by `SPIKE_RAD` or more; a joint is "held" that
-    stands still and then leaps to where it has got. rot: `(T, J, 4)`, continuous in sign.
+    stands still and then leaps to where it has got. A spike that the next joints undo is none: what
+    hangs on it would leap without. rot: `(T, J, 4)`, continuous in sign.
     """
-    out: list[tuple[str, int, int, int]] = []
     spikes, lever = drop_spikes(rot, clip.fps)[1], _reach(clip.skeleton)
     sure = np.zeros_like(spikes)
     for j in np.flatnonzero(spikes.any(0)):
@@ -185,11 +198,12 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
         least = max(SPIKE_RAD, SPIKE_M / max(lever[j], 1e-3))
         for a, b in find_runs(spikes[:, j], 0):
             sure[a : b + 1, j] = turned[a : b + 1].max() >= least
-    if sure.mean() >= MANY_SPIKES:
-        sure |= _small_spikes(rot, sure, clip.fps)
-    out += [
-        ("spike", int(j), a, b) for j in np.flatnonzero(sure.any(0)) for a, b in find_runs(sure[:, j], 0)
-    ]
+    out = _leaping(clip, rot, sure)
+    if sum(b - a + 1 for _, _, a, b in out) >= MANY_SPIKES * sure.size:
+        sure[:] = False
+        for _, j, a, b in out:
+            sure[a : b + 1, j] = True
+        out = _leaping(clip, rot, sure | _small_spikes(rot, sure, clip.fps))
     still = (rot[1:] == rot[:-1]).all(-1)
     step, reach = np.linalg.norm(np.diff(rot, axis=0), axis=-1), max(3, round(0.2 * clip.fps))
     for j in np.flatnonzero(still.any(0) & ~still.all(0)):
@@ -201,6 +215,42 @@ def find_lost(clip: Clip, rot: np.ndarray) -> list[tuple[str, int, int, int]]:
             if len(near) and step[last + 1, j] > max(LEAPS * np.median(near), 0.5 * LEAP_RAD):
                 out.append(("held", int(j), first + 1, last + 1))
     return out
+
+
+def _leaping(clip: Clip, rot: np.ndarray, found: np.ndarray) -> list[Lost]:
+    """The spikes `found (T, J)` without which what hangs on their joints moves more smoothly, by fourth
+    differences.
+
+    Joints fitted to keypoints twist to and fro, a forearm back as far as its upper arm: no hand leaps.
+    """
+    spikes: list[Lost] = [
+        ("spike", int(j), a, b)
+        for j in np.flatnonzero(found.any(0))
+        for a, b in find_runs(found[:, j], 0)
+    ]
+    skeleton = clip.skeleton
+    hang = np.eye(len(skeleton), dtype=bool)
+    for j in range(len(skeleton) - 1, 0, -1):
+        hang[skeleton.parents[j]] |= hang[j]
+    np.fill_diagonal(hang, False)
+    before = _rough(clip)
+    while spikes:
+        after = _rough(clip.replaced(rot=_filled(rot, spikes, clip.fps)))
+        kept = []
+        for one in spikes:
+            _, j, a, b = one
+            near = slice(max(a - 4, 0), b + 1)
+            there = [x[near, hang[j]].max(initial=0.0) for x in (before, after)]
+            kept += [one] if there[1] <= CALMER * there[0] else []
+        if len(kept) == len(spikes):
+            break
+        spikes = kept
+    return spikes
+
+
+def _rough(clip: Clip) -> np.ndarray:
+    """`(T - 4, J)` m, fourth differences of the joints' places."""
+    return np.linalg.norm(np.diff(clip.positions(), n=4, axis=0), axis=-1)
 
 
 def _continuous(rot: np.ndarray) -> np.ndarray:
@@ -299,29 +349,20 @@ def _repeats(y: np.ndarray) -> bool:
 
 
 def _turns(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:
-    """`(T, J, 3)` rad, the small turns from the motion below `hz` to `rot (T, J, 4)`, in their axes.
+    """`(T, J, 3)` rad, the small turns from the motion below `hz` to `rot (T, J, 4)`, in their axes."""
+    return quat_to_rotvec(quat_mul(quat_conj(_slow(rot, fps, hz)), torch.tensor(rot))).numpy()
 
-    The motion below is a smoothing spline's, turned about its ends: clean clips need not wait for SciPy.
-    """
+
+def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
+    """`(T, J, 4)` the motion of rotations below a frequency: that of a smoothing spline by its gain,
+    turned about its ends. Its bands would need SciPy, for which clean clips need not wait."""
     flat = rot.reshape(len(rot), -1)
     line = flat[0] + np.linspace(0.0, 1.0, len(rot))[:, None] * (flat[-1] - flat[0])
     both = np.concatenate((flat - line, -(flat - line)[-2:0:-1]))
     wave = 2 * np.sin(np.pi * np.arange(len(both) // 2 + 1) / len(both))
     gain = 1.0 / (1.0 + (wave / (2 * np.sin(np.pi * hz / fps))) ** 6)
     slow = line + np.fft.irfft(gain[:, None] * np.fft.rfft(both, axis=0), len(both), axis=0)[: len(rot)]
-    base = normalize(torch.tensor(slow.reshape(rot.shape)))
-    return quat_to_rotvec(quat_mul(quat_conj(base), torch.tensor(rot))).numpy()
-
-
-def _slow(rot: np.ndarray, fps: float, hz: float) -> torch.Tensor:
-    """`(T, J, 4)` the motion of rotations below a frequency."""
-    # SciPy takes 0.3 s to load, which is spared where nothing asks for it.
-    from scipy.linalg import cho_solve_banded
-
-    frames = len(rot)
-    stiff = float((2 * np.sin(np.pi * hz / fps)) ** -6)
-    slow = cho_solve_banded((spline(frames, stiff), True), rot.reshape(frames, -1)).reshape(rot.shape)
-    return normalize(torch.tensor(slow))
+    return normalize(torch.tensor(slow.reshape(rot.shape)))
 
 
 def _still(rot: np.ndarray, fps: float, hz: float) -> np.ndarray:

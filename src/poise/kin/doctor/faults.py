@@ -10,6 +10,7 @@ import numpy as np
 
 from poise.kin.series import find_runs
 from poise.motion import Clip
+from poise.motion.points.tremble import Tremble
 
 
 class Kind(NamedTuple):
@@ -51,7 +52,8 @@ class Fault:
     """Something no body can have done, in frames `start` to `stop` (inclusive, from 0, as read).
 
     kind: a key of `KINDS`, which states the unit of `size`. joint: "" for the whole body.
-    detail: what else is to be said, a clause without a full stop.
+    detail: what else is to be said, a clause without a full stop. hz: the frequency of a tremble that
+    has one, else None.
     """
 
     kind: str
@@ -60,6 +62,12 @@ class Fault:
     stop: int
     size: float
     detail: str = ""
+    hz: float | None = None
+
+    @classmethod
+    def tremble(cls, start: int, stop: int, mm: float, hz: float | None) -> Fault:
+        """A tremble of the whole body at a frequency, or from frame to frame."""
+        return cls("tremble", "", start, stop, mm, Tremble(mm, hz).how, hz)
 
     @property
     def repairable(self) -> bool:
@@ -67,8 +75,9 @@ class Fault:
         return bool(KINDS[self.kind].repair)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, with the unit of the size."""
-        return {**asdict(self), "unit": KINDS[self.kind].unit, "repairable": self.repairable}
+        """Plain values, with the unit of the size; `hz` for a tremble that has one."""
+        own = {k: v for k, v in asdict(self).items() if v is not None}
+        return {**own, "unit": KINDS[self.kind].unit, "repairable": self.repairable}
 
 
 def by_kind(faults: Iterable[Fault]) -> dict[str, list[Fault]]:
@@ -96,7 +105,9 @@ def read_faults(clip: Clip) -> list[Fault]:
     for kind, joint, a, b, size in clip.skeleton.source.mended:
         stop = clip.frames - 1 if b < 0 else b
         millimetres = size * (1e3 if KINDS[kind].unit == "mm" else 1.0)
-        # A tremble is the whole body's; its frequency stands in the joint's place.
-        named, detail = ("", joint) if kind == "tremble" else (joint, "")
-        out.append(Fault(kind, named, a, stop, millimetres, detail))
+        if kind == "tremble":
+            # It is the whole body's; its frequency stands in the joint's place.
+            out.append(Fault.tremble(a, stop, millimetres, float(joint) if joint else None))
+        else:
+            out.append(Fault(kind, joint, a, stop, millimetres))
     return out

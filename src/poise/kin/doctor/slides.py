@@ -94,10 +94,10 @@ def mend_path(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     return clip.replaced(root_pos=path)
 
 
-def mend_slides(clip: Clip, support: Support, faults: list[Fault], firm: float = FIRM) -> Clip:
+def mend_slides(clip: Clip, support: Support, faults: list[Fault]) -> Clip:
     """The clip with every sliding foot held in place while it stands, its leg bent to follow (`hold`).
 
-    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`: by `firm`.
+    In a spell of `faults` the points of the sole that are in contact bear, see `Standing`.
     """
     contact, weights = support.contacts[1], {}
     for foot in dict.fromkeys(support.feet):
@@ -107,7 +107,7 @@ def mend_slides(clip: Clip, support: Support, faults: list[Fault], firm: float =
             if fault.joint == clip.skeleton.names[foot]:
                 slides[fault.start : fault.stop] = True
         if bool(slides.any()):
-            weights[foot] = mine, (contact[:, mine] & slides).double() * firm
+            weights[foot] = mine, (contact[:, mine] & slides).double() * FIRM
 
     def standing(pos: Tensor, _: Tensor) -> dict[int, Standing]:
         return {

@@ -193,11 +193,8 @@ def height_faults(clip: Clip, support: Support) -> list[Fault]:
     return out
 
 
-def slide_faults(clip: Clip, support: Support, share: float = 1.0) -> list[Fault]:
-    """Spells in which a standing foot travels over the floor, in cm between the ends of its way.
-
-    share: of the speed and the way from which on they count.
-    """
+def slide_faults(clip: Clip, support: Support) -> list[Fault]:
+    """Spells in which a standing foot travels over the floor, in cm between the ends of its way."""
     out = []
     for foot, slip, contact in foot_slips(support):
         for first, last in find_runs(contact, 1):
@@ -206,7 +203,7 @@ def slide_faults(clip: Clip, support: Support, share: float = 1.0) -> list[Fault
             distance = float(np.linalg.norm(np.ptp(way, axis=0)))
             speed = float(np.linalg.norm(run, axis=-1).mean()) * clip.fps
             lasting = last - first + 1 >= SLIDE_S * clip.fps
-            if lasting and distance > share * SLIDE_M and speed > share * SLIDE_SPEED:
+            if lasting and distance > SLIDE_M and speed > SLIDE_SPEED:
                 name, detail = clip.skeleton.names[foot], f"at {speed:.2f} m/s"
                 out.append(Fault("foot slide", name, first, last + 1, distance * 100, detail))
     return sorted(out, key=lambda f: f.start)

@@ -42,11 +42,13 @@ class Standing(NamedTuple):
     weight: `(T - 1, 2)`, how much either end of the sole bears between frames; from 0 to 1 it may drift
         by millimetres per second, larger numbers hold it firmly.
     lift: `(T)` m, how much higher it must be, None where it stays.
+    flat: `(T - 1)`, how much its ankle bears as well, so that it does not roll; None where it may.
     """
 
     sole: Sole
     weight: Tensor
     lift: Tensor | None = None
+    flat: Tensor | None = None
 
 
 def hold(
@@ -56,7 +58,7 @@ def hold(
     fps: float,
     standing: Callable[[Tensor, Tensor], Mapping[int, Standing]],
     fixed: Tensor | None = None,
-    vertical: bool = False,
+    vertical: float = 0.0,
     rounds: int = HOLD_ROUNDS,
 ) -> Tensor:
     """Rotations `(T, J, 4)` wxyz with the feet held where they stand; all but the legs stays as it is.
@@ -65,14 +67,15 @@ def hold(
         root: `(T, 3)` m. rot: `(T, J, 4)` wxyz, local.
         standing: tells from world poses `(T, J, 3)` m and `(T, J, 4)` how feet stand, by their joint.
         fixed: `(T)` bool, frames that stay as they are.
-        vertical: the heights of the soles' ends are held as well.
+        vertical: the heights of the soles' ends are held as well, with this share of their weight.
     """
     offsets = torch.tensor(skeleton.offsets, dtype=rot.dtype)
     pinned = None if fixed is None else fixed.numpy()
     for _ in range(rounds):
         leads = {}
         for foot, one in standing(*forward_kinematics(skeleton.parents, offsets, root, rot)).items():
-            leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical)
+            flat = None if one.flat is None else one.flat.numpy()
+            leads[foot] = lead(one.sole, one.weight.numpy(), fps, pinned, vertical, flat)
             if one.lift is not None:
                 leads[foot].shift[:, 2] += one.lift
         rot = led(skeleton, rot, root, leads) if leads else rot

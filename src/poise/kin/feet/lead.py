@@ -33,53 +33,71 @@ _PINNED = 1e8
 
 
 class Lead(NamedTuple):
-    """What is done to a foot: shift `(T, 3)` m of its ankle, turn `(T)` rad about the vertical, and tilt
-    `(T)` rad that raises its toe, about `axis (T, 3)`, which is level."""
+    """What is done to a foot: shift `(T, 3)` m of its ankle, turn `(T)` rad about the vertical, tilt
+    `(T)` rad that raises its toe, about `axis (T, 3)`, which is level, and roll `(T)` rad about the line
+    of the sole, None without any."""
 
     shift: Tensor
     turn: Tensor
     tilt: Tensor
     axis: Tensor
+    roll: Tensor | None = None
 
 
 def lead(
-    sole: Sole, weight: np.ndarray, fps: float, fixed: np.ndarray | None = None, vertical: bool = False
+    sole: Sole,
+    weight: np.ndarray,
+    fps: float,
+    fixed: np.ndarray | None = None,
+    vertical: float = 0.0,
+    flat: np.ndarray | None = None,
 ) -> Lead:
     """How a foot must be led; see the module's text.
 
     Args:
         weight: `(T - 1, 2)`, how much each end bears between frames.
         fixed: `(T)` bool, frames that stay as they are.
-        vertical: the heights of the ends are held as well, by a shift and a tilt.
+        vertical: the heights of the ends are held as well, by a shift and a tilt, with this share of
+            `weight`.
+        flat: `(T - 1)`, how much the ankle stays as well, above the sole, by a roll of the foot.
     """
     fixed = np.zeros(len(sole.ankle), dtype=bool) if fixed is None else fixed
     ends, ankle = sole.ends.numpy(), sole.ankle.numpy()
     velocity = np.diff(ends, axis=0) * fps
     length = float(np.linalg.norm(ends[0, 1] - ends[0, 0]))
-    arm = (ends[..., :2] - ankle[:, None, :2]) / length
+    arm = (ends - ankle[:, None]) / length
     middle = 0.5 * (arm[1:] + arm[:-1])
-    # Unknowns per frame: s_x, s_y, L psi.
-    rows = []
-    for p in range(2):
-        for axis, across in ((0, -middle[:, p, 1]), (1, middle[:, p, 0])):
-            unit = np.zeros((len(velocity), 3))
-            unit[:, axis], unit[:, 2] = 1.0, across
-            rows.append((np.stack((-unit, unit), 1) * fps, -velocity[:, p, axis], weight[:, p]))
-    flat = _solve(rows, 3, fixed, fps)
     way = ends[:, 1, :2] - ends[:, 0, :2]
     way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+    # Unknowns per frame: s_x, s_y, L psi, and the roll about the sole's line times L.
+    rows, width = [], 3 if flat is None else 4
+    for p in range(2):
+        for axis, across in ((0, -middle[:, p, 1]), (1, middle[:, p, 0])):
+            unit = np.zeros((len(velocity), 4))
+            unit[:, axis], unit[:, 2] = 1.0, across
+            unit[:, 3] = middle[:, p, 2] * (way[1:, 1], -way[1:, 0])[axis]
+            unit = unit[:, :width]
+            rows.append((np.stack((-unit, unit), 1) * fps, -velocity[:, p, axis], weight[:, p]))
+    if flat is not None:
+        slip = np.diff(ankle, axis=0) * fps
+        for axis in range(2):
+            unit = np.tile(np.eye(width)[axis], (len(slip), 1))
+            rows.append((np.stack((-unit, unit), 1) * fps, -slip[:, axis], flat))
+    level = _solve(rows, width, fixed, fps)
     up = np.zeros((len(ankle), 2))
     if vertical:
         # Unknowns per frame: s_z, L theta.
-        along = (middle * 0.5 * (way[1:] + way[:-1])[:, None]).sum(-1)
+        along = (middle[..., :2] * 0.5 * (way[1:] + way[:-1])[:, None]).sum(-1)
         heights = []
         for p in range(2):
             unit = np.stack((np.ones(len(along)), along[:, p]), -1)
-            heights.append((np.stack((-unit, unit), 1) * fps, -velocity[:, p, 2], weight[:, p]))
+            held = vertical * weight[:, p]
+            heights.append((np.stack((-unit, unit), 1) * fps, -velocity[:, p, 2], held))
         up = _solve(heights, 2, fixed, fps)
-    shift = np.concatenate((flat[:, :2], up[:, :1]), -1)
+    shift = np.concatenate((level[:, :2], up[:, :1]), -1)
     axis = np.stack((way[:, 1], -way[:, 0], np.zeros(len(way))), -1)
-    return Lead(*(torch.tensor(x) for x in (shift, flat[:, 2] / length, up[:, 1] / length, axis)))
+    turns = (level[:, 2] / length, up[:, 1] / length, axis, *(level[:, 3:] / length).T)
+    return Lead(*(torch.tensor(x) for x in (shift, *turns)))
 
 
 def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]) -> Tensor:
@@ -91,6 +109,8 @@ def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]
     touched = torch.zeros(len(rot), dtype=torch.bool)
     for one in leads.values():
         touched |= one.shift.any(-1) | (one.turn != 0) | (one.tilt != 0)
+        if one.roll is not None:
+            touched |= one.roll != 0
     out = match_positions(skeleton, rot, root, goals, soft=_SOFT)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=rot.dtype)
     for joint, one in leads.items():
@@ -98,6 +118,9 @@ def led(skeleton: Skeleton, rot: Tensor, root: Tensor, leads: Mapping[int, Lead]
         own = quat[:, joint]
         tilt = axis_angle_to_quat(one.axis.to(own.dtype), one.tilt)
         about = quat_mul(axis_angle_to_quat(up, one.turn), tilt)
+        if one.roll is not None:
+            line = torch.linalg.cross(up.expand_as(one.axis), one.axis.to(own.dtype), dim=-1)
+            about = quat_mul(about, axis_angle_to_quat(line, one.roll))
         out[:, joint] = quat_mul(out[:, joint], quat_between(own, quat_mul(about, own)))
     kept = torch.ones(rot.shape[:2], dtype=torch.bool)
     for joint in leads:

@@ -85,7 +85,8 @@ def fit_clip(points: Keypoints, config: FitConfig | None = None) -> Clip:
     mended = points.source.mended
     if marks.tremble is not None:
         found = marks.tremble
-        mended += (("tremble", found.how, 0, clip.frames - 1, found.size_mm / 1e3),)
+        hz = "" if found.hz is None else f"{found.hz:.6g}"
+        mended += (("tremble", hz, 0, clip.frames - 1, found.size_mm / 1e3),)
     return clip.replaced(skeleton=skeleton.with_source(notes=all_notes, mended=mended))
 
 

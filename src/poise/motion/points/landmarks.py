@@ -43,33 +43,41 @@ def places_of(points: Keypoints) -> tuple[dict[str, np.ndarray], list[str]]:
     Raises:
         PoiseError: a needed place has no keypoint, or a keypoint that is never seen.
     """
-    found = find_places(points.names)
-    tracks = {place: points.positions[:, list(k)].mean(1) for place, k in found.items()}
-    marked, notes = marker_places(points.names, points.positions, tracks)
+    # A label that is never seen still says what the others mean, and tells no place.
+    there = [not np.isnan(points.positions[:, k, 0]).all() for k in range(len(points.names))]
+    found = {p: [k for k in ks if there[k]] for p, ks in find_places(points.names).items()}
+    tracks = {place: points.positions[:, ks].mean(1) for place, ks in found.items() if ks}
+    seen = [name for name, known in zip(points.names, there, strict=True) if known]
+    marked, notes = marker_places(seen, points.positions[:, np.array(there)], tracks)
     # Joints that are named outright win over estimates from surface markers.
     tracks = {**marked, **tracks}
+    unseen = [name for name in points.names if name not in seen]
     lost = [place for place in NEEDED if place not in tracks]
+    lost += [place for place in NEEDED if place in tracks and np.isnan(tracks[place][:, 0]).all()]
     if lost:
-        raise _lacking(points, lost)
-    for place in NEEDED:
-        if np.isnan(tracks[place][:, 0]).all():
-            label = _label_of(points, found, place)
-            raise PoiseError(
-                f"{label} is missing in every frame, and the body needs it",
-                points.source.path or points.name,
-            )
+        raise _lacking(points, lost, unseen)
+    if unseen:
+        notes.append(f"Missing in every frame and left out: {listed(unseen, 6)}")
     return tracks, notes
 
 
-def _label_of(points: Keypoints, found: dict[str, tuple[int, ...]], place: str) -> str:
-    if place in found:
-        return f"keypoint '{points.names[found[place][0]]}'"
-    return f"the {place.replace('_', ' ')}"
-
-
-def _lacking(points: Keypoints, lost: list[str]) -> PoiseError:
+def _lacking(points: Keypoints, lost: list[str], unseen: list[str]) -> PoiseError:
     """Which places have no keypoint, what the file has, and which label may have been meant."""
     places = listed((place.replace("_", " ") for place in lost), 12)
+    named = find_places(points.names)
+    marked = marker_places(points.names, np.zeros((2, len(points.names), 3)), {})[0]
+    if unseen and {*named, *marked}.issuperset(lost):
+        direct = {points.names[k] for place in lost for k in named.get(place, ())}
+        mine = [name for name in unseen if name in direct or not direct]
+        one, quoted = len(mine) == 1, listed((f"'{name}'" for name in mine), 6)
+        return PoiseError(
+            f"{'keypoint' if one else 'keypoints'} {quoted} {'is' if one else 'are'} missing in every "
+            f"frame, and nothing else shows the {places}",
+            points.source.path or points.name,
+            f"Track {'that keypoint' if one else 'those keypoints'} again, or fill "
+            f"{'it' if one else 'them'} in where the file was made: the body needs both hips, knees, "
+            "ankles, shoulders, elbows and wrists",
+        )
     side, part = lost[0].split("_")
     wanted = (
         f"{side[0].upper()}{part.capitalize()}",
