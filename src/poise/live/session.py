@@ -22,7 +22,8 @@ import numpy as np
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
-from poise.live.characters import EASE, FALLS, RETURNS, TRACKS, Aims
+from poise.live.aims import Aims
+from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
 from poise.live.config import LiveConfig
 from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer, as_json, packed
