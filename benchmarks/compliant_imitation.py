@@ -26,7 +26,7 @@ from poise.env import ImitationEnv
 from poise.env.task import Acts
 from poise.learn import LATEST, IterationStats, Until, load_policy, run
 from poise.motion import ClipLibrary, read_clip
-from poise.recipes.compliant_imitation import CompliantImitation, build
+from poise.papers.compliant.imitation_controller import CompliantImitation, build
 from poise.recipes.imitation import Imitation
 from poise.spatial import into_heading
 

@@ -22,7 +22,7 @@ from speed import machine
 from websockets.asyncio.client import connect
 
 from live import serve
-from poise.live.character import FALLS, RETURNS
+from poise.live.characters import FALLS, RETURNS
 
 #: s before figures count.
 WARMS_S = 20.0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 from endless_data import FUTURE, PAST
+from next_frames import NextFrame, NextFrameConfig, NextFrameObjective, NextFrames
 from torch import Tensor
 
 from poise.body import Humanoid
@@ -20,16 +21,13 @@ from poise.jobs.tracker import Tracker
 from poise.kin import qpos_velocity
 from poise.learn.cvae import CVAEObjective, CVAETraining
 from poise.learn.inbetween import InbetweenTrainer
-from poise.learn.next_frame import NextFrameObjective
 from poise.motion import ClipLibrary
 from poise.nets.cosine_cvae import make_cvae
 from poise.nets.cvae import CVAEConfig
-from poise.nets.next_frame import NextFrame, NextFrameConfig
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import task as universal_task
 from poise.recipes.residual_force import ResidualForce, task
 from poise.synth.generator import Kinematic
-from poise.synth.next_frames import NextFrames
 from poise.synth.place_free import ROOT
 
 #: Width of all networks of motion, windows of a step of a network of the next frame and of ours.

@@ -32,9 +32,9 @@ from live_client import Sent, watch
 from speed import machine
 
 from poise.jobs.open import open_run
-from poise.live.character import FALLS, RETURNS
+from poise.live.characters import FALLS, RETURNS
 from poise.live.config import LiveConfig
-from poise.live.loop import Live
+from poise.live.session import Live
 from poise.live.sources.file import Loop, packet_of
 from poise.motion import Clip, read_clip
 

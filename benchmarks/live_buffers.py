@@ -24,8 +24,8 @@ from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.kin.retarget.keypoint_body import PointBody
 from poise.live.config import LiveConfig
-from poise.live.loop import Live
-from poise.live.packet import Packet
+from poise.live.session import Live
+from poise.live.stream import Packet
 from poise.metrics import success_rule
 from poise.motion import Clip, read_clip
 from poise.motion.keypoints import Keypoints

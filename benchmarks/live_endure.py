@@ -26,7 +26,7 @@ from live_client import Sent, play, watch
 from speed import machine
 
 from live import clips_of, memory_mb, serve
-from poise.live.character import FALLS, RETURNS
+from poise.live.characters import FALLS, RETURNS
 from poise.motion import Clip
 from poise.view.svg import line_plot
 

@@ -24,14 +24,13 @@ from websockets.sync.client import connect
 
 from poise.errors import PoiseError
 from poise.live.commands import command, parse
-from poise.live.packet import Inbox
 from poise.live.page.guard import Guard
 from poise.live.page.server import PageServer
 from poise.live.sinks.vmc import datagram
-from poise.live.sources.door import StreamDoor
-from poise.live.sources.keypoints import Frame
-from poise.live.sources.stream import JsonStream
+from poise.live.sources.sockets import StreamDoor
+from poise.live.sources.stream import Frame, JsonStream
 from poise.live.sources.vmc import VmcSource
+from poise.live.stream import Inbox
 from poise.live.vrm import standard
 
 SKELETON = standard()

@@ -31,7 +31,7 @@ from live import serve
 from poise.errors import PoiseError
 from poise.jobs.track import track
 from poise.kin import retarget
-from poise.live.sources.osc import messages
+from poise.live.sources.vmc import messages
 from poise.live.vrm import standard, t_pose, to_unity
 from poise.motion import Clip, read_clip, resample
 

@@ -27,7 +27,6 @@ from torch import Tensor
 
 from poise.env import Reference
 from poise.eval.inbetween import BANDAI, deviation
-from poise.jobs.compliant.training import digest_of
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate, train, trained_policy
@@ -38,9 +37,10 @@ from poise.learn import Until
 from poise.metrics import l2p
 from poise.motion import Clip, ClipLibrary, read_clip, shifted, trim
 from poise.motion.windows import pack_frames
+from poise.papers.compliant.training import digest_of
+from poise.papers.skeleton2humanoid.recipe import Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.recipes.skeleton_to_humanoid import Budget, build, settings
 from poise.spatial import forward_kinematics
 
 PAST, AFTER, FPS = 10, 5, 30.0

@@ -31,10 +31,7 @@ EXPLAINED = {
     "figures of the benchmarks": (
         "jobs/track/noise.py:robustness", "jobs/track/noise.py:write_robustness",
         "jobs/tracker.py:Tracker.with_damping",
-        "jobs/compliant/throws.py:throws",
-        "learn/next_frame.py:NextFrameObjective", "nets/next_frame.py:NextFrameConfig.aclstm",
-        "nets/next_frame.py:NextFrameConfig.egopose", "nets/next_frame.py:NextFrameConfig.erd",
-        "synth/next_frames.py:NextFrames",
+        "papers/compliant/throw_figures.py:throws",
     ),
     "analytic inverse kinematics, which keyframes will need": (
         "kin/ik/analytic.py:clip_ik",
@@ -46,7 +43,7 @@ EXPLAINED = {
         "motion/io/numpy/smpl_write.py:smpl_skeleton", "sim/worlds.py:add_contact_sensors",
         "sim/guard.py:replay_dump", "sim/floor.py:HeightField",
         "sim/props/lift.py:Lift",
-        "env/teams.py:Teams", "jobs/compliant/training.py:save_learned",
+        "papers/compliant/teams.py:Teams", "papers/compliant/training.py:save_learned",
     ),
     "called by the libraries that they belong to": (
         "env/gym.py:GymVectorEnv.close_extras", "motion/io/numpy/pickles.py:_Machine.find_class",

@@ -7,8 +7,7 @@ import endless_methods as methods
 import endless_tables as tables
 import pytest
 import torch
-
-from poise.nets.next_frame import NextFrame
+from next_frames import NextFrame
 
 CMU = data.LIBRARIES["CMU"]
 

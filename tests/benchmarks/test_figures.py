@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from poise.jobs.compliant.training import digest_of
 from poise.jobs.open import open_run
+from poise.papers.compliant.training import digest_of
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -18,9 +18,9 @@ from poise.jobs.endless.training import Endless
 from poise.jobs.inbetween.training import Inbetween
 from poise.jobs.presets import preset_of
 from poise.motion import read_clip
+from poise.papers.compliant.recipe import Compliant
 from poise.plan import TrajOptConfig
 from poise.recipes import ResidualForce
-from poise.recipes.compliant import Compliant
 from poise.recipes.perpetual import Perpetual
 
 KINDS: dict[str, Any] = {

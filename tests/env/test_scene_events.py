@@ -11,9 +11,9 @@ from torch import Tensor
 from poise.env import ImitationEnv, ObsTerm
 from poise.env.events import InScene, Move, ScenePart, SetDown, Switch, Throw, near
 from poise.env.frame import Frame
-from poise.env.teams import Teams
 from poise.errors import PoiseError
 from poise.motion import ClipLibrary
+from poise.papers.compliant.teams import Teams
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 from poise.sim import Character, Link, Scene, SceneSim, Touch

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from poise.jobs.open import open_run
-from poise.live.ahead import QUICK, tries_of
-from poise.live.ahead_beside import LEAD, AheadBeside
+from poise.live.lookahead import LEAD, QUICK, AheadBeside, tries_of
 from poise.live.world import World
 
 

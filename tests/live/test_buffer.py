@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from poise.live import quats as q
-from poise.live.buffer import FADE_S, JitterBuffer, margin
+from poise.live.stream import FADE_S, JitterBuffer, margin
 
 STILL = np.array([[1.0, 0, 0, 0]])
 

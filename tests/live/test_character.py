@@ -9,8 +9,7 @@ from torch import Tensor
 from poise.env.recovery.get_up import GetUpPlanner
 from poise.env.recovery.planner import walk_of
 from poise.jobs.open import open_run
-from poise.live.character import EASE, RETURNS, TRACKS, Body, Character
-from poise.live.passing import PASSES_S, SPEEDS_UP
+from poise.live.characters import EASE, PASSES_S, RETURNS, SPEEDS_UP, TRACKS, Body, Character
 from poise.spatial.directions import facing
 
 RATE = 30.0

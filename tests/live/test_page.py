@@ -24,12 +24,10 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.live.commands import MOST_BYTES
 from poise.live.config import LiveConfig
-from poise.live.packet import Inbox
-from poise.live.page.doorway import A_SECOND
-from poise.live.page.frames import HEAD, as_json, packed
-from poise.live.page.guard import EACH, Guard
-from poise.live.page.server import PAGES, PageServer
+from poise.live.page.guard import A_SECOND, EACH, Guard
+from poise.live.page.server import HEAD, PAGES, PageServer, as_json, packed
 from poise.live.session import Session, Wanted
+from poise.live.stream import Inbox
 from poise.motion import read_clip
 from test_docs import WALK
 

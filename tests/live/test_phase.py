@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from poise.live.phase import MARGIN_S, MOVES_S, Phase
+from poise.live.session import MARGIN_S, MOVES_S, Phase
 
 PERIOD = 1 / 30
 

@@ -18,15 +18,14 @@ from poise.env.goals import StreamGoal
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.live import quats as q
-from poise.live.character import TRACKS
+from poise.live.characters import TRACKS
 from poise.live.config import LiveConfig
-from poise.live.loop import Live
-from poise.live.packet import Inbox, Packet
 from poise.live.passage import world_of
 from poise.live.points import PointFit
-from poise.live.sources.door import StreamDoor
-from poise.live.sources.keypoints import Frame
-from poise.live.sources.stream import JsonStream
+from poise.live.session import Live
+from poise.live.sources.sockets import StreamDoor
+from poise.live.sources.stream import Frame, JsonStream
+from poise.live.stream import Inbox, Packet
 from poise.motion import Clip, read_clip
 from test_docs import ROOT, WALK
 

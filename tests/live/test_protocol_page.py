@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from poise.live.commands import COMMANDS, command, parse
-from poise.live.packet import Inbox
-from poise.live.page.frames import as_json
-from poise.live.sources.keypoints import Frame
-from poise.live.sources.stream import JsonStream
+from poise.live.page.server import as_json
+from poise.live.sources.stream import Frame, JsonStream
+from poise.live.stream import Inbox
 from test_docs import ROOT
 
 PAGE = (ROOT / "docs" / "live-protocol.md").read_text(encoding="utf-8")

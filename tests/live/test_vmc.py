@@ -11,14 +11,13 @@ import pytest
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.live import quats as q
-from poise.live.calibration import OntoBody
 from poise.live.config import LiveConfig
-from poise.live.loop import Live
-from poise.live.packet import Inbox
 from poise.live.passage import world_of
+from poise.live.people import OntoBody
+from poise.live.session import Live
 from poise.live.sinks.vmc import OwnPuppet, Puppet, VmcSink, datagram
-from poise.live.sources.osc import MESSAGES, Message, bundled, encoded, messages
-from poise.live.sources.vmc import Avatar, VmcSource
+from poise.live.sources.vmc import MESSAGES, Avatar, Message, VmcSource, bundled, encoded, messages
+from poise.live.stream import Inbox
 from poise.live.vrm import NEEDED, from_unity, skeleton_of, standard, t_pose, to_unity
 from poise.motion import Clip, Skeleton, read_clip
 from test_docs import WALK

@@ -19,7 +19,7 @@ from poise.jobs.keep import claimed, may_write
 
 if TYPE_CHECKING:
     from poise.control import Compliance, Stiffness
-    from poise.env.scenes import PlayScene
+    from poise.papers.compliant.scenes import PlayScene
 
 #: What is written into the folder.
 RESULTS = ("simulated.bvh", "score.json", "figures.json", "report.html")
@@ -111,9 +111,9 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
         raise PoiseError(what, hint="Add --controller lookahead, or leave --budget out")
     for name in RESULTS:
         may_write(o.out / name, o.force, *([o.clip] if o.clip else []))
-    from poise.jobs.compliant.play import play
-    from poise.jobs.compliant.training import open_learned, shipped
     from poise.jobs.open import open_run
+    from poise.papers.compliant.play import play
+    from poise.papers.compliant.training import open_learned, shipped
     from poise.plan import LookaheadConfig
 
     how = LookaheadConfig() if o.budget is None else LookaheadConfig().with_budget(o.budget)
@@ -167,7 +167,7 @@ def scene_of(options: Options) -> PlayScene:
         PoiseError: no such scene, or an option of another one.
     """
     from poise.cli.push import direction_of
-    from poise.env.scenes import SCENES
+    from poise.papers.compliant.scenes import SCENES
 
     o = options
     if o.scene not in SCENES:

@@ -29,7 +29,7 @@ SOURCES = {
     "inbetween": ("jobs/inbetween/training.py", "Inbetween"),
     "perpetual": ("recipes/perpetual/config.py", "Perpetual"),
     "endless": ("jobs/endless/training.py", "Endless"),
-    "compliant": ("recipes/compliant.py", "Compliant"),
+    "compliant": ("papers/compliant/recipe.py", "Compliant"),
 }
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str}
 #: Of fields that need no entry in a recipe.

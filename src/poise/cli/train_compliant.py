@@ -15,14 +15,14 @@ from poise.jobs.keep import claimed
 
 if TYPE_CHECKING:
     from poise.cli.options import Training
-    from poise.recipes.compliant import Compliant
+    from poise.papers.compliant.recipe import Compliant
 
 
 def run(config: Compliant, out: Path, training: Training, again: str) -> Answer:
     """Trains until the limit or Ctrl-C."""
-    from poise.jobs.compliant.training import RUN_FILE, train
     from poise.jobs.open import open_run
     from poise.learn import LATEST, Until
+    from poise.papers.compliant.training import RUN_FILE, train
 
     if training.device != "cpu":
         raise PoiseError("the recipe compliant trains on the CPU", hint="Leave --device out")

@@ -11,14 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from poise.live.buffer import margin
-from poise.live.calibration import OntoBody, calibrated
-from poise.live.character import FALLS, RETURNS, tensor
+from poise.live.characters import FALLS, RETURNS, Endless, tensor
 from poise.live.config import LiveConfig
-from poise.live.endless import Endless
-from poise.live.packet import Packet
-from poise.live.people import People
+from poise.live.people import OntoBody, People, calibrated
 from poise.live.sinks.vmc import Own
+from poise.live.stream import Packet, margin
 from poise.live.world import World
 from poise.motion import Clip
 from poise.synth.generator import Kinematic

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live.packet import FAR_M, NAME
+from poise.live.stream import FAR_M, NAME
 from poise.motion import Skeleton
 
 #: Version of the protocol; bytes and depth of a message; joints of a skeleton.

@@ -17,10 +17,9 @@ from poise.errors import PoiseError
 from poise.kin.fading import FadingFilter, of_points
 from poise.kin.retarget.keypoint_body import PointBody
 from poise.kin.retarget.keypoint_stream import Gaps
-from poise.live.calibration import FEWEST, STAND_S, STILL_M
-from poise.live.packet import PEOPLE, Inbox, Packet, Tremble
-from poise.live.people import FORGET_S
-from poise.live.sources.keypoints import Frame
+from poise.live.people import FEWEST, FORGET_S, STAND_S, STILL_M
+from poise.live.sources.stream import Frame
+from poise.live.stream import PEOPLE, Inbox, Packet, Tremble
 from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import hold_missing

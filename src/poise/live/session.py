@@ -1,34 +1,411 @@
-"""A live session: sources, loop, page and sinks joined, and ended together."""
+"""A live session: sources, loop, page and sinks joined, and ended together.
+
+The loop: 30 times a second what came becomes goals, goals become actions, actions become motion. It
+never waits. Sources put packets into an `Inbox`, pages put commands into a bounded queue, and a step
+is handed to the page and the recorder, each of which takes the newest when it can.
+"""
 
 from __future__ import annotations
 
 import gc
 import sys
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
 
 from poise.errors import PoiseError
 from poise.jobs.endless.model import load_generator
 from poise.jobs.tracker import Tracker
+from poise.live.aims import Aims
+from poise.live.characters import EASE, FALLS, RETURNS, TRACKS
 from poise.live.config import LiveConfig
-from poise.live.loop import Live
-from poise.live.packet import Inbox
 from poise.live.page.guard import Guard
-from poise.live.page.server import PageServer
+from poise.live.page.server import PageServer, as_json, packed
+from poise.live.people import STAND, Steady
 from poise.live.points import PointFit
-from poise.live.show import ShowPage, ShowRecorder, ShowVmc, hello_of
 from poise.live.sinks.record import Recorder
 from poise.live.sinks.vmc import OwnPuppet, VmcSink
-from poise.live.sources.door import StreamDoor
 from poise.live.sources.file import FileSource
+from poise.live.sources.sockets import StreamDoor
 from poise.live.sources.vmc import VmcSource
-from poise.live.steady import Steady
+from poise.live.stream import Inbox, Tremble
+from poise.live.vrm import NEEDED, PARENTS
+from poise.live.world import Seen, World
 from poise.motion import Clip
 from poise.synth.generator import Kinematic
+
+#: Commands that wait at most.
+MOST_ORDERS = 256
+#: s after which a hand that says nothing more has let go.
+HOLDS_S = 1.0
+
+
+class Orders:
+    """Commands that wait, and what they change.
+
+    Attributes:
+        waiting: commands that were checked, see `poise.live.commands`.
+        paused: whether physics waits.
+        recording: is told to begin or end a recording; None: there is none.
+        pulled: when each character was last pulled at, by the loop's clock.
+    """
+
+    def __init__(self, aims: Aims):
+        self.aims, self.world = aims, aims.world
+        self.waiting: deque[dict[str, Any]] = deque(maxlen=MOST_ORDERS)
+        self.paused = False
+        self.recording: Callable[[bool], None] | None = None
+        self.pulled: dict[int, float] = {}
+
+    def obey(self, now_s: float) -> None:
+        """Does what waits."""
+        while self.waiting:
+            self._do(self.waiting.popleft(), now_s)
+        for k in [k for k, t in self.pulled.items() if now_s - t > HOLDS_S]:
+            del self.pulled[k]
+            self.world.hands.let_go(k)
+
+    def _do(self, command: dict[str, Any], now_s: float) -> None:
+        kind, k, world = command["type"], int(command.get("character", 0)), self.world
+        if k >= world.count:
+            return
+        if kind == "pull":
+            if command["body"] < len(world.humanoid.bodies):
+                world.hands.pull(k, command["body"], np.array(command["point"]), np.array(command["to"]))
+                self.pulled[k] = now_s
+        elif kind == "release":
+            self.pulled.pop(k, None)
+            world.hands.let_go(k)
+        elif kind == "knock":
+            angle = self.aims.rng.uniform(0, 2 * np.pi)
+            world.hands.blow(k, np.array([np.cos(angle), np.sin(angle), 0.0]))
+        elif kind == "ball":
+            world.drop_ball(k)
+        elif kind == "comply":
+            world.comply(k, command["level"])
+        elif kind == "dream":
+            self.aims.dream(k, command["on"])
+        elif kind == "pause":
+            self.paused = command["on"]
+        elif kind == "follow":
+            self.aims.people.switch(k, command["person"])
+        elif kind == "record" and self.recording is not None:
+            self.recording(command["on"])
+        elif kind == "set":
+            self._set(command)
+
+    def _set(self, command: dict[str, Any]) -> None:
+        if "buffer" in command:
+            self.aims.people.delay(command["buffer"])
+            self.aims.set_lead()
+        if "noise" in command:
+            self.aims.noise = command["noise"]
+        if "lookahead" in command:
+            most = min(command["lookahead"], self.world.count)
+            self.world.look_ahead(tuple(range(most if self.world.can_look_ahead else 0)))
+
+
+#: Packets by which it is known when they come; s after them at which a step begins; s by which one step
+#: is moved at most; s that must be gained for it to be moved.
+SEEN, MARGIN_S, MOVES_S, GAINS_S = 64, 0.003, 0.0005, 0.002
+
+
+class Phase:
+    """Sources have clocks of their own. A packet that comes just after a step began waits a whole period
+    for the next one; one that comes before it does not wait at all.
+
+    Steps are moved, by no more than `MOVES_S` each, to where 95 % of the packets wait the least. Packets
+    that come at any time, as those of many sources, leave them where they are.
+
+    Args:
+        period_s: s between steps.
+    """
+
+    def __init__(self, period_s: float):
+        self.period_s = period_s
+        self._came: deque[float] = deque(maxlen=SEEN)
+
+    def add(self, arrived_s: list[float]) -> None:
+        """When packets came, by the loop's clock."""
+        self._came += arrived_s
+
+    def shift(self, due_s: float) -> float:
+        """s by which a step that is due at `due_s` is to come later; less than 0 for sooner."""
+        if len(self._came) < SEEN:
+            return 0.0
+        period = self.period_s
+        phases = (np.array(self._came) - due_s) % period
+        starts = np.append((phases + MARGIN_S) % period, 0.0)
+        # What comes less than a margin before a step might as well come after it.
+        waits = np.percentile((starts[:, None] - phases - MARGIN_S / 2) % period, 95, axis=1)
+        best = int(waits.argmin())
+        if waits[best] > waits[-1] - GAINS_S:
+            return 0.0
+        # The shorter way round.
+        way = (float(starts[best]) + period / 2) % period - period / 2
+        return float(np.clip(way, -MOVES_S, MOVES_S))
+
+
+#: Steps of which figures are made.
+STEPS = 1800
+
+
+class Times:
+    """When the last control steps began, how long they took, and how late they were.
+
+    Attributes:
+        steps: that were made.
+    """
+
+    def __init__(self) -> None:
+        self.steps = 0
+        self._latency: deque[float] = deque(maxlen=STEPS)
+        self._spent: deque[float] = deque(maxlen=STEPS)
+        self._began: deque[float] = deque(maxlen=90)
+
+    def add(self, began_s: float, done_s: float, arrived_s: list[float]) -> None:
+        """What a step took, and when the newest packets that it knew had come."""
+        self._spent.append(done_s - began_s)
+        self._began.append(began_s)
+        self._latency += [done_s - arrived for arrived in arrived_s]
+
+    def told(self) -> dict[str, Any]:
+        """Steps a second, and ms."""
+        began = self._began
+        span = began[-1] - began[0] if len(began) > 1 else 0.0
+        return {
+            "hz": round((len(began) - 1) / span, 1) if span > 0 else 0.0,
+            "latency_ms": _percentiles(self._latency),
+            "step_ms": _percentiles(self._spent),
+        }
+
+
+def figures(aims: Aims, inbox: Inbox, times: Times) -> dict[str, Any]:
+    """Those of the people and characters; times in ms, over the last minute."""
+    world, people = aims.world, aims.people
+    return {
+        **times.told(),
+        "buffer": people.delay_s, "noise": aims.noise, "lookahead": len(world.ahead_of),
+        "looked_ahead": round(world.looked / max(1, times.steps), 3),
+        "resets": world.resets, "help_n": 0.0, "received": inbox.received,
+        "refused": dict(inbox.refused), "crowded": inbox.crowded,
+        "people": [
+            {
+                "name": p.name, "calibrated": round(p.share, 2), "said": "" if p.onto else p.said,
+                **_of_tremble(p.buffer.tremble),
+            }
+            for p in people.known.values()
+        ]
+        + [
+            {"name": name, "calibrated": round(share, 2), "said": STAND, **_of_tremble(Tremble())}
+            for name, share in list(inbox.standing.items())
+        ],
+        "characters": [_of_character(aims, k) for k in range(world.count)],
+    }  # fmt: skip
+
+
+def _of_tremble(tremble: Tremble) -> dict[str, Any]:
+    """By how many mm a person trembles, at how many Hz, and how many ms later it is followed."""
+    hz = None if tremble.hz is None else round(tremble.hz, 1)
+    return {"trembles_mm": round(tremble.mm), "hz": hz, "late_ms": round(1000.0 * tremble.late_s)}
+
+
+def _of_character(aims: Aims, k: int) -> dict[str, Any]:
+    c, world = aims.world.characters[k], aims.world
+    return {
+        "follows": aims.people.follows[k], "doing": c.doing, "lost": c.lost, "falls": c.falls,
+        "recovered": c.recovered, "off_mm": round(1000.0 * world.body(k).off_m),
+        "compliance": round(float(world.yielding.level[k]), 3), "endless": k in aims.endless,
+    }  # fmt: skip
+
+
+def _percentiles(seconds: deque[float]) -> list[float]:
+    """ms that half of them, and 99 % of them, are below."""
+    kept = np.array(seconds) * 1000.0 if seconds else np.zeros(1)
+    return [round(float(np.percentile(kept, p)), 1) for p in (50, 99)]
+
+
+#: What characters do, in the order of the numbers in frames.
+DOING = (EASE, TRACKS, FALLS, RETURNS)
+
+
+def hello_of(world: World, names: dict[str, Any]) -> dict[str, Any]:
+    """What a page needs to draw the characters.
+
+    names: more of it, such as whether there is a recorder.
+    """
+    table = world.humanoid.table
+    return {
+        "characters": world.count,
+        "rate": world.rate_hz,
+        "bodies": list(world.humanoid.bodies),
+        "parents": [r.parent for r in table.rows],
+        "shapes": [
+            {"body": i, "kind": g.kind, "size": list(g.size), "pos": list(g.pos), "quat": list(g.quat)}
+            for i, row in enumerate(table.rows)
+            for g in row.geoms
+        ],
+        "ball": 0.12,
+        "doing": list(DOING),
+        "looks_ahead": world.can_look_ahead,
+        **names,
+    }
+
+
+class ShowPage:
+    """Hands steps to a page server."""
+
+    def __init__(self, server: PageServer):
+        self.server = server
+
+    def show(self, seen: Seen, live: Live) -> None:
+        """Takes a control step."""
+        doing = [c.doing for c in live.world.characters]
+        frame = packed(
+            live.steps, seen.time_s, [DOING.index(d) for d in doing], seen.bodies, seen.goals, seen.ball
+        )
+        self.server.publish(frame, lambda: as_json(seen.time_s, doing, seen.bodies))
+
+
+class ShowRecorder:
+    """Hands steps to a recording while it is on."""
+
+    def __init__(self, recorder: Recorder):
+        self.recorder = recorder
+
+    def show(self, seen: Seen, live: Live) -> None:
+        """Takes a control step."""
+        self.recorder.write(seen.qpos)
+
+
+class ShowVmc:
+    """Hands steps to a VMC sink."""
+
+    def __init__(self, sink: VmcSink):
+        self.sink = sink
+
+    def show(self, seen: Seen, live: Live) -> None:
+        """Takes a control step."""
+        own = live.aims.own(self.sink.character)
+        if own is not None and not set(NEEDED) <= set(own.skeleton.names) <= set(PARENTS):
+            # A person that is no VRM model.
+            own = None
+        self.sink.write(seen.bodies, seen.time_s, seen.goals, own)
+
+
+#: s for which no character looks ahead after a step that came too late.
+HURRIES_S = 2.0
+
+
+class Shows(Protocol):
+    """What a step's outcome goes to; it returns at once."""
+
+    def show(self, seen: Seen, live: Live) -> None:
+        """Takes a control step."""
+        ...
+
+
+class Live:
+    """The world, the people, and the clock.
+
+    Args:
+        inbox: where sources put packets.
+        shows: what steps go to.
+        executor: calibrates and plans beside the loop, and characters look ahead in a process of its
+            own; None does it at once, as tests do.
+        clock: s; the clock by which packets arrive.
+        generator: makes endless motion; None: there is none.
+
+    Attributes:
+        world: the characters; `aims`, what they are to do; `people`, that they follow; `orders`, what
+            pages want.
+        behind: control steps that came too late.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        config: LiveConfig | None = None,
+        inbox: Inbox | None = None,
+        shows: Sequence[Shows] = (),
+        executor: Executor | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        generator: Kinematic | None = None,
+    ):
+        self.config = c = config or LiveConfig()
+        self.tracker, self.inbox, self.shows = tracker, inbox or Inbox(Steady), list(shows)
+        ahead, beside = tuple(range(c.lookahead)), executor is not None
+        self.world = World(tracker, c.characters, executor, ahead, c.seed, beside)
+        self.aims = Aims(self.world, c, executor, generator)
+        self.people, self.orders = self.aims.people, Orders(self.aims)
+        self.commands = self.orders.waiting
+        self.rate_hz, self.clock = self.world.rate_hz, clock
+        self.behind, self._hurry, self.times = 0, 0, Times()
+        self._phase = Phase(1.0 / self.rate_hz)
+
+    @property
+    def steps(self) -> int:
+        """Control steps that were made."""
+        return self.times.steps
+
+    @property
+    def paused(self) -> bool:
+        """Whether physics waits."""
+        return self.orders.paused
+
+    def run(self, until: Callable[[], bool]) -> None:
+        """Steps in real time until `until()`; a step that comes late is not made up for."""
+        period = 1.0 / self.rate_hz
+        due = self.clock()
+        while not until():
+            now = self.clock()
+            if now < due:
+                time.sleep(min(due - now, 0.05))
+                continue
+            if now - due > period:
+                self.behind += int((now - due) / period)
+                due = now
+                # Better in time than far-sighted.
+                self._hurry = self.steps + round(HURRIES_S * self.rate_hz)
+            due += period
+            self.step(now)
+            due += self._phase.shift(due)
+
+    def step(self, now_s: float) -> Seen | None:
+        """One control step at `now_s`; None while paused."""
+        began = self.clock()
+        packets = self.inbox.take()
+        self.people.add(packets)
+        self.orders.obey(now_s)
+        if self.paused:
+            return None
+        self.world.hurries = self.steps < self._hurry
+        seen = self.world.step(*self.aims.next(now_s))
+        self.times.steps += 1
+        if self.steps % 30 == 0:
+            self.people.tidy(now_s)
+        for show in self.shows:
+            show.show(seen, self)
+        arrived = [t for line in packets.values() for t, _ in line[-1:]]
+        self._phase.add(arrived)
+        self.times.add(began, self.clock(), arrived)
+        return seen
+
+    def figures(self) -> dict[str, Any]:
+        """What is shown beside the characters; times in ms, over the last minute."""
+        told = figures(self.aims, self.inbox, self.times)
+        return {**told, "behind": self.behind, "paused": self.paused}
+
+    def close(self) -> None:
+        """Frees the simulations."""
+        self.world.close()
+
 
 #: Steps that are made at least; s for which a thread beside the loop has the interpreter, where both
 #: want it.

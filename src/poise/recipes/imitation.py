@@ -79,7 +79,7 @@ class Imitation:
             `residual_std` where there is a residual force.
         recovery_clips: those of the library, where recovery is learned by them.
         props: what else stands in every world, such as a chair or a ball, or another character, which
-            `env.opponent` moves.
+            `papers.compliant.opponent` moves.
         links, touches, floor: of such worlds, see `Scene`; the character's bodies have their own names.
         physics: a model in place of the body's own on a floor, such as a heavier one; without props.
     """

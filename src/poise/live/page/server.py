@@ -1,20 +1,18 @@
-"""The server: a page, its files, and three doors for WebSockets, in a thread of its own.
-
-/live shows every control step and takes commands; /bodies is the same as JSON, for programs; /stream
-takes the poses of people.
-"""
+"""The server: a page, its files, and three doors for WebSockets, in a thread of its own."""
 
 from __future__ import annotations
 
 import asyncio
 import http
 import json
+import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -22,11 +20,41 @@ from websockets.http11 import Request, Response
 
 from poise.errors import PoiseError
 from poise.live.commands import MOST_BYTES, VERSION, command, parse
-from poise.live.packet import Inbox
-from poise.live.page.doorway import WAITING, Doorway, pauses
-from poise.live.page.guard import Bucket, Guard
-from poise.live.sources.keypoints import Fits
-from poise.live.sources.stream import JsonStream
+from poise.live.page.guard import WAITING, Bucket, Doorway, Guard, pauses
+from poise.live.sources.stream import Fits, JsonStream
+from poise.live.stream import Inbox
+
+#: Version, step, simulated time, characters, bodies; then what each does, and numbers.
+HEAD = struct.Struct("<IIdHH")
+
+
+def packed(
+    step: int,
+    time_s: float,
+    doing: Sequence[int],
+    bodies: np.ndarray,
+    goals: np.ndarray,
+    ball: np.ndarray,
+) -> bytes:
+    """Little-endian: version u32, step u32, time f64, K u16, B u16; K u8 what each character does,
+    filled up to a multiple of 4; f32 `(K, B, 7)` of the bodies, as many of the goals, 7 of the ball."""
+    k, b = bodies.shape[:2]
+    head = HEAD.pack(VERSION, step, time_s, k, b) + bytes(doing) + bytes(-k % 4)
+    return head + b"".join(np.ascontiguousarray(x, "<f4").tobytes() for x in (bodies, goals, ball))
+
+
+def as_json(time_s: float, doing: Sequence[str], bodies: np.ndarray) -> str:
+    """The same for programs: places m and rotations wxyz of the simulated bodies."""
+    characters = [
+        {
+            "doing": what,
+            "pos": np.round(rows[:, :3].astype(float), 5).tolist(),
+            "quat": np.round(rows[:, 3:].astype(float), 5).tolist(),
+        }
+        for what, rows in zip(doing, bodies, strict=True)
+    ]
+    return json.dumps({"v": VERSION, "type": "bodies", "time": time_s, "characters": characters})
+
 
 #: What can be fetched: a fixed list, so that no path leads to a file of the user's.
 PAGES = {

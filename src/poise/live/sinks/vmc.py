@@ -14,9 +14,9 @@ import numpy as np
 from poise.body import BodyTable
 from poise.errors import PoiseError
 from poise.live import quats as q
-from poise.live.calibration import Elsewhere
 from poise.live.passage import FramePassage, local_of, world_of
-from poise.live.sources.osc import bundled, encoded
+from poise.live.people import Elsewhere
+from poise.live.sources.vmc import bundled, encoded
 from poise.live.vrm import standard, t_pose, to_unity
 from poise.motion import Clip, Skeleton
 

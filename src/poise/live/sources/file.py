@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from poise.live import quats as q
-from poise.live.packet import Inbox, Packet
+from poise.live.stream import Inbox, Packet
 from poise.motion import Clip
 
 #: s in which the end of a clip passes into its beginning.

@@ -1,9 +1,11 @@
-"""JSON messages of one connection as packets: a skeleton once, then poses."""
+"""JSON messages of one connection as packets: a skeleton once, then poses or keypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from poise.errors import PoiseError
 from poise.live.commands import (
@@ -16,10 +18,27 @@ from poise.live.commands import (
     skeleton_of,
     turned,
     vertical,
-)  # fmt: skip
-from poise.live.packet import PEOPLE, Inbox, Packet
-from poise.live.sources.keypoints import Fits, Frame
+)
+from poise.live.stream import PEOPLE, Inbox, Packet
 from poise.motion import Skeleton
+
+
+class Frame(NamedTuple):
+    """Keypoints `(K, 3)` m of a person, Z up, NaN where one is missing, and when they were and came."""
+
+    person: str
+    names: tuple[str, ...]
+    points: np.ndarray
+    time_s: float
+    arrived_s: float
+
+
+class Fits(Protocol):
+    """What frames go to."""
+
+    def offer(self, frame: Frame) -> None:
+        """Takes a frame; returns at once."""
+        ...
 
 
 class JsonStream:

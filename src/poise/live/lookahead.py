@@ -1,0 +1,282 @@
+"""Looking ahead in live motion: beside the loop in a process of its own, or at once, as tests do."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from poise.control import Compliance
+from poise.env import ImitationEnv
+from poise.env.goals import StreamGoal
+from poise.env.snapshot import Snapshot
+from poise.errors import PoiseError
+from poise.jobs.track.controllers import look_ahead
+from poise.jobs.track.placement import place
+from poise.jobs.track.tracking import imitation_of
+from poise.jobs.tracker import Tracker
+from poise.plan import Lookahead, LookaheadConfig
+from poise.plan.lookahead import PAST, Choice
+
+#: Simulated at once where a character looks ahead in real time: candidates, horizon, hold.
+QUICK = LookaheadConfig(candidates=8, horizon=6, hold_steps=3, smoothing=(0.0, 0.7), corrections=(1.0,))
+
+
+class Ahead(Protocol):
+    """What acts in place of the policy in the worlds that look ahead."""
+
+    def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
+        """Acts in `env` from now on, and looks ahead in some of its worlds."""
+        ...
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions `(N, A)`."""
+        ...
+
+    def skip(self) -> None:
+        """The policy acts alone in this step: what was decided before is of another time afterwards."""
+        ...
+
+    @property
+    def acts(self) -> bool:
+        """Whether the last actions had looked ahead."""
+        ...
+
+    def close(self) -> None:
+        """Frees what it holds."""
+        ...
+
+
+def tries_of(tracker: Tracker, config: LookaheadConfig, seed: int) -> Lookahead:
+    """Copies of a live character in which a policy tries what it might do.
+
+    Raises:
+        PoiseError: the policy has no critic.
+    """
+    if tracker.value is None or tracker.recovery_clips is None:
+        raise PoiseError("the policy was saved without its critic, which lookahead needs")
+    task = imitation_of(tracker, [place(tracker.example, tracker)])
+    task = replace(task, task=replace(task.task, help_by="all", compliance=Compliance(level=0.0)))
+    out = look_ahead(tracker, task, config, 1, seed)
+    goal = StreamGoal(task.humanoid, task.config.sim.control_hz, out.copies.num_envs)
+    goal.push(tracker.recovery_clips.ease)
+    goal.draw(torch.arange(out.copies.num_envs))
+    out.copies.set_goal(goal)
+    return out
+
+
+class AheadAtOnce:
+    """Looks ahead while the loop waits, as tests do."""
+
+    def __init__(self, tracker: Tracker, seed: int):
+        self._lookahead = tries_of(tracker, QUICK, seed)
+        self.acts = False
+
+    def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
+        """See `Ahead`."""
+        self._watched = env, worlds
+        self._lookahead.watch(env, worlds)
+
+    def act(self, obs: Tensor) -> Tensor:
+        """See `Ahead`."""
+        self.acts = True
+        return self._lookahead.act(obs)
+
+    def skip(self) -> None:
+        """See `Ahead`."""
+        self.watch(*self._watched)
+
+    def close(self) -> None:
+        """See `Ahead`."""
+        self._lookahead.copies.close()
+
+
+#: Control steps after which a decision that is made beside the loop counts.
+LEAD = 3
+#: By how much the other process comes after the loop, as `nice` counts.
+NICE = 5
+#: s that the other process has to end.
+ENDS_S = 2.0
+
+
+class _Asked(NamedTuple):
+    """A question to the other process; arrays, which cost little to hand over.
+
+    Attributes:
+        worlds, physics, goal: of the snapshot.
+        past, off_m, last, meanwhile: see `Lookahead.decide`.
+    """
+
+    worlds: Mapping[str, np.ndarray]
+    physics: int
+    goal: Mapping[str, np.ndarray]
+    past: np.ndarray
+    off_m: float
+    last: np.ndarray
+    meanwhile: np.ndarray
+
+
+class _Answer(NamedTuple):
+    """What the other process decided; see `Choice`."""
+
+    offsets: np.ndarray
+    smoothing: float
+    correction: float
+
+
+@dataclass(eq=False)
+class _World:
+    """A character that looks ahead.
+
+    Attributes:
+        choice: what it does now, None before the first decision; `step`, control steps since it counts.
+        past: `(B, 3)` m, the bodies in the last frames.
+        since: control steps since it asked; None where it waits for nothing.
+    """
+
+    choice: Choice | None = None
+    step: int = 0
+    past: list[Tensor] = field(default_factory=list)
+    since: int | None = None
+
+
+class AheadBeside:
+    """Looks ahead in a process of its own; characters take turns.
+
+    Attributes:
+        acts: whether the last actions had looked ahead; without an answer the policy acts alone.
+        decided: decisions that came.
+    """
+
+    def __init__(self, tracker: Tracker, seed: int):
+        self._policy = tracker.policy
+        self._env: ImitationEnv | None = None
+        self._worlds = dict[int, _World]()
+        self.acts, self.decided = False, 0
+        context = get_context("spawn")
+        self._line, other = context.Pipe()
+        args = (other, replace(tracker, about={}), seed)
+        self._process = context.Process(target=_decide_all, args=args, daemon=True)
+        self._process.start()
+        other.close()
+        self._asks: queue.SimpleQueue[tuple[_World, _Asked] | None] = queue.SimpleQueue()
+        self._told: queue.SimpleQueue[tuple[_World, _Answer]] = queue.SimpleQueue()
+        self._waiting = False
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+
+    def watch(self, env: ImitationEnv, worlds: tuple[int, ...]) -> None:
+        """See `Ahead`. What was asked before is not waited for."""
+        self._env, self._worlds = env, {k: _World() for k in worlds}
+
+    def act(self, obs: Tensor) -> Tensor:
+        """See `Ahead`."""
+        env = self._env
+        if env is None:
+            raise PoiseError("a lookahead acts in an environment", hint="Call watch(env) first")
+        while not self._told.empty():
+            world, told = self._told.get()
+            self._waiting = False
+            self.decided += 1
+            world.choice = Choice(torch.from_numpy(told.offsets), told.smoothing, told.correction)
+            world.step, world.since = world.since or 0, None
+        pos, fresh = env.here().pos, (env.age == 0).tolist()
+        n = len(obs)
+        offsets = torch.zeros(n, env.num_actions)
+        keep, much = torch.zeros(n, 1), torch.ones(n, 1)
+        self.acts = False
+        for i, world in self._worlds.items():
+            if fresh[i]:
+                # It was set down anew: what is decided by now is of another place.
+                self._worlds[i] = world = _World()
+            choice = world.choice
+            self._ask(i, world, pos[i])
+            if choice is not None and world.step < len(choice.offsets):
+                offsets[i] = choice.offsets[world.step]
+                keep[i], much[i] = choice.smoothing, choice.correction
+                self.acts = True
+            world.step += 1
+            world.since = None if world.since is None else world.since + 1
+            world.past = [*world.past, pos[i].clone()][-PAST:]
+        return env.unfiltered(torch.lerp(much * self._policy.act(obs) + offsets, env.action, keep))
+
+    def skip(self) -> None:
+        """See `Ahead`. What was asked is not waited for."""
+        self._worlds = {k: _World() for k in self._worlds}
+
+    def _ask(self, i: int, world: _World, pos: Tensor) -> None:
+        """Hands a question over, where nothing is being decided and this character's turn has come."""
+        env = self._env
+        assert env is not None
+        if self._waiting or (world.choice is not None and world.step < QUICK.hold_steps):
+            return
+        if len(self._worlds) > 1 and world is not max(self._worlds.values(), key=lambda w: w.step):
+            return
+        ahead = torch.zeros(LEAD, env.num_actions)
+        last = ahead[:0]
+        if world.choice is not None:
+            planned = world.choice.offsets[world.step : world.step + LEAD]
+            ahead[: len(planned)] = planned
+            last = world.choice.offsets[world.step + LEAD :][: QUICK.horizon]
+        snapshot = env.snapshot(torch.tensor([i]))
+        past = torch.stack(world.past) if world.past else pos[None][:0]
+        off = float((pos - env.goal_pose().pos[i]).norm(dim=-1).mean())
+        arrays = {k: v.numpy() for k, v in snapshot.worlds.items()}
+        goal = {k: v.clone().numpy() for k, v in snapshot.goal.items()}
+        asked = _Asked(arrays, snapshot.physics, goal, past.numpy(), off, last.numpy(), ahead.numpy())
+        world.since, self._waiting = 0, True
+        self._asks.put((world, asked))
+
+    def _carry(self) -> None:
+        """Hands questions over and answers back, so that the loop waits for neither."""
+        try:
+            while (one := self._asks.get()) is not None:
+                self._line.send(one[1])
+                self._told.put((one[0], self._line.recv()))
+        except (EOFError, OSError):
+            # The other process has ended; the policy acts alone.
+            return
+
+    def close(self) -> None:
+        """See `Ahead`."""
+        self._asks.put(None)
+        self._line.close()
+        self._process.terminate()
+        self._process.join(ENDS_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join(ENDS_S)
+        self._thread.join(ENDS_S)
+
+
+def _decide_all(line: Connection, tracker: Tracker, seed: int) -> None:
+    """What the other process does until nobody asks any more."""
+    # Ctrl-C is for the loop, which ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    # The loop comes first, where there is not a core for each.
+    os.nice(NICE)
+    lookahead = tries_of(tracker, QUICK, seed)
+    while True:
+        try:
+            asked: _Asked = line.recv()
+        except (EOFError, OSError):
+            return
+        snapshot = Snapshot(_tensors(asked.worlds), asked.physics, _tensors(asked.goal), None)
+        last, meanwhile, past = (torch.from_numpy(x) for x in (asked.last, asked.meanwhile, asked.past))
+        made = lookahead.decide(snapshot, past, asked.off_m, last, meanwhile)
+        line.send(_Answer(made.offsets.numpy(), made.smoothing, made.correction))
+
+
+def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {k: torch.from_numpy(v) for k, v in arrays.items()}

@@ -1,0 +1,30 @@
+"""Scenes in which a character gives way, one file each."""
+
+from poise.papers.compliant.scenes.ball import Balance
+from poise.papers.compliant.scenes.chicken import Chicken
+from poise.papers.compliant.scenes.door import Doorway
+from poise.papers.compliant.scenes.hands import Hands
+from poise.papers.compliant.scenes.pull import Pull
+from poise.papers.compliant.scenes.stage import PlayScene, Stage, hand_of
+from poise.papers.compliant.scenes.throws import Throws
+from poise.papers.compliant.scenes.trampoline import Trampoline
+
+#: The scenes by their names.
+SCENES: dict[str, type[PlayScene]] = {
+    "throws": Throws, "pull": Pull, "hands": Hands, "door": Doorway, "trampoline": Trampoline,
+    "ball": Balance, "chicken": Chicken,
+}  # fmt: skip
+
+__all__ = [
+    "SCENES",
+    "Balance",
+    "Chicken",
+    "Doorway",
+    "Hands",
+    "PlayScene",
+    "Pull",
+    "Stage",
+    "Throws",
+    "Trampoline",
+    "hand_of",
+]

@@ -1,0 +1,261 @@
+"""A ball on a rod that stands on the head (Deep Compliant Control, Sec. 5.4)."""
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from poise.body import Humanoid
+from poise.control import Compliance, Stiffness
+from poise.env.events import InScene, Pushes, Switch, near
+from poise.env.events.event import Drawn
+from poise.env.frame import DoneTerm, Frame, ObsTerm, RewardTerm
+from poise.env.goals.displaced import DisplacedGoal
+from poise.env.goals.goal import Goal
+from poise.env.plugins import Felt, Plugin
+from poise.env.reference import Reference
+from poise.errors import PoiseError
+from poise.papers.compliant.scenes.stage import Given, Stage
+from poise.sim import Backend, CharacterRows, Drive, Link, SceneSim
+from poise.sim.props import Rod
+from poise.spatial import heading_quat, into_heading, quat_rotate
+
+#: Sharpness of the reward, 1/m^2 (Sec. 5.4).
+SHARPNESS = 2.0
+#: m above the head's joint where the rod stands.
+UP_M = 0.2
+#: m by which the rod's middle may be farther from the head when it is put there.
+NEAR_M = 0.15
+#: N for a fictional force of 1 that a policy asks for, and the most of one.
+UNIT_N, MOST_N = 100.0, 150.0
+#: Of the linear law, N/m and N s/m.
+GAIN, DAMPING = 700.0, 250.0
+#: Of the angle at which a rod counts as fallen.
+COS_45 = math.cos(math.pi / 4)
+FLAT = torch.tensor([1.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Balance:
+    """A rod with a ball on its end stands on the head, free to tilt.
+
+    Two fictional forces, at the head and at the root, act on nothing but the goal, which gives way to
+    them: so the character moves as it wants the ball to go. A linear law sets them, of where the ball is
+    and how fast, against where the head would be without giving way; a policy that learns the scene adds
+    to them, six numbers. Since nothing moves by such a force in the simulation, `Stiffness` and
+    algorithm1 give way to it, eq8 does not.
+
+    Attributes:
+        length: m, of the rod.
+        spread: rad, how far it is tilted at first, at random.
+        gain, damping: of the linear law, N/m and N s/m.
+        pushes: N, of a push at the chest for 0.1 s every 2 to 3 s from all around; 0 is none.
+        seed: of the draws.
+    """
+
+    length: float = 1.0
+    spread: float = 0.02
+    gain: float = GAIN
+    damping: float = DAMPING
+    pushes: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (0.1 <= self.length <= 5.0 and 0.0 <= self.spread < 1.0):
+            what = f"a rod is 0.1 to 5 m long and tilted by less than 1 rad, got {self.length:g} m"
+            raise PoiseError(f"{what} and {self.spread:g} rad", "ball")
+        if not 0.0 <= self.pushes < 10_000.0:
+            raise PoiseError(f"a push has at least 0 N, got {self.pushes:g}", "ball")
+
+    def stage(self, humanoid: Humanoid, reference: Reference) -> Stage:
+        """The rod, its joint on the head, the fictional forces and the task's terms.
+
+        Raises:
+            PoiseError: a body without a head.
+        """
+        heads = humanoid.rows_of("head")
+        if not heads:
+            names = ", ".join(humanoid.bodies)
+            raise PoiseError("the skeleton has no head, which 'ball' needs", hint=f"It has {names}")
+        head = heads[-1]
+        pose = reference.pose
+        x, y, z = (float(v) for v in pose.pos[0, head])
+        top = Rod(length=self.length, pos=(x, y, z + UP_M))
+        # The rod's foot above the head, in the head's own frame.
+        up = torch.tensor([0.0, 0.0, UP_M])
+        to = quat_rotate(pose.quat[0, head] * torch.tensor([1.0, -1.0, -1.0, -1.0]), up)
+        a, b, c = (float(v) for v in to)
+        link = Link("stands", humanoid.bodies[head], top.name, "ball", to=(a, b, c))
+        close = near(humanoid.bodies[head], top.name, UP_M + self.length + NEAR_M)
+        stands = Switch(link.name, lambda sim: close(sim) & ~leans(sim), leans)
+        part = InScene(
+            sees=(top.name,),
+            events=(Tilted(top, self.spread, self.seed), stands),
+        )
+        chest = (humanoid.rows_of("spine") or (0,))[-1]
+        force, rate = (self.pushes, self.pushes), reference.rate_hz
+        push = Pushes(force, (2.0, 3.0), 0.1, (chest,), rate, self.seed)
+        pushes = (push,) if self.pushes else ()
+        known = {"head": head, "length": self.length}
+        return Stage(
+            (top,), (link,), (), (part, *pushes, Fictional(self, head)),
+            (ObsTerm("task/ball", ball_seen, known),),
+            (RewardTerm("task/above", above, 0.5, known, imitation=False),),
+            (DoneTerm("task/dropped", dropped),), True, yields=fictional,
+        )  # fmt: skip
+
+
+def fictional(given: Given | None) -> Given:
+    """What feels forces that are not simulated: a stiffness, or by a level the law that looks ahead."""
+    if isinstance(given, Compliance):
+        return replace(given, law="algorithm1")
+    return given or Stiffness(1000.0, 0.02, series=False)
+
+
+@dataclass(frozen=True)
+class Tilted:
+    """A rod that begins each episode upright but for a random tilt about X and Y.
+
+    Attributes:
+        rod: the prop.
+        spread: rad, to either side.
+        seed: of the draws.
+    """
+
+    rod: Rod
+    spread: float
+    seed: int
+
+    def __call__(self, sim: SceneSim, control_hz: float) -> _Tilted:
+        """The event in the worlds of a scene."""
+        return _Tilted(self, sim)
+
+
+class _Tilted(Drawn):
+    def __init__(self, event: Tilted, sim: SceneSim):
+        super().__init__(event.seed)
+        self._event, self._sim = event, sim
+
+    def begin(self, worlds: Tensor) -> None:
+        half = 0.5 * self.between(-self._event.spread, self._event.spread, len(worlds), 2)
+        qpos = torch.zeros(len(worlds), 7, dtype=torch.float64)
+        qpos[:, :3], qpos[:, 3] = torch.tensor(self._event.rod.pos), 1.0
+        qpos[:, 4:6] = half
+        qpos[:, 3:] /= qpos[:, 3:].norm(dim=1, keepdim=True)
+        here = self._sim.backend.device
+        still = torch.zeros(len(worlds), 6, dtype=torch.float64, device=here)
+        self._sim.place(self._event.rod.name, qpos.to(here), still, worlds)
+
+
+@dataclass(frozen=True)
+class Fictional:
+    """The fictional forces of `Balance`, as a plug-in.
+
+    Attributes:
+        given: the scene.
+        head: the body's row.
+    """
+
+    given: Balance
+    head: int
+
+    def __call__(self, goal: Goal, backend: Backend) -> Plugin:
+        """The plug-in of an environment."""
+        if not isinstance(backend, CharacterRows) or backend.sim is None:
+            raise PoiseError("'ball' needs the worlds of its scene", "ball")
+        return FictionalForces(self, backend, backend.sim, goal)
+
+
+class FictionalForces(Plugin):
+    """The fictional forces in N worlds.
+
+    Attributes:
+        asked: `(N, 6)` what a policy asks for in the control steps that come, at head and root, in units
+            of `UNIT_N` and the heading's axes, beside the linear law; None for nothing.
+    """
+
+    def __init__(self, given: Fictional, rows: CharacterRows, sim: SceneSim, goal: Goal):
+        self.asked: Tensor | None = None
+        self._given, self._rows, self._sim, self._goal = given, rows, sim, goal
+        like = rows.state.xpos
+        self._body = torch.tensor([given.head + 1, 1], device=like.device).repeat(rows.num_envs, 1)
+        self._force = like.new_zeros(rows.num_envs, 2, 3)
+
+    def follow(self, goal: Goal) -> None:
+        self._goal = goal
+
+    def push(self, drive: Drive) -> None:
+        """A control step begins: sets the forces that are held for it."""
+        law = self._given.given
+        off, moves = tipped(self._sim, law.length)
+        off = off - self._head()
+        # A ball that has fallen is let go.
+        up = (off[:, 2:] > 0.5 * law.length).to(off)
+        one = up * FLAT.to(off) * (law.gain * off + law.damping * moves)
+        force = torch.stack((one, one), 1).to(self._force)
+        if self.asked is not None:
+            local = UNIT_N * self.asked.unflatten(1, (2, 3)).to(self._force)
+            heading = heading_quat(self._rows.state.xquat[:, 1]).unsqueeze(1)
+            force = force + quat_rotate(heading.to(local).expand(-1, 2, -1), local)
+        size = force.norm(dim=-1, keepdim=True)
+        self._force = force * (MOST_N / size.clamp_min(MOST_N))
+
+    def _head(self) -> Tensor:
+        """`(N, 3)` where the head would be without giving way, m."""
+        goal = self._goal.goal if isinstance(self._goal, DisplacedGoal) else self._goal
+        return goal.layout.unpacked(goal.now()).pos[:, self._given.head]
+
+    def felt(self) -> Felt:
+        point = self._rows.state.xpos.gather(1, self._body.unsqueeze(-1).expand(-1, -1, 3))
+        return Felt(self._body, point, self._force, driven=False)
+
+
+def tipped(sim: SceneSim, length: float) -> tuple[Tensor, Tensor]:
+    """`(N, 3)` where the ball is, m, and how fast it moves, m/s."""
+    place, state = sim.scene.place("rod"), sim.backend.state
+    pos, quat = state.xpos[:, place.body], state.xquat[:, place.body]
+    arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
+    qvel = state.qvel[:, place.dofs]
+    return pos + arm, qvel[:, :3] + torch.linalg.cross(quat_rotate(quat, qvel[:, 3:]), arm)
+
+
+def leans(sim: SceneSim) -> Tensor:
+    """`(N,)` bool: the rod leans by more than 45 degrees, and falls off the head."""
+    return upright_of(sim) < COS_45
+
+
+def upright_of(sim: SceneSim) -> Tensor:
+    """`(N,)` the cosine of the rod's angle to upright."""
+    quat = sim.backend.state.xquat[:, sim.scene.place("rod").body].double()
+    return quat_rotate(quat, torch.tensor([0.0, 0.0, 1.0]).to(quat).expand(len(quat), 3))[:, 2]
+
+
+def ball_seen(frame: Frame, head: int, length: float) -> Tensor:
+    """p and v of ball and rod from the head, in the heading's axes `(N, 12)`, m and m/s."""
+    pos, quat, qvel = (frame.source(f"rod/{k}") for k in ("pos", "quat", "qvel"))
+    arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
+    spin, sim = quat_rotate(quat, qvel[:, 3:]), frame.sim
+    from_head, moves = pos - sim.pos[:, head], qvel[:, :3] - sim.linvel[:, head]
+    turning = torch.linalg.cross(spin, arm)
+    rows = (from_head + arm, moves + turning, from_head + 0.5 * arm, moves + 0.5 * turning)
+    return into_heading(sim.heading, torch.stack(rows, 1)).flatten(1)
+
+
+def above(frame: Frame, head: int, length: float) -> Tensor:
+    """r = exp(-2 |p_ball - p_head|^2) along the floor."""
+    pos, quat = frame.source("rod/pos"), frame.source("rod/quat")
+    arm = quat_rotate(quat, torch.tensor([0.0, 0.0, length]).to(quat).expand_as(pos))
+    off = (pos + arm - frame.sim.pos[:, head])[:, :2]
+    return torch.exp(-SHARPNESS * off.square().sum(-1))
+
+
+def dropped(frame: Frame) -> Tensor:
+    """`(N,)` bool: the rod leans by more than 45 degrees."""
+    quat = frame.source("rod/quat")
+    along = quat_rotate(quat, torch.tensor([0.0, 0.0, 1.0]).to(quat).expand(len(quat), 3))
+    return along[:, 2] < COS_45

@@ -1,0 +1,283 @@
+"""Scenes of compliance: what stands in them, where it goes, what a body cannot do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+
+from poise.body.humanoid import make_humanoid
+from poise.control import Compliance, Stiffness
+from poise.env.events import InScene, Push, ScenePart
+from poise.env.goals import DisplacedGoal
+from poise.errors import PoiseError
+from poise.jobs.open import open_run
+from poise.jobs.track import imitation_of
+from poise.jobs.track.placement import place
+from poise.motion import read_clip
+from poise.papers.compliant.scenes import (
+    SCENES,
+    Balance,
+    Doorway,
+    Hands,
+    PlayScene,
+    Pull,
+    Throws,
+    Trampoline,
+    ball,
+    door,
+    trampoline,
+)
+from poise.recipes.imitation import Imitation
+from poise.sim import Character, Scene, SceneSim
+from poise.sim.props import Door
+from toy_policy import WALK
+
+
+@pytest.fixture(scope="module")
+def task() -> Imitation:
+    tracker = open_run(None).tracker
+    return imitation_of(tracker, [place(read_clip(WALK), tracker)])
+
+
+def test_a_partner_goes_as_the_motion_goes(task: Imitation) -> None:
+    stage = Hands(lead=0.2, sway=0.1).stage(task.humanoid, task.reference)
+    (prop,), (link,), (part,) = stage.props, stage.links, stage.plugins
+    assert isinstance(part, InScene) and part.felt == (link.name,)
+    assert (link.a, link.b) == (prop.name, "lwrist")
+    path = part.events[0].path  # type: ignore[attr-defined]
+    t, h = torch.linspace(0.0, 3.0, 31), 1e-5
+    qvel = path(t)[1]
+    slope = (path(t.double() + h)[0] - path(t.double() - h)[0]) / (2 * h)
+    torch.testing.assert_close(qvel, slope, atol=1e-5, rtol=0)
+    # On the whole it is as fast as the walk, and 0.2 m/s faster.
+    pose, rate, n = task.reference.pose, task.reference.rate_hz, int(task.reference.length[0])
+    walk = float((pose.pos[n - 1, 0, :2] - pose.pos[0, 0, :2]).norm()) * rate / (n - 1)
+    seconds = torch.tensor([0.0, 4.0])
+    gone = path(seconds)[0]
+    assert float((gone[1, :2] - gone[0, :2]).norm()) / 4.0 == pytest.approx(walk + 0.2, abs=1e-5)
+    assert gone[0].abs().max() == 0.0
+
+
+def test_a_pull_and_throws(task: Imitation) -> None:
+    (push,) = Pull(30.0, "right", (0.0, 0.0, -2.0)).stage(task.humanoid, task.reference).plugins
+    assert isinstance(push, Push) and push.force == (0.0, 0.0, -30.0) and push.first == 15
+    assert task.humanoid.bodies[push.row] == "rwrist"
+    stage = Throws(mass=2.0).stage(task.humanoid, task.reference)
+    assert stage.props[0].mass == 2.0  # type: ignore[attr-defined]
+    assert len(stage.touches) == len(task.humanoid.bodies) + 1
+    assert set(SCENES) == {"throws", "pull", "hands", "door", "trampoline", "ball", "chicken"}
+
+
+def test_doors_of_all_widths_have_their_knob_at_the_hand(task: Imitation) -> None:
+    knobs: list[Tensor] = []
+    for width in (1.0, 1.7):
+        stage = Doorway(width).stage(task.humanoid, task.reference)
+        (leaf,) = stage.props
+        assert isinstance(leaf, Door) and leaf.width == width
+        knobs.append(torch.tensor(leaf.pos) + torch.tensor(leaf.knob))
+        assert [t.name for t in stage.obs] == ["task/phase", "task/knob"] and stage.from_start
+    torch.testing.assert_close(*knobs)
+    frame = round(door.GRIPS_S * task.reference.rate_hz)
+    row = task.humanoid.bodies.index("lwrist")
+    hand = task.reference.pose.pos[min(frame, int(task.reference.length[0]) - 1), row]
+    assert float((knobs[0] - hand).norm()) == pytest.approx(door.AHEAD_M, abs=1e-5)
+
+
+def test_what_a_door_s_knob_does_and_what_the_task_pays(task: Imitation) -> None:
+    stage = Doorway(1.0).stage(task.humanoid, task.reference)
+    things = (Character(task.humanoid), *stage.props)
+    sim = SceneSim(Scene(things, stage.links, sim=task.config.sim), 2, threads=1)
+    sim.place("door", torch.tensor([[0.0], [-0.7]]), torch.zeros(2, 1))
+    # Opened by 0.7 rad the knob moves along (cos .7, -sin .7); a force along it is not felt.
+    way = door.way(sim)
+    torch.testing.assert_close(way[1, :2], torch.tensor([math.cos(0.7), -math.sin(0.7)]).double())
+    force = 30.0 * way + torch.tensor([0.0, 0.0, 5.0])
+    part = SimpleNamespace(sim=sim)
+    torch.testing.assert_close(door.across(part, force), torch.tensor([[0.0, 0.0, 5.0]] * 2).double())  # type: ignore[arg-type]
+
+    class Seen:
+        def source(self, name: str) -> Tensor:
+            return {"door/qpos": torch.tensor([[0.0], [-0.7], [-1.0]])}[name]
+
+    # exp(-1.5 0.7) = 0.34994 closed, 1 from 0.7 rad on.
+    expected = torch.tensor([0.34994, 1.0, 1.0])
+    torch.testing.assert_close(door.opened(Seen()), expected, atol=1e-5, rtol=0)  # type: ignore[arg-type]
+
+
+def test_a_hand_that_keeps_away_from_the_knob_ends_the_episode(task: Imitation) -> None:
+    stage = Doorway(1.0).stage(task.humanoid, task.reference)
+    (end,) = stage.dones
+    away = torch.tensor([0.0, 0.3, 0.3, 0.3])
+
+    class Seen:
+        # At the knob; away from it before it is due, while it is held, and when it is let go.
+        phase = torch.tensor([2.0, 1.5, 2.0, 4.5]) / door.LASTS_S
+        sim = SimpleNamespace(
+            pos=torch.zeros(4, len(task.humanoid.bodies), 3),
+            quat=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, len(task.humanoid.bodies), 4),
+        )
+
+        def source(self, name: str) -> Tensor:
+            knob = end.params["knob"]
+            pos = torch.stack((away, 0 * away, 0 * away), 1) - knob
+            turn = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4)
+            return {"door/quat": turn, "door/pos": pos, "door/qpos": torch.zeros(4, 1)}[name]
+
+    missed = end.fn(Seen(), **end.params)  # type: ignore[arg-type]
+    assert missed.tolist() == [False, False, True, False]
+
+
+def test_a_door_that_nobody_gets_through(task: Imitation) -> None:
+    broad = door.breadth(task.humanoid, task.reference)
+    assert 0.25 < broad < 0.6
+    with pytest.raises(PoiseError, match=r"is 0\.2 m wide and the body 0\.\d\d m: it cannot pass"):
+        Doorway(0.2).stage(task.humanoid, task.reference)
+
+
+def test_a_trampoline_rises_every_3_s_and_carries_a_body(task: Imitation) -> None:
+    stage = Trampoline(0.1).stage(task.humanoid, task.reference)
+    (plate,), (part,) = stage.props, stage.plugins
+    # Under the middle of what the motion crosses.
+    way = task.reference.pose.pos[:, 0, :2]
+    assert plate.pos[:2] == pytest.approx((0.5 * (way.amin(0) + way.amax(0))).tolist(), abs=1e-5)
+    assert isinstance(part, InScene) and len(stage.touches) == len(task.humanoid.feet)
+    things = (Character(task.humanoid), plate)
+    scene = Scene(things, (), stage.touches, stage.floor, task.config.sim)
+    sim = SceneSim(scene, 2, threads=1)
+    place = sim.scene.place("trampoline")
+    assert place.coordinates == 3 and place.controls.stop - place.controls.start == 4
+    bounce = part.events[1](sim, 30.0)
+    assert isinstance(bounce, trampoline.Bouncing)
+    ctrl = sim.backend.drive.ctrl[:, place.controls]
+    up = list[int]()
+    for step in range(150):
+        bounce.before()
+        if bool((ctrl == 0.1).all()):
+            up.append(step)
+        else:
+            assert not ctrl.any()
+        bounce.steps += 1
+    assert up == [30, 31, 32, 33, 120, 121, 122, 123]
+    # At rest it carries itself, and 10 cm of control lift it by 10 cm.
+    ctrl[:] = 0.1
+    sim.place("", *_far_off(task))
+    sim.backend.step(240)
+    assert float(sim.backend.state.qpos[0, place.qpos][0]) == pytest.approx(0.1, abs=2e-3)
+    assert isinstance(stage.yields(None), Compliance) and not stage.yields(None).root
+    # Contacts are felt for a second from the one that follows the air.
+    one = torch.ones(2, 3).double()
+    part_of = SimpleNamespace(happenings=[bounce])
+    assert not trampoline.after_contact(part_of, one).any()  # type: ignore[arg-type]
+    bounce.gives[1] = 5
+    assert trampoline.after_contact(part_of, one)[:, 0].tolist() == [0.0, 1.0]  # type: ignore[arg-type]
+
+
+def _far_off(task: Imitation) -> tuple[Tensor, Tensor]:
+    """The motion's first pose, 50 m off."""
+    qpos = task.reference.qpos[:1].double().repeat(2, 1)
+    qpos[:, 0] += 50.0
+    return qpos, torch.zeros(2, qpos.shape[1] - 1).double()
+
+
+def test_a_ball_on_the_head(task: Imitation) -> None:
+    scene = Balance(spread=0.1, gain=0.0, damping=0.0, pushes=50.0)
+    stage = scene.stage(task.humanoid, task.reference)
+    own = replace(task.task, plugins=stage.plugins, compliance=stage.yields(None), dones=())
+    made = replace(task, task=own, props=stage.props, links=stage.links, config=task.config)
+    env = made.env(3, threads=1, auto_reset=False, help_scale=0.0, guard=False)
+    zero = torch.zeros(3, dtype=torch.long)
+    env.reset_to(zero, zero)
+    forces, part = env.plugin(ball.FictionalForces), env.plugin(ScenePart)
+    assert forces is not None and part is not None
+    cosine = ball.upright_of(part.sim)
+    assert bool((cosine > math.cos(0.15)).all()) and bool((cosine < 1.0).any())
+    # What a policy asks for is at head and root, in the heading's axes, and bounded.
+    forces.asked = torch.zeros(3, 6)
+    forces.asked[0, :3] = torch.tensor([0.0, 0.5, 0.0])
+    forces.asked[1, 3:] = torch.tensor([0.0, 0.0, 99.0])
+    env.step(env.action)
+    felt = forces.felt()
+    assert felt is not None
+    assert felt.force[0].norm(dim=-1).tolist() == pytest.approx([50.0, 0.0], abs=1e-4)
+    assert felt.force[1, 1].tolist() == pytest.approx([0.0, 0.0, ball.MOST_N], abs=1e-4)
+    assert not felt.driven and felt.body[0].tolist() == [env.goal.humanoid.rows_of("head")[-1] + 1, 1]
+    assert isinstance(env.goal, DisplacedGoal)
+    assert bool(env.goal.offset[0].any()) and not env.goal.offset[2].any()
+    # By the linear law it pushes the goal to where the ball leans.
+    forces.asked = None
+    env.step(env.action)
+    where, moves = ball.tipped(part.sim, scene.length)
+    head = env.goal.layout.unpacked(env.goal.goal.now()).pos[:, forces.felt().body[0, 0] - 1]
+    assert where.shape == moves.shape == head.shape == (3, 3)
+    env.close()
+    # The rod stands where it is tied: it does not slip off.
+    law = stage.yields(Compliance(0.1))
+    assert isinstance(law, Compliance) and law.law == "algorithm1"
+    assert isinstance(stage.yields(None), Stiffness)
+
+
+def test_what_balancing_sees_and_is_paid() -> None:
+    class Seen:
+        sim = SimpleNamespace(
+            pos=torch.tensor([[[0.0, 0.0, 1.5]]]), linvel=torch.zeros(1, 1, 3),
+            heading=torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]]),
+        )  # fmt: skip
+
+        def source(self, name: str) -> Tensor:
+            # A rod of 1 m that leans by 90 degrees along X and turns about Y by 2 rad/s.
+            half = math.sqrt(0.5)
+            return {
+                "rod/pos": torch.tensor([[0.0, 0.0, 1.7]]),
+                "rod/quat": torch.tensor([[half, 0.0, half, 0.0]]),
+                "rod/qvel": torch.tensor([[0.0, 0.0, 0.0, 0.0, 2.0, 0.0]]),
+            }[name]
+
+    paid = ball.above(Seen(), 0, 1.0)  # type: ignore[arg-type]
+    torch.testing.assert_close(paid, torch.tensor([math.exp(-2.0)]))
+    seen = ball.ball_seen(Seen(), 0, 1.0)[0]  # type: ignore[arg-type]
+    # Facing +Y, what is along X lies to the right, -Y; it goes down by 2 m/s.
+    expected = [0.0, -1.0, 0.2, 0.0, 0.0, -2.0, 0.0, -0.5, 0.2, 0.0, 0.0, -1.0]
+    torch.testing.assert_close(seen, torch.tensor(expected), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("scene", [Hands(), Pull(), Doorway()])
+def test_a_skeleton_without_hands(task: Imitation, scene: PlayScene) -> None:
+    table = task.humanoid.table
+    rows = tuple(replace(r, kind="forearm" if r.kind == "hand" else r.kind) for r in table.rows)
+    body = make_humanoid(task.humanoid.skeleton, replace(table, rows=rows))
+    with pytest.raises(PoiseError, match=r"the skeleton has no left hand, which '.*' needs"):
+        scene.stage(body, task.reference)
+
+
+def test_a_skeleton_without_a_head(task: Imitation) -> None:
+    table = task.humanoid.table
+    rows = tuple(replace(r, kind="neck" if r.kind == "head" else r.kind) for r in table.rows)
+    body = make_humanoid(task.humanoid.skeleton, replace(table, rows=rows))
+    with pytest.raises(PoiseError, match="the skeleton has no head, which 'ball' needs"):
+        Balance().stage(body, task.reference)
+
+
+@pytest.mark.parametrize(
+    ("made", "what"),
+    [
+        (lambda: Pull(0.0), "a pull needs a force above 0 N"),
+        (lambda: Pull(direction=(0.0, 0.0, 0.0)), "and a direction"),
+        (lambda: Pull(lasts_s=0.0), "lasts some time"),
+        (lambda: Hands(sway=2.0), "its sway below 1 m"),
+        (lambda: Doorway(0.0), "a door is 0 to 10 m wide"),
+        (lambda: Doorway(made_for=9.0), "a motion is made for 0.5 to 3 m"),
+        (lambda: Throws(mass=0.0), "must weigh above 0"),
+        (lambda: Trampoline(2.0), "a bounce is 0 to 1 m high"),
+        (lambda: Trampoline(first=3.0), "begins within 3 s"),
+        (lambda: Balance(length=0.0), "a rod is 0.1 to 5 m long"),
+        (lambda: Balance(pushes=-1.0), "a push has at least 0 N"),
+    ],
+)
+def test_scenes_that_are_none(made: object, what: str) -> None:
+    with pytest.raises(PoiseError, match=what):
+        made()  # type: ignore[operator]
