@@ -46,8 +46,8 @@ RUNS: dict[str, list[str]] = {
     "count": ["track", WALK, "-o", "{out}", "--controller", "policy", "--count", "3"],
     "own_body": ["track", DANCE, "-o", "{out}", "--controller", "policy", "--body", "own"],
     "range": [
-        "track", DANCE, "-o", "{out}", "--controller", "policy", "--from", "{tmp}/track_lookahead",
-        "--range", "0.5-1.2",
+        "track", DANCE, "-o", "{out}", "--budget=128", "--from", "{tmp}/track_lookahead", *ONE,
+        "--range", "0.5-1.5",
     ],
     "keypoints": ["track", DANCE, "-o", "{out}", "--controller", "policy", "--policy", "keypoints"],
     "imitate": [
@@ -60,9 +60,9 @@ RUNS: dict[str, list[str]] = {
     "perpetual_stages": [
         "train", "perpetual", "--library", "{lib}", "-o", "{out}", "--iterations=5", "--envs=64", *ONE,
     ],
-    "inbetween": ["inbetween", WALK, "-o", "{out}/walk.bvh", "--keyframes", "0,30,60,89"],
+    "inbetween": ["inbetween", WALK, "-o", "{out}/walk.bvh", "--keyframes", "0,30,60,85"],
     "complete": [
-        "complete", WALK, "-o", "{out}", "--keyframes", "0,30,60,89", "--controller", "policy", *ONE,
+        "complete", WALK, "-o", "{out}", "--keyframes", "0,30,60,85", "--controller", "policy", *ONE,
     ],
     "dream": ["dream", "-o", "{out}", "--seconds", "20", "--controller", "policy", "--seed", "3"],
     "door": ["play", "compliant", "door", "-o", "{out}", "--controller", "policy", "--count", "2", *ONE],
