@@ -37,7 +37,15 @@ RUNS: dict[str, list[str]] = {
     "track_policy": ["track", WALK, "-o", "{out}", "--controller", "policy"],
     "track_lookahead": ["track", DANCE, "-o", "{out}", "--controller", "lookahead", "--budget=64", *ONE],
     "track_search": [
-        "track", SPIN, "-o", "{out}", "--controller", "search", "--characters=64", "--rounds=1", *ONE,
+        "track",
+        SPIN,
+        "-o",
+        "{out}",
+        "--controller",
+        "search",
+        "--characters=64",
+        "--rounds=1",
+        *ONE,
     ],
     "recover": ["track", SPIN, "-o", "{out}", "--controller", "policy", "--recover"],
     "chain": ["track", WALK, DANCE, "-o", "{out}", "--controller", "policy"],
@@ -46,30 +54,75 @@ RUNS: dict[str, list[str]] = {
     "count": ["track", WALK, "-o", "{out}", "--controller", "policy", "--count", "3"],
     "own_body": ["track", DANCE, "-o", "{out}", "--controller", "policy", "--body", "own"],
     "range": [
-        "track", DANCE, "-o", "{out}", "--budget=128", "--from", "{tmp}/track_lookahead", *ONE,
-        "--range", "0.5-1.5",
+        "track",
+        DANCE,
+        "-o",
+        "{out}",
+        "--budget=128",
+        "--from",
+        "{tmp}/track_lookahead",
+        *ONE,
+        "--range",
+        "0.5-1.5",
     ],
     "keypoints": ["track", DANCE, "-o", "{out}", "--controller", "policy", "--policy", "keypoints"],
     "imitate": [
-        "imitate", WALK, "-o", "{out}", "--iterations", "20", "--from", "none", "--envs", "64", *ONE,
+        "imitate",
+        WALK,
+        "-o",
+        "{out}",
+        "--iterations",
+        "20",
+        "--from",
+        "none",
+        "--envs",
+        "64",
+        *ONE,
     ],
     "perpetual": [
-        "train", "perpetual", "--library", "{lib}", "-o", "{out}", "--iterations", "5", "--envs", "64",
-        "--single", "--no-style", *ONE,
+        "train",
+        "perpetual",
+        "--library",
+        "{lib}",
+        "-o",
+        "{out}",
+        "--iterations",
+        "5",
+        "--envs",
+        "64",
+        "--single",
+        "--no-style",
+        *ONE,
     ],
     "perpetual_stages": [
-        "train", "perpetual", "--library", "{lib}", "-o", "{out}", "--iterations=5", "--envs=64", *ONE,
+        "train",
+        "perpetual",
+        "--library",
+        "{lib}",
+        "-o",
+        "{out}",
+        "--iterations=5",
+        "--envs=64",
+        *ONE,
     ],
     "inbetween": ["inbetween", WALK, "-o", "{out}/walk.bvh", "--keyframes", "0,30,60,85"],
     "complete": [
-        "complete", WALK, "-o", "{out}", "--keyframes", "0,30,60,85", "--controller", "policy", *ONE,
+        "complete",
+        WALK,
+        "-o",
+        "{out}",
+        "--keyframes",
+        "0,30,60,85",
+        "--controller",
+        "policy",
+        *ONE,
     ],
     "dream": ["dream", "-o", "{out}", "--seconds", "20", "--controller", "policy", "--seed", "3"],
     "door": ["play", "compliant", "door", "-o", "{out}", "--controller", "policy", "--count", "2", *ONE],
     "hands": ["play", "compliant", "hands", "-o", "{out}", "--controller", "policy", "--count=2", *ONE],
     "doctor": ["doctor", DANCE, "--fix", "-o", "{out}/mended.bvh"],
     "retarget": ["retarget", DANCE, "--onto", WALK, "-o", "{out}/moved.bvh"],
-}  # fmt: skip
+}
 #: Keys and files that tell the time or the version.
 TIMES = re.compile(r"second|time|speed|_ms|version|wall|per_s$|created|host|stamp|digest", re.I)
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -106,7 +159,7 @@ def flat(value: Any, at: str = "") -> dict[str, Any]:
 
 
 def numbers(path: Path) -> tuple[Any, np.ndarray]:
-    """What must be the same, and numbers that may differ in the last digits."""
+    """The part of a file that must be the same, and its numbers, which may differ in the last digits."""
     if path.suffix == ".json":
         of = flat(json.loads(path.read_text()))
         real = {k: v for k, v in of.items() if isinstance(v, float | int) and not isinstance(v, bool)}

@@ -1,4 +1,4 @@
-"""What people use on dirty motion: filters, and a foot lock that is told the contacts. A part of
+"""Rivals on dirty motion: filters, and a foot lock that is told the contacts. A part of
 `repair.py`."""
 
 from __future__ import annotations

@@ -120,8 +120,8 @@ def test_long_pushes_are_weaker_and_some_episodes_have_none(task: Imitation) -> 
     assert float((lasts < 0.447).float().mean()) == pytest.approx(0.5, abs=0.1)
     # 20 N s: the whole 100 N for up to 0.2 s.
     assert size[lasts < 0.19].allclose(torch.tensor(100.0).double())
-    torch.testing.assert_close((size * lasts)[lasts > 0.3], torch.full_like(size, 20.0)[lasts > 0.3],
-                               rtol=0.12, atol=0.0)  # fmt: skip
+    impulse = (size * lasts)[lasts > 0.3]
+    torch.testing.assert_close(impulse, torch.full_like(impulse, 20.0), rtol=0.12, atol=0.0)
     assert float((plugin.left > 10**6).float().mean()) == pytest.approx(0.5, abs=0.1)
     env.close()
 

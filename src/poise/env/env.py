@@ -101,7 +101,7 @@ class ImitationEnv:
         named = {**observables.STANDARD, **task.observables}
         u = torch.zeros(self.num_envs, 6 + self.hinges, dtype=torch.float64, device=here)
         held = {"action": self.action, "age": self.age, **self.controls.sources()}
-        # Where nothing gives way, u is 0.
+        # u is 0 in tasks in which nothing gives way.
         held |= {"compliance/u": u, "compliance/level": u[:, 0]}
         for plugin in self.plugins:
             named |= plugin.observables

@@ -204,7 +204,7 @@ def _observed(imitation: Imitation) -> dict[str, Tensor]:
 
 def _measure(policy: PolicyBundle, imitation: Imitation, columns: Tensor, steps: int) -> None:
     """Sets mean and deviation of the inputs beside `columns` to those of what the policy meets."""
-    # What pushes do is only seen where they act.
+    # Inputs that tell of pushes are measured while characters are pushed.
     task = pushed(imitation.task, imitation.config, imitation.humanoid)
     env = replace(imitation, task=task).env(MEASURED_IN, threads=1, help_scale=0.0, guard=False)
     norm = RunningNorm(env.num_obs)

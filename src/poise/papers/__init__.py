@@ -1,5 +1,5 @@
 """Four papers, each a short package over the engine: what only its tables and its own scenes need.
 
-The engine never imports them; the command line may. What has a verb for any motion and what ships is in
-the engine.
+The engine never imports them; the command line may. The engine holds whatever has a verb for any
+motion, and whatever ships.
 """
