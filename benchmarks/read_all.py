@@ -1,6 +1,6 @@
 """Every motion file of the data set: is it read, is it recognised, how fast, and what is wrong with it.
 
-    python benchmarks/read_all.py --data FOLDER [--only PART] [--out docs/reading.md] [--json FILE.json]
+    python benchmarks/read_all.py --data FOLDER [--only PART] [--out benchmarks/notes/reading.md] [--json FILE.json]
 
 FOLDER holds `INDEX.tsv` (path, format, joints, fps, frames, ...) and the files that it lists. What the
 index does not tell, the true unit and vertical of each folder, stands in `GROUPS`.
@@ -233,7 +233,7 @@ def known(seen: list[Seen]) -> list[str]:
 
 
 def page(seen: list[Seen]) -> str:
-    """The page `docs/reading.md`."""
+    """The page `benchmarks/notes/reading.md`."""
     total = sum(s.seconds for s in seen)
     size = sum(s.megabytes for s in seen)
     read = [s for s in seen if s.facts]

@@ -13,8 +13,15 @@ _HEADING = re.compile(r"^#+ +(.+?) *$", re.MULTILINE)
 
 
 def pages() -> list[Path]:
-    """The markdown files at the root and under docs."""
-    return sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+    """The markdown files of the repository, but for tables that scripts of the benchmarks write."""
+    folders = ("docs", "benchmarks/notes", "benchmarks/tracker", "integrations", "src")
+    return sorted(
+        [
+            *ROOT.glob("*.md"),
+            ROOT / "benchmarks/README.md",
+            *(page for name in folders for page in (ROOT / name).rglob("*.md")),
+        ]
+    )
 
 
 def anchors(text: str) -> set[str]:

@@ -39,7 +39,7 @@ def bench_conformance(
     Args:
         steps: control steps.
         until: `time.monotonic()` after which no step begins.
-        cone: "pyramidal" or "elliptic"; the edges of MuJoCo Warp's pyramids differ, see docs/gpu.md.
+        cone: "pyramidal" or "elliptic"; the edges of MuJoCo Warp's pyramids differ, see docs/install.md.
     """
     model = copy.copy(imitation.model)
     model.opt.cone = int(getattr(mujoco.mjtCone, f"mjCONE_{cone.upper()}"))

@@ -30,7 +30,7 @@ def command() -> list[str]:
 
 
 def answer_of(words: Sequence[str]) -> dict[str, Any]:
-    """The answer of a verb, as docs/json.md has it. A lost motion is one; a refusal is raised.
+    """The answer of a verb, as docs/cli.md has it. A lost motion is one; a refusal is raised.
 
     ComfyUI's cancel button ends the process.
     """

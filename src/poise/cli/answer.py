@@ -1,4 +1,4 @@
-"""What a verb came to: exit code, files, and the one JSON document of `--json` (docs/json.md)."""
+"""What a verb came to: exit code, files, and the one JSON document of `--json` (docs/cli.md)."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Options:
     force: Flag = False
     """Write over a file that is there."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
     body: OmitArgPrefixes[Body] = field(default_factory=Body)
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 

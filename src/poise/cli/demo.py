@@ -38,7 +38,7 @@ class Options:
     force: Flag = False
     """Write over the results that are there."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
 
     @property
     def clip(self) -> Path:

@@ -24,7 +24,7 @@ class Options:
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a result or of a run."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
     rule: Annotated[Rule, arg(metavar="NAME")] = "phc"
     """When an episode has failed: phc, phc_strict, any_25cm, rfc_height or s2h_root."""
     starts: Annotated[int, arg(metavar="N")] = 1

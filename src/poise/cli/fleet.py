@@ -60,7 +60,7 @@ class Options:
     same files. By default the jobs run on this machine, without Ray."""
 
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:

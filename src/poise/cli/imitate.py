@@ -54,7 +54,7 @@ class Options:
     force: Flag = False
     """Write over files that are there."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
     body: OmitArgPrefixes[Body] = field(default_factory=Body)

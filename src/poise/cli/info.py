@@ -31,7 +31,7 @@ class Options:
     ] = ()
     """Motion files, or folders of them."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 

@@ -66,7 +66,7 @@ class Options:
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the noise, of blows and of lookahead."""
     json: Flag = False
-    """Print one JSON document at the end and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document at the end and nothing else on stdout, see docs/cli.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 

@@ -37,7 +37,7 @@ class Options:
     force: Flag = False
     """Write over files that are there."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
 
 
 def run(options: Options, argv: Sequence[str]) -> Answer:

@@ -71,7 +71,7 @@ class Options:
     overwrite: Flag = False
     """Write over files that are there."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 

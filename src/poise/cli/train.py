@@ -46,7 +46,7 @@ class Options:
     ] = ()
     """Motion files. compliant: the scene, ball or door."""
     json: Flag = False
-    """Print one JSON document and nothing else on stdout, see docs/json.md."""
+    """Print one JSON document and nothing else on stdout, see docs/cli.md."""
     training: OmitArgPrefixes[Training] = field(default_factory=Training)
     recipe_settings: OmitArgPrefixes[Chosen] = field(default_factory=Chosen)
     library: OmitArgPrefixes[Library] = field(default_factory=Library)

@@ -1,4 +1,4 @@
-"""The score card as a value, as a file, `score.json` with stable keys (docs/metrics.md), and in words:
+"""The score card as a value, as a file, `score.json` with stable keys (docs/python.md), and in words:
 labelled rows, each judged good, fair or poor by stated thresholds."""
 
 from __future__ import annotations
@@ -22,7 +22,18 @@ Weighting = Literal["frame", "episode"]
 
 @dataclass(frozen=True)
 class Help:
-    """The residual wrench's budget and use; `limit_*` inf means unlimited (null in JSON)."""
+    """The residual wrench's budget and use; `limit_*` inf means unlimited (null in JSON).
+
+    Attributes:
+        limit_n: the budget of a wrench's force, N: `help.limit_n` of `score.json`, and so on.
+        limit_nm: of its torque, N m: `help.limit_nm`.
+        force_mean_n: mean of |F|, N: `help.force_mean_n`.
+        force_p95_n: its 95th percentile: `help.force_p95_n`.
+        torque_mean_nm: mean of |T|, N m: `help.torque_mean_nm`.
+        torque_p95_nm: its 95th percentile: `help.torque_p95_nm`.
+        work_j_per_s: mean of |F v + T w|, J/s: `help.work_j_per_s`.
+        share_of_body_weight: the mean force over the body's weight: `help.share_of_body_weight`.
+    """
 
     limit_n: float
     limit_nm: float
@@ -40,18 +51,53 @@ NO_HELP = Help(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class ScoreCard:
-    """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.
+    """The figures of one evaluation; every field is a key of `score.json`.
 
-    NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
-    `kin.doctor.needs`. `raw` is there where the motion came with noise that was taken off: the error
-    beside what came in (`mpjpe_mm`, `mpjpe_global_mm`), and that noise (`noise_mm`, and `noise_hz`, NaN
-    from frame to frame). `detail` is what is left of the reference's movement at each frequency, of one
-    clip that is tracked, see `metrics.detail`, and `changed` its spells that physics changed most, see
-    `metrics.deviations`. `variants` holds the tracking figures by weighting
-    ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all frames, those
-    after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success and tracking
-    figures of action 0 from the same starts, `spread` their standard deviations over `starts` perturbed
-    starts; empty where that was not measured.
+    NaN means "not measured" and becomes null; unlimited help becomes null, too. Errors count up to the
+    first frame that breaks the rule. p is where a body is, r where the reference has it; differences are
+    those at 30 frames a second.
+
+    Attributes:
+        succ: share of episodes, one from every start frame with a second to come, that reach their end
+            within the rule.
+        succ_rule: the rule; rates under different rules do not compare.
+        mpjpe_mm: mean of |(p - p_root) - (r - r_root)| over bodies and frames, mm (PHC's E_mpjpe).
+        mpjpe_global_mm: mean of |p - r|, mm (PHC's E_g-mpjpe).
+        vel_mm_per_frame: mean of |Dp - Dr|, mm a frame (PHC's E_vel).
+        acc_mm_per_frame2: mean of |DDp - DDr|, mm a frame^2 (PHC's E_acc).
+        foot_slide_mm_per_s: mean horizontal speed of points of the feet in contact, mm/s.
+        penetration_mm: mean depth of the lowest point under the floor, mm.
+        float_mm: mean height of the lowest point where contact is due, mm.
+        jerk: mean of the third difference of the bodies' places, m/s^3.
+        reward: `total` and every term, mean over frames.
+        help: the residual wrench, below.
+        seconds: time of the training; 0 where nothing was trained.
+        samples: control steps of the training.
+        seed: of the training.
+        version: of Poise.
+        clip: the clip; up to three names, else their number.
+        method: the recipe.
+        episodes: how many.
+        frames: how many count.
+        mpjpe_succ_mm: `mpjpe_mm` over episodes that succeed.
+        tracked: share of episodes that succeed, upright and on their feet where the motion is.
+        needs: what a motion lacks besides a floor: `what`, `start_s`, `stop_s`.
+        raw: where noise was taken off: the error beside what came in (`mpjpe_mm`, `mpjpe_global_mm`),
+            and that noise (`noise_mm`, `noise_hz`, NaN from frame to frame).
+        detail: what is left of the reference's movement at each frequency, of one clip that is tracked.
+        changed: its spells that physics changed most: `start_s`, `stop_s`, `body`, `most_mm`.
+        reference: `foot_slide_mm_per_s`, `penetration_mm`, `float_mm`, `jerk` of the reference itself.
+        per_clip: each clip's figures, its earliest failure (`first_fail_s`), and of clips one after
+            another when each began and ended.
+        weighting: how figures are averaged, "frame" or "episode".
+        variants: tracking figures by weighting, for successes alone ("succ_frame", "succ_episode"), and
+            over all frames, those after a failure among them ("uncut_frame", "uncut_episode").
+        nothing: success and tracking figures of action 0 from the same starts.
+        starts: how often every episode was begun, a hair apart.
+        spread: standard deviations over these starts.
+        delivered: of each clip that was written: feet of `source`, `simulated` and `delivered` as `poise
+            doctor` says of a file, how far holding led the ankles (`held_mean_mm`, `held_max_mm`), and
+            feet that were `left`.
     """
 
     succ: float
@@ -199,7 +245,7 @@ THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
         "torque_mean_nm": Threshold(5.0, 25.0),
     }
 )
-"""By key of the score card, in its units; reasons in docs/metrics.md. `jerk_ratio` is jerk over the
+"""By key of the score card, in its units; shown in docs/python.md. `jerk_ratio` is jerk over the
 reference's jerk."""
 
 

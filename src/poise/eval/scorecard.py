@@ -1,4 +1,4 @@
-"""From padded rollouts to a score card; the definitions stand in docs/metrics.md."""
+"""From padded rollouts to a score card; the definitions stand in docs/results.md."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def score_rollouts(
     samples: int = 0,
     seed: int = 0,
 ) -> ScoreCard:
-    """Score an evaluation; every definition stands in docs/metrics.md.
+    """Score an evaluation; every definition stands in docs/results.md.
 
     An episode succeeds when it reached its end and no frame broke `rule`. All figures are over the
     valid frames up to and including the first that broke the rule, failed episodes included: what
@@ -253,7 +253,7 @@ def clip_figures(
     clip: Clip, joints: Sequence[int], shapes: Shapes, feet: Sequence[int], ground: float = 0.0
 ) -> dict[str, float]:
     """`point_slide_mm_per_s` (the score's foot slide, at the clip's own rate) and
-    `point_penetration_mm` of a clip with a character's shapes (docs/metrics.md).
+    `point_penetration_mm` of a clip with a character's shapes (docs/results.md).
 
     Args:
         joints: the clip's joint that each body of `shapes` is fixed to. feet: the bodies that are feet.

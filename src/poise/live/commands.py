@@ -1,5 +1,5 @@
 """What pages and programs may send, checked before anything else sees it: one JSON document a message,
-small, flat, of the kinds below and no others. The protocol is described in docs/live-protocol.md."""
+small, flat, of the kinds below and no others. The protocol is described in docs/live.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pure functions that score motion: tracking, plausibility, help; definitions in docs/metrics.md."""
+"""Pure functions that score motion: tracking, plausibility, help; definitions in docs/results.md."""
 
 from poise.metrics.help import HelpAudit, help_audit
 from poise.metrics.inbetween import l2p, l2q, npss, physics

@@ -97,7 +97,7 @@ class PageServer:
 
     Args:
         guard: what is let in; its port 0 takes a free one.
-        hello: what a page is told first, see docs/live-protocol.md.
+        hello: what a page is told first, see docs/live.md.
         inbox: where streams go.
         command: takes a checked command.
         figures: what is shown beside the characters, asked for a few times a second.

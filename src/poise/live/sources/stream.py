@@ -42,7 +42,7 @@ class Fits(Protocol):
 
 
 class JsonStream:
-    """What one connection sends, see docs/live-protocol.md.
+    """What one connection sends, see docs/live.md.
 
     Args:
         inbox: where packets go; what is refused is counted there.
