@@ -33,7 +33,7 @@ _UNITS = (
 )
 _NUMBER = r"(?<![\w.,])[-+±]?\d[\d,]*(?:\.\d+)?"
 FIGURE = re.compile(
-    rf"{_NUMBER}\s?(?:{_UNITS})(?![\w-])|{_NUMBER} of {_NUMBER}|(?<![\w.])\d*\.\d+(?![\w.])"
+    rf"{_NUMBER}\s?(?:{_UNITS})(?![\w-])|{_NUMBER} of {_NUMBER}|(?<![\w.])\d*\.\d+(?!\w|\.\w)"
 )
 
 

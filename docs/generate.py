@@ -212,11 +212,8 @@ def _signature(thing: Any, name: str) -> str:
         signature = inspect.signature(thing)
     except (TypeError, ValueError):
         return name
-    shown = [
-        _ADDRESS.sub("", str(p)).replace("<factory>", "...")
-        for p in signature.parameters.values()
-        if p.name != "self"
-    ]
+    told = [str(p) for p in signature.parameters.values() if p.name != "self"]
+    shown = [_ADDRESS.sub("", text).replace("<factory>", "...") for text in told]
     shown = [re.sub(r"^(\**\w+): '([^']*)'", r"\1: \2", s) for s in shown]
     back = signature.return_annotation
     arrow = (
