@@ -23,8 +23,8 @@ import torch
 from going_on import as_lesson, gone_on
 
 from poise.control import Compliance
-from poise.env.events import Pushes
-from poise.env.terms.phc_obs import style_terms
+from poise.env.observations import style_terms
+from poise.env.pushes import Pushes
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of, track
 from poise.jobs.track.placement import place

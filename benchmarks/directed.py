@@ -17,7 +17,7 @@ from poise.body import find_anatomy
 from poise.jobs.open import open_run
 from poise.jobs.track import track
 from poise.jobs.track.direction import Direction
-from poise.kin.directed import Pin, TouchPoint
+from poise.kinematics.directed import Pin, TouchPoint
 from poise.motion import Clip, read_clip, trim
 
 #: Walks, jumps, dances and everyday motion; six seconds of each at most.

@@ -27,8 +27,8 @@ from speed import machine
 
 from poise.learn.checkpoint import write_atomic
 from poise.motion import Clip, read_clip, resample, write_clip
-from poise.spatial import quat_mul, slerp
-from poise.view.svg import line_plot
+from poise.motion.rotations import quat_mul, slerp
+from poise.score.report.svg import line_plot
 
 RATE = 30.0
 #: Frames from one clip to the next, and how far the next may be turned by, rad.

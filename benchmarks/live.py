@@ -33,9 +33,9 @@ from speed import machine
 
 from poise.jobs.open import open_run
 from poise.live.characters import FALLS, RETURNS
-from poise.live.config import LiveConfig
+from poise.live.commands import LiveConfig
 from poise.live.session import Live
-from poise.live.sources.file import Loop, packet_of
+from poise.live.sources import Loop, packet_of
 from poise.motion import Clip, read_clip
 
 

@@ -30,9 +30,8 @@ from speed import machine
 from live import serve
 from poise.errors import PoiseError
 from poise.jobs.track import track
-from poise.kin import retarget
-from poise.live.sources.vmc import messages
-from poise.live.vrm import standard, t_pose, to_unity
+from poise.kinematics import retarget
+from poise.live.vmc import messages, standard, t_pose, to_unity
 from poise.motion import Clip, read_clip, resample
 
 #: s that it stands before the motion, Hz of the messages.

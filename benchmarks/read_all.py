@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 from poise.errors import PoiseError
-from poise.kin import by_kind, examine
+from poise.kinematics import by_kind, examine
 from poise.motion import describe, read_clip
 
 ASF = 0.0254 / 0.45

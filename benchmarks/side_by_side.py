@@ -20,8 +20,8 @@ import torch
 from poise.env import Reference
 from poise.jobs.open import open_run
 from poise.jobs.track import Keeper, imitation_of
-from poise.jobs.track.crowd import crowd
 from poise.jobs.track.placement import place
+from poise.jobs.track.supports import crowd
 from poise.jobs.tracker import Tracker
 from poise.motion import read_clip
 

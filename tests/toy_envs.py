@@ -10,7 +10,9 @@ import torch
 
 from poise.control import PDTargets, range_scale
 from poise.env import DoneTerm, ImitationEnv, ObsTerm
-from poise.env.terms import done, phc_obs, phc_reward
+from poise.env import observations as phc_obs
+from poise.env import rewards as done
+from poise.env import rewards as phc_reward
 from poise.motion import Clip
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation

@@ -8,7 +8,7 @@ import poise
 from poise.jobs.perpetual import run as perpetual_run
 from poise.learn import PPOConfig, Until
 from poise.motion import Clip, ClipLibrary, read_clip, trim
-from poise.recipes.perpetual import Perpetual
+from poise.recipes.perpetual_settings import Perpetual
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 PPO = PPOConfig(

@@ -19,10 +19,12 @@ from poise.errors import PoiseError
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.learn import ConvergenceConfig, Until
+from poise.learn.composer import Composer
 from poise.motion import ClipLibrary, write_clip
-from poise.nets import Composer
-from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual.shapes import BodyShapes, shaped
+from poise.recipes import perpetual as task
+from poise.recipes.perpetual import build
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.shapes import BodyShapes, shaped
 from toy_policy import PPO, toy_run, walk
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

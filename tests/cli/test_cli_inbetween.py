@@ -10,7 +10,7 @@ import pytest
 
 from poise.cli.main import main
 from poise.jobs.inbetween.fill import shipped_model
-from poise.learn.model import load_model
+from poise.learn.inbetween import load_model
 from poise.motion import read_clip
 
 

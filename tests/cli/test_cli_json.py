@@ -13,7 +13,7 @@ import pytest
 from tiny_clips import MINIATURE
 
 import poise
-from poise.cli.answer import Answer, document
+from poise.cli.console import Answer, document
 from poise.cli.main import VERBS, main
 from poise.errors import PoiseError
 from poise.motion import read_clip, trim, write_clip
@@ -110,7 +110,7 @@ def test_faults_and_unknown_verbs(
         print("a library prints")
         raise ZeroDivisionError
 
-    monkeypatch.setattr("poise.motion.io.read_clip", broken)
+    monkeypatch.setattr("poise.formats.read_clip", broken)
     found = answered("info", short, code=1)
     assert "ZeroDivisionError" in found["error"]["what"] and "fault of Poise" in found["error"]["hint"]
 

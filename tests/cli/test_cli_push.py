@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from poise.cli.answer import LOST
+from poise.cli.console import LOST
 from poise.cli.main import main
 from poise.motion import read_clip
 from toy_policy import WALK

@@ -114,7 +114,7 @@ def test_bandais_root_survives_the_file(data_dir, tmp_path: Path, capsys) -> Non
     out = tmp_path / "out.bvh"
     assert main(["retarget", str(source), "--onto", str(target), "-o", str(out)]) == 0
     made = read_clip(out)
-    from poise.kin import retarget
+    from poise.kinematics import retarget
 
     wanted, _ = retarget(read_clip(source), read_clip(target))
     assert np.abs(made.positions() - wanted.positions()).max() < 1e-3

@@ -8,9 +8,11 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
+from poise.env import observations as obs
+from poise.env import rewards as done
+from poise.env import rewards as reward
 from poise.env.frame import Frame, Pose
-from poise.env.terms import done, obs, reward
-from poise.spatial import (
+from poise.motion.rotations import (
     axis_angle_to_quat,
     euler_to_quat,
     heading_quat,

@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from poise.env import ImitationEnv, RewardTerm
+from poise.env.evaluate import MANY, record
 from poise.env.frame import Frame, LazyPose
-from poise.env.recording import record
-from poise.env.terms.evaluate import MANY
-from poise.sim import CpuBackend, body_linear_velocity_w
-from poise.spatial import (
+from poise.motion.rotations import (
     euler_to_quat,
     heading_quat,
     quat_angle,
@@ -25,6 +23,7 @@ from poise.spatial import (
     quat_rotate_inv,
     quat_to_matrix,
 )
+from poise.sim import CpuBackend, body_linear_velocity_w
 from toy_human import swing
 
 #: MB that a recording's constant takes, more than what the C library keeps of what is freed, and how

@@ -12,10 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from poise.body import generate_table, make_humanoid
 from poise.env import ObsTerm, RewardTerm
+from poise.env import observations as phc_obs
+from poise.env import rewards as done
+from poise.env import rewards as phc_reward
 from poise.env.frame import Frame, PointGoal, Pose
-from poise.env.terms import done, phc_obs, phc_reward
 from poise.errors import PoiseError
-from poise.spatial import axis_angle_to_quat, heading_quat, normalize, quat_mul, quat_rotate
+from poise.motion.rotations import axis_angle_to_quat, heading_quat, normalize, quat_mul, quat_rotate
 from toy_human import human
 
 N, B, J, H = 3, 5, 4, 6

@@ -9,9 +9,9 @@ import torch
 
 from poise.control import range_scale
 from poise.env import ImitationEnv
+from poise.env import rewards as phc_reward
+from poise.env.evaluate import MANY, seen_by
 from poise.env.style import ClipFeatures, ClipWindows
-from poise.env.terms import phc_reward
-from poise.env.terms.evaluate import MANY, seen_by
 from poise.errors import PoiseError
 from poise.recipes.imitation import Imitation
 from poise.sim import make_backend

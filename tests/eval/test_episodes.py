@@ -12,7 +12,12 @@ import torch
 from poise.control import ExplicitResidual
 from poise.env import Reference
 from poise.errors import PoiseError
-from poise.eval import (
+from poise.jobs.runs import score
+from poise.learn import Policy
+from poise.motion import ClipLibrary
+from poise.recipes import ResidualForce, build
+from poise.recipes.imitation import Imitation
+from poise.score import (
     Nothing,
     perturb,
     run_episodes,
@@ -21,12 +26,7 @@ from poise.eval import (
     simulate,
     start_frames,
 )
-from poise.eval.episodes import OFF_RAD
-from poise.jobs.runs import score
-from poise.learn import Policy
-from poise.motion import ClipLibrary
-from poise.recipes import ResidualForce, build
-from poise.recipes.imitation import Imitation
+from poise.score.episodes import OFF_RAD
 from poise.sim import UnstableError
 from toy_human import swing
 

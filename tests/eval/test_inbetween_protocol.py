@@ -15,19 +15,11 @@ import torch
 from inbetween import truth_rows
 from inbetween_baselines import Baseline
 
-from poise.eval.inbetween import (
-    BANDAI,
-    LAFAN1,
-    Protocol,
-    deviation,
-    evaluate,
-    slide,
-    test_set,
-)
-from poise.eval.inbetween import TestSet as InbetweenTestSet
+from poise.learn.transition import Layout
 from poise.motion import read_clip
 from poise.motion.windows import LAFAN1_FACING, pack_frames, without_still_root
-from poise.nets.transition import Layout
+from poise.score.gaps import BANDAI, LAFAN1, Protocol, deviation, evaluate, slide, test_set
+from poise.score.gaps import TestSet as InbetweenTestSet
 
 # pytest would take the function for a test.
 make_test_set = test_set

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.eval import table
-from poise.eval.card import read_score, write_score
-from poise.eval.rolloutset import RolloutSet
-from poise.eval.scorecard import PLAUSIBILITY, TRACKING, score_rollouts
 from poise.metrics import KINDS, Shapes
+from poise.score import table
+from poise.score.card import read_score, write_score
+from poise.score.rollouts import RolloutSet
+from poise.score.scorecard import PLAUSIBILITY, TRACKING, score_rollouts
 
 KEYS = [
     "succ", "succ_rule", "mpjpe_mm", "mpjpe_global_mm", "vel_mm_per_frame", "acc_mm_per_frame2",

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.eval import Nothing, Transitions, record_transitions
 from poise.jobs.open import Run, open_run
+from poise.score import Nothing, Transitions, record_transitions
 from toy_policy import toy_run
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from poise.eval import THRESHOLDS, Help, ScoreCard, Threshold, table
+from poise.score import THRESHOLDS, Help, ScoreCard, Threshold, table
 
 
 def card(**changes):

@@ -8,13 +8,14 @@ from typing import Any
 import pytest
 
 from poise.control import ImplicitResidual
-from poise.env.terms import phc_reward, reward
+from poise.env import rewards as phc_reward
+from poise.env import rewards as reward
 from poise.errors import PoiseError
 from poise.jobs.inbetween.training import Inbetween
 from poise.jobs.presets import NAMES, preset_of
 from poise.recipes import ResidualForce, build
-from poise.recipes.perpetual import Perpetual
 from poise.recipes.perpetual import build as build_perpetual
+from poise.recipes.perpetual_settings import Perpetual
 from poise.settings import from_data, to_data
 from toy_human import swing
 

@@ -12,7 +12,7 @@ import torch
 
 import poise
 from poise.control import Stiffness
-from poise.env.events import OnePush, Push
+from poise.env.pushes import OnePush, Push
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import TrackConfig, imitation_of, track, write

@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from poise.env import ImitationEnv, Reference
-from poise.env.goals.led import RETURNS, TRACKS, LedGoal
+from poise.env.led import RETURNS, TRACKS, LedGoal
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import recovering, track, write
-from poise.jobs.track.parts import cut, parts_of
 from poise.jobs.track.placement import home, place, place_all
+from poise.jobs.track.story import cut, parts_of
 from poise.jobs.tracker import Tracker
 from poise.motion import Clip, read_clip, shifted, trim
 from poise.plan import LookaheadConfig

@@ -16,9 +16,8 @@ from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track import Tracked, track, write
 from poise.jobs.track.direction import Direction, Weight
-from poise.jobs.track.retaking import FADE_S, SETTLE_S, eased, part_of
+from poise.jobs.track.retaking import FADE_S, SETTLE_S, changed_s, eased, part_of
 from poise.jobs.track.simulation import FILE, Retake, Simulation, read_simulation, retake_of
-from poise.jobs.track.splice import changed_s
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.motion import Clip, read_clip, trim, write_clip

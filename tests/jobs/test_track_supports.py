@@ -15,7 +15,7 @@ from poise.jobs.track import TrackConfig, track, write
 from poise.jobs.track.placement import place
 from poise.jobs.track.supports import at_home, on_body
 from poise.jobs.tracker import Tracker
-from poise.kin.supports import Support, read_supports
+from poise.kinematics.supports import Support, read_supports
 from poise.motion import read_clip
 from toy_policy import walk
 

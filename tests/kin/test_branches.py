@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from poise.kin.hinges import best_path, euler_path, wrapped
+from poise.kinematics.coords import best_path, euler_path, wrapped
 
 
 def test_the_path_is_that_of_brute_force_for_every_joint():

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from poise.body import BodyTable, find_anatomy, generate_table
-from poise.kin import clip_to_qpos, qpos_to_clip
-from poise.kin.fk import Kinematics
+from poise.kinematics import clip_to_qpos, qpos_to_clip
+from poise.kinematics.forward import Kinematics
 from poise.motion import Clip
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 from rigs import Rig, rig
 
 VARIANTS = [

@@ -10,7 +10,7 @@ import torch
 
 from poise.body import generate_table
 from poise.errors import PoiseError
-from poise.kin import Kinematics, clip_to_qpos, fit_humanoid, qpos_to_clip
+from poise.kinematics import Kinematics, clip_to_qpos, fit_humanoid, qpos_to_clip
 from poise.motion import Clip, read_clip, trim, write_clip
 from toy_human import human, swing
 

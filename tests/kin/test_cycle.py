@@ -10,10 +10,17 @@ import torch
 
 from poise.body import generate_table
 from poise.env import Reference
-from poise.kin import clip_to_qpos, close_cycle, cycle_step, cycle_velocity, fit_humanoid, qpos_velocity
-from poise.kin.cycle import join_cycle
+from poise.kinematics import (
+    clip_to_qpos,
+    close_cycle,
+    cycle_step,
+    cycle_velocity,
+    fit_humanoid,
+    qpos_velocity,
+)
+from poise.kinematics.loops import join_cycle
 from poise.motion import ClipLibrary, read_clip
-from poise.spatial import heading_quat, quat_angle, quat_conj, quat_mul, rotvec_to_quat
+from poise.motion.rotations import heading_quat, quat_angle, quat_conj, quat_mul, rotvec_to_quat
 from toy_human import human, swing
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from poise.kin.fading import LATE_S, FadingFilter, of_points
-from poise.kin.stream_noise import SAMPLES
+from poise.kinematics.stream_noise import LATE_S, SAMPLES, FadingFilter, of_points
 
 POINTS = 8
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
-from poise.kin import Kinematics, fit_humanoid, lowest_height, qpos_velocity
+from poise.kinematics import Kinematics, fit_humanoid, lowest_height, qpos_velocity
 from poise.motion import read_clip
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 from toy_human import human, swing
 
 

@@ -7,9 +7,16 @@ import pytest
 import torch
 
 from poise.body import generate_table
-from poise.kin import Kinematics, clip_to_qpos, contact_labels, fit_ground, fit_humanoid, lowest_height
-from poise.kin.feet.contact import stance_heights
-from poise.kin.ground import SINK_M
+from poise.kinematics import (
+    Kinematics,
+    clip_to_qpos,
+    contact_labels,
+    fit_ground,
+    fit_humanoid,
+    lowest_height,
+)
+from poise.kinematics.feet import stance_heights
+from poise.kinematics.ground import SINK_M
 from poise.motion import read_clip, resample
 from toy_human import human, swing
 

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from poise.kin import chain_angles, chain_quat
-from poise.spatial import euler_to_quat, normalize, quat_angle, quat_conj, quat_mul, quat_to_euler
+from poise.kinematics import chain_angles, chain_quat
+from poise.motion.rotations import (
+    euler_to_quat,
+    normalize,
+    quat_angle,
+    quat_conj,
+    quat_mul,
+    quat_to_euler,
+)
 
 ORDERS = ["".join(p) for p in itertools.permutations("XYZ")]
 ONE = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)

@@ -10,10 +10,10 @@ import torch
 
 import toy_human
 from poise.errors import PoiseError
-from poise.kin import limb_of, match_positions, two_bone
-from poise.kin.limbs import soft_reach
+from poise.kinematics import limb_of, match_positions, two_bone
+from poise.kinematics.limbs import soft_reach
 from poise.motion import read_clip
-from poise.spatial import (
+from poise.motion.rotations import (
     forward_kinematics,
     frame_quat,
     normalize,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from poise.kin.loops import best_period, overlap_of, repeated
+from poise.kinematics.loops import best_period, overlap_of, repeated
 from poise.metrics import jerk
 from poise.motion import Clip, trim
-from poise.spatial import quat_distance
+from poise.motion.rotations import quat_distance
 from toy_walker import walker
 
 

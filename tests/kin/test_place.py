@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
-from poise.kin import (
+from poise.kinematics import (
     clean_clip,
     clip_to_qpos,
     fit_ground,
@@ -16,10 +16,10 @@ from poise.kin import (
     place_on_body,
     retarget,
 )
-from poise.kin.hinges import within_turns
+from poise.kinematics.coords import within_turns
 from poise.motion import Clip, resample
-from poise.motion.spectrum import white_mm
-from poise.spatial import quat_mul, rotvec_to_quat
+from poise.motion.rotations import quat_mul, rotvec_to_quat
+from poise.motion.smoothing import white_mm
 from toy_human import human, swing
 
 

@@ -14,11 +14,10 @@ from poise.jobs.open import open_run
 from poise.jobs.track.placement import place
 from poise.jobs.track.tracking import imitation_of
 from poise.jobs.tracker import Tracker
-from poise.kin import lowest_height
-from poise.kin.solids import poses_of
-from poise.kin.supports import Support, find_supports, read_supports
-from poise.kin.supports.room import face, rectangle
-from poise.kin.supports.wrench import FRICTION, asked
+from poise.kinematics import lowest_height
+from poise.kinematics.find_supports import FRICTION, asked, find_supports
+from poise.kinematics.forward import poses_of
+from poise.kinematics.supports import Support, face, read_supports, rectangle
 from poise.motion import Clip
 from toy_policy import walk
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from poise.kin import examine, heal
-from poise.kin.travel import find_travel, in_place, travelled
+from poise.kinematics import examine, heal
+from poise.kinematics.travel import find_travel, in_place, travelled
 from poise.motion import Clip
-from poise.spatial import quat_distance
+from poise.motion.rotations import quat_distance
 from toy_human import swing
 from toy_walker import walker
 
@@ -135,7 +135,7 @@ def test_a_mended_loop_stays_in_place_and_closes() -> None:
     rot = np.array(clip.rot)
     half = 0.5 * slip / 0.7
     turn = np.stack((np.cos(half), 0 * half, np.sin(half), 0 * half), -1)
-    from poise.spatial import quat_mul
+    from poise.motion.rotations import quat_mul
 
     rot[:, j] = quat_mul(torch.tensor(turn), torch.tensor(rot[:, j])).numpy()
     healed = heal(clip.replaced(rot=rot))
@@ -146,7 +146,7 @@ def test_a_mended_loop_stays_in_place_and_closes() -> None:
 
 def turned(clip: Clip, angle: float) -> Clip:
     """The clip turned about the vertical."""
-    from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
+    from poise.motion.rotations import axis_angle_to_quat, quat_mul, quat_rotate
 
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     turn = axis_angle_to_quat(up, torch.tensor(angle, dtype=torch.float64))

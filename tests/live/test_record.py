@@ -14,8 +14,8 @@ import pytest
 
 from poise.errors import PoiseError
 from poise.jobs.open import open_run
-from poise.kin import clip_to_qpos
-from poise.live.sinks.record import Recorder
+from poise.kinematics import clip_to_qpos
+from poise.live.record import Recorder
 from poise.motion import read_clip
 
 

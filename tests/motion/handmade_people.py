@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from poise.motion.io.raw import vectors_from_z_up
+from poise.formats.raw import vectors_from_z_up
 
 NAMES = (
     *("RHip", "LHip", "RKnee", "LKnee", "RAnkle", "LAnkle", "RBigToe", "LBigToe", "RShoulder"),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
 from poise.motion import Clip, describe, read_clip, trim, write_clip
-from poise.spatial import forward_kinematics
+from poise.motion.rotations import forward_kinematics
 
 UNIT = 0.0254 / 0.45
 

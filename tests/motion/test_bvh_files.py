@@ -11,9 +11,9 @@ import torch
 from handmade_motion_files import BVH_HEADER, bvh_rows, bvh_text, put
 
 from poise.errors import PoiseError
+from poise.formats import WRITERS
 from poise.motion import Clip, Skeleton, read_clip, trim, write_bvh, write_clip
-from poise.motion.io import WRITERS
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 
 TRAVEL = """HIERARCHY
 ROOT joint_Root
@@ -65,7 +65,7 @@ def test_rotation_order_is_the_channels_order(tmp_path: Path) -> None:
     row = " ".join(["0 90 0"] + ["0"] * 6 + ["90 90 0"] + ["0"] * 6)
     clip = read_clip(put(tmp_path, "a.bvh", bvh_text([row] * 3)))
     tip = torch.tensor([[0.0, 0.0, 0.2]], dtype=torch.float64)  # file (0, 20, 0) cm
-    from poise.spatial import quat_rotate
+    from poise.motion.rotations import quat_rotate
 
     got = quat_rotate(torch.tensor(clip.rot[:1, 2]), tip)[0].numpy()
     np.testing.assert_allclose(got, [0.2, 0.0, 0.0], atol=1e-12)

@@ -12,9 +12,9 @@ from handmade_fbx_files import BONES, fbx_text, travel, turns
 from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
+from poise.formats import fbx as fbx_read
+from poise.formats.fbx_scene import skeleton
 from poise.motion import read_clip
-from poise.motion.io.fbx import read as fbx_read
-from poise.motion.io.fbx.scene import skeleton
 
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx")
 

@@ -10,8 +10,8 @@ from handmade_rigs import FPS, Rig, fbx_of, walker
 from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
+from poise.formats.table import read_skeleton
 from poise.motion import Clip, read_clip
-from poise.motion.io.formats import read_skeleton
 
 pytest.importorskip("ufbx")
 

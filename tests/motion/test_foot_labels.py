@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
-from poise.kin import anatomy_of, examine, retarget, support_of
+from poise.formats.named_arrays import SKELETONS
+from poise.formats.smpl import LAYOUTS
+from poise.kinematics import anatomy_of, examine, retarget, support_of
 from poise.motion import Clip, read_clip, trim
-from poise.motion.edits import backwards
-from poise.motion.io.numpy.kimodo import SKELETONS
-from poise.motion.io.numpy.smpl_table import LAYOUTS
-from poise.motion.mirror import mirrored_clip
+from poise.motion.clip import backwards
 from poise.motion.roles import find_roles
 from poise.motion.skeleton import rest_positions
+from poise.motion.windows import mirrored_clip
 
 FRAMES = 30
 #: Joints of the walk that comes with Poise, in the order of SMPL.

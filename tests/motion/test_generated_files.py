@@ -10,12 +10,12 @@ import torch
 from handmade_numpy_files import amass
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
+from poise.formats.named_arrays import SKELETONS
+from poise.formats.smpl import LAYOUTS
 from poise.motion import Clip
-from poise.motion.io import read_clip, write_clip
-from poise.motion.io.numpy.kimodo import SKELETONS
-from poise.motion.io.numpy.smpl_table import LAYOUTS
+from poise.motion.rotations import quat_to_matrix, rotvec_to_quat
 from poise.motion.skeleton import posed
-from poise.spatial import quat_to_matrix, rotvec_to_quat
 from toy_human import swing
 
 FRAMES = 24

@@ -13,7 +13,7 @@ from handmade_gltf_files import QUARTER_X, Gltf, person, put, turn, walker
 from poise.body import generate_table
 from poise.errors import PoiseError
 from poise.motion import read_clip
-from poise.spatial import quat_to_matrix, slerp
+from poise.motion.rotations import quat_to_matrix, slerp
 
 
 def wxyz(q: tuple[float, float, float, float]) -> torch.Tensor:

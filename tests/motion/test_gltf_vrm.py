@@ -9,8 +9,7 @@ import pytest
 from handmade_gltf_files import Gltf, put, turn
 
 from poise.motion import Skeleton, read_clip, write_clip
-from poise.motion.joint_map import map_joints
-from poise.motion.roles import find_roles
+from poise.motion.roles import find_roles, map_joints
 from toy_human import swing
 
 #: VRM's bones with their parents and places in m, Y up.

@@ -17,7 +17,7 @@ from handmade_motion_files import bvh_text, deepmimic_text
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip, trim, write_clip
-from poise.spatial import quat_distance
+from poise.motion.rotations import quat_distance
 from toy_human import swing
 
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

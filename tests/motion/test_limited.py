@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from poise.errors import PoiseError
-from poise.motion.io import limited
-from poise.motion.io.limited import read_limited
+from poise.formats import limited
+from poise.formats.limited import read_limited
 
 
 def job(folder: Path, body: str) -> Path:
@@ -77,7 +77,7 @@ def test_memory_has_a_limit_that_grows_with_the_file(tmp_path: Path) -> None:
 def test_where_nothing_can_be_limited_files_are_read_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from poise.motion.io import apart
+    from poise.formats import apart
 
     monkeypatch.setitem(sys.modules, "resource", None)
     apart.limit(1.0, 1 << 20)

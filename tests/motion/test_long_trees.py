@@ -11,10 +11,10 @@ from handmade_gltf_files import Gltf
 
 from poise.body.topology import find_limbs
 from poise.errors import PoiseError
+from poise.formats.nodes import unique_names
+from poise.formats.text import MAX_JOINTS
 from poise.motion import find_roles, read_clip
 from poise.motion.info import describe
-from poise.motion.io.nodes import unique_names
-from poise.motion.io.text import MAX_JOINTS
 
 
 def chain(count: int) -> str:

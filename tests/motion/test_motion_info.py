@@ -68,7 +68,7 @@ def test_lying_people_keep_their_vertical(data_dir: Path, tmp_path: Path) -> Non
 def _turned(clip, quarter: int):  # type: ignore[no-untyped-def]
     import torch
 
-    from poise.spatial import quat_mul, quat_rotate
+    from poise.motion.rotations import quat_mul, quat_rotate
 
     half = np.pi / 4 * quarter
     q = torch.tensor([np.cos(half), 0, 0, np.sin(half)], dtype=torch.float64)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats.own import pack_clips, unpack_clips
 from poise.motion import Channel, Clip, Source, read_clip, trim
-from poise.motion.pack import pack_clips, unpack_clips
 from toy_human import swing
 
 

@@ -17,9 +17,9 @@ import pytest
 from handmade_numpy_files import aist, poselib, save_npy, save_npz, save_pickle
 
 from poise.errors import PoiseError
+from poise.formats import pickles
+from poise.formats.pickles import load_plain, loads_restricted, named_arrays
 from poise.motion import read_clip, write_clip
-from poise.motion.io.numpy import pickles
-from poise.motion.io.numpy.pickles import load_plain, loads_restricted, named_arrays
 
 
 def load_restricted(path):  # type: ignore[no-untyped-def]
@@ -174,7 +174,7 @@ def test_damaged_pickles_never_break_out() -> None:
 
 
 def test_no_instruction_is_known_that_calls_or_looks_up() -> None:
-    from poise.motion.io.numpy.pickles import _STEPS
+    from poise.formats.pickles import _STEPS
 
     known = {op.name for op in pickletools.opcodes}
     assert set(_STEPS) <= known

@@ -10,14 +10,13 @@ import pytest
 from handmade_numpy_files import amass, save_npz
 
 from poise.errors import PoiseError
+from poise.formats.c3d import c3d_points
+from poise.formats.point_arrays import HUMANML3D, array_points, mdm_points
+from poise.formats.point_fit import FitConfig, fit_clip, fit_distances
+from poise.formats.point_raw import assemble_points
+from poise.formats.point_tables import csv_points, trc_points
+from poise.formats.raw import ReadOptions
 from poise.motion import Clip, read_clip
-from poise.motion.io.points.arrays import HUMANML3D, array_points, mdm_points
-from poise.motion.io.points.c3d import c3d_points
-from poise.motion.io.points.csv import csv_points
-from poise.motion.io.points.raw import assemble_points
-from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import ReadOptions
-from poise.motion.points import FitConfig, fit_clip, fit_distances
 
 # A standing person in a file's Y-up axes, facing +Z, left at +X, m.
 PERSON = {

@@ -12,13 +12,13 @@ import torch
 
 from poise.body.parts import find_anatomy
 from poise.errors import PoiseError
+from poise.formats.markers import find_places, split_label
+from poise.formats.point_fit import FitConfig, fit_clip, fit_distances
+from poise.formats.point_noise import drop_spikes, fill, longest_stretch, smooth
+from poise.formats.point_skeleton import hold_lengths, steady_twist
 from poise.motion import Clip, read_clip
 from poise.motion.keypoints import Keypoints
-from poise.motion.points import FitConfig, fit_clip, fit_distances
-from poise.motion.points.clean import drop_spikes, fill, longest_stretch, smooth
-from poise.motion.points.labels import find_places, split_label
-from poise.motion.points.solve import hold_lengths, steady_twist
-from poise.spatial import quat_angle, quat_between
+from poise.motion.rotations import quat_angle, quat_between
 
 # A standing body that faces -Y with the left at +X, m.
 BODY = {

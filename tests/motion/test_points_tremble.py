@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-from poise.kin import examine
+from poise.formats.point_fit import FitConfig, fit_clip
+from poise.kinematics import examine
 from poise.motion import Clip, read_clip
 from poise.motion.keypoints import Keypoints
-from poise.motion.points import FitConfig, fit_clip
 from poise.motion.skeleton import Source
 
 

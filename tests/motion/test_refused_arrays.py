@@ -15,11 +15,10 @@ from handmade_numpy_files import aist, amass, odd_clip, poselib, save_npy, save_
 from test_points_files import NAMES, walking, write_c3d
 
 from poise.errors import PoiseError
+from poise.formats import arrays as array_files
+from poise.formats import c3d, pickles
+from poise.formats.arrays import directory_bytes
 from poise.motion import read_clip, write_clip
-from poise.motion.io.numpy import arrays as array_files
-from poise.motion.io.numpy import pickles
-from poise.motion.io.numpy.zips import directory_bytes
-from poise.motion.io.points import c3d
 
 
 def refusal(path: Path) -> str:

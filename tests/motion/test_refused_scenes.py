@@ -148,7 +148,7 @@ def test_joints_under_another_root_are_left_out(tmp_path: Path) -> None:
 
 @needs_ufbx
 def test_fbx_files_of_two_takes_and_beyond_the_limits(tmp_path: Path) -> None:
-    from poise.motion.io.fbx.scene import read
+    from poise.formats.fbx_scene import read
 
     path = tmp_path / "a.fbx"
     path.write_text(fbx_text())

@@ -9,7 +9,7 @@ import pytest
 from handmade_rigs import FPS, Rig, bvh_of, fbx_of, gltf_of, skeleton_of, usda_of, walker
 
 from poise.motion import Clip, read_clip, write_clip
-from poise.motion.edits import trim
+from poise.motion.clip import trim
 
 FORMATS = ("bvh", "glb", "usda", "fbx")
 

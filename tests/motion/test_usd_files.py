@@ -14,14 +14,14 @@ from handmade_numpy_files import odd_clip
 
 from poise.errors import PoiseError
 from poise.motion import Clip, read_clip, write_clip
-from poise.spatial import quat_distance
+from poise.motion.rotations import quat_distance
 
 
 @pytest.fixture
 def pxr() -> Any:
     usd = pytest.importorskip("pxr.Usd")
     assert usd is not None
-    from poise.motion.io.usd.read import pxr_package
+    from poise.formats.usd import pxr_package
 
     return pxr_package()
 

@@ -12,8 +12,8 @@ from handmade_rigs import FPS, Rig, skeleton_of, usda_of, walker
 from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
+from poise.formats.table import read_skeleton
 from poise.motion import Clip, read_clip, write_clip
-from poise.motion.io.formats import read_skeleton
 
 pytest.importorskip("pxr")
 

@@ -9,16 +9,9 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.nets.between import (
-    Between,
-    BetweenConfig,
-    Dropout,
-    carried,
-    last_before_gap,
-    neighbours,
-)
-from poise.nets.transition import Layout, joint_positions
-from poise.spatial import quat_rotate, slerp
+from poise.learn.between import Between, BetweenConfig, Dropout, carried, last_before_gap, neighbours
+from poise.learn.transition import Layout, joint_positions
+from poise.motion.rotations import quat_rotate, slerp
 from toy_windows import SMALL, bank, known, layout, moved
 
 

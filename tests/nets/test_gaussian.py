@@ -5,7 +5,7 @@ import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
 from poise.errors import PoiseError
-from poise.nets import MLP, GaussianPolicy, gaussian_entropy, gaussian_kl, gaussian_log_prob
+from poise.learn.networks import MLP, GaussianPolicy, gaussian_entropy, gaussian_kl, gaussian_log_prob
 
 G = torch.Generator().manual_seed(0)
 MEAN, OTHER, X = (torch.randn(4, 6, 5, generator=G, dtype=torch.float64) for _ in range(3))

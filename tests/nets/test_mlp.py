@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.nets import ACTIVATIONS, MLP
+from poise.learn.networks import ACTIVATIONS, MLP
 
 
 def make(seed: int = 0, **options) -> MLP:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from poise.nets import RunningNorm
+from poise.learn.networks import RunningNorm
 
 
 def stream(batches: int = 5) -> list[torch.Tensor]:

@@ -8,7 +8,8 @@ import torch
 from scipy.stats import norm as normal
 
 from poise.errors import PoiseError
-from poise.nets import Composer, ProgressiveNet, gaussian_log_prob, product_of_gaussians
+from poise.learn.composer import Composer, product_of_gaussians
+from poise.learn.networks import ProgressiveNet, gaussian_log_prob
 
 
 def rng(seed: int = 0) -> torch.Generator:

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from poise.nets.rtn import PLU, RTN, Critic, RTNConfig, arrival_embedding, noise_scale
-from poise.nets.transition import Layout
-from poise.spatial import quat_rotate
+from poise.learn.rtn import PLU, RTN, Critic, RTNConfig, arrival_embedding, noise_scale
+from poise.learn.transition import Layout
+from poise.motion.rotations import quat_rotate
 from toy_windows import SMALL_RTN, bank, known, layout, moved
 
 

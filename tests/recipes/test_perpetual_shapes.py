@@ -10,23 +10,19 @@ import pytest
 import torch
 
 from poise.body import make_humanoid
-from poise.env.body_assignment import BodyAssignment, differing
-from poise.env.terms import phc_obs
+from poise.env import observations as phc_obs
+from poise.env.reference import BodyAssignment, differing
 from poise.errors import PoiseError
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.stage_trainer import StageTrainer
-from poise.kin import Kinematics, retarget
+from poise.kinematics import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
 from poise.motion import ClipLibrary, read_clip, resample
+from poise.recipes import perpetual as task
 from poise.recipes.imitation import Imitation
-from poise.recipes.perpetual import Perpetual, build, task
-from poise.recipes.perpetual.shapes import (
-    GROUPS,
-    BodyShapes,
-    scaled_skeleton,
-    scaled_table,
-    shaped,
-)
+from poise.recipes.perpetual import build
+from poise.recipes.perpetual_settings import Perpetual
+from poise.recipes.shapes import GROUPS, BodyShapes, scaled_skeleton, scaled_table, shaped
 from poise.sim import CpuBackend, alone
 from toy_library import library, tiny
 

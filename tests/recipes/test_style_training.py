@@ -11,7 +11,9 @@ import torch
 
 from poise.control import PDTargets, range_scale
 from poise.env import DoneTerm, ObsTerm
-from poise.env.terms import done, phc_obs, phc_reward
+from poise.env import observations as phc_obs
+from poise.env import rewards as done
+from poise.env import rewards as phc_reward
 from poise.errors import PoiseError
 from poise.learn import Amp, AmpConfig, PPOConfig
 from poise.motion import read_clip

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from poise.spatial import (
+from poise.motion.rotations import (
     axis_heading,
     forward_kinematics,
     matrix_kinematics,

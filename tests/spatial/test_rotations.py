@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from poise import spatial
+from poise.motion import rotations as spatial
 
 ORDERS = ["".join(p) for p in itertools.permutations("XYZ")]
 DTYPES = [(torch.float64, 1e-12), (torch.float32, 2e-6)]

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from poise.spatial import forward_kinematics, normalize, quat_mul, quat_rotate
+from poise.motion.rotations import forward_kinematics, normalize, quat_mul, quat_rotate
 
 PARENTS = (-1, 0, 1, 1, 3, 0)
 

@@ -9,9 +9,8 @@ import torch
 
 from poise.jobs.inbetween.fill import inbetween
 from poise.motion import Clip
-from poise.spatial import forward_kinematics
-from poise.synth.flight import fall_s, flight_speeds, flown
-from poise.synth.limits import ALOFT_M, off_floor
+from poise.motion.rotations import forward_kinematics
+from poise.synthesis.limits import ALOFT_M, fall_s, flight_speeds, flown, off_floor
 from toy_human import swing
 
 FPS = 30.0

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from poise.kin.doctor.doctor import examine
+from poise.kinematics.repair.doctor import examine
 from poise.motion import Clip
-from poise.spatial import forward_kinematics
-from poise.synth.footsteps import stepped
-from poise.synth.limits import Motion, excess, fastest, standing_heights
-from poise.synth.step_plans import planned
+from poise.motion.rotations import forward_kinematics
+from poise.synthesis.footsteps import stepped
+from poise.synthesis.limits import Motion, excess, fastest, standing_heights
+from poise.synthesis.steps import planned
 from toy_human import swing
 
 FPS = 30.0

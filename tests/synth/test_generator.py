@@ -10,21 +10,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from poise.env.goals import GeneratorGoal
+from poise.env.generator import GeneratorGoal
 from poise.errors import PoiseError
 from poise.jobs.endless.model import GeneratorModel, load_generator
 from poise.jobs.endless.training import Endless, Motions, balanced, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
-from poise.learn.cvae import CVAEObjective, CVAETraining, Frames, falling, settling
+from poise.learn.cvae import (
+    CVAE,
+    Code,
+    CosineCVAE,
+    CVAEConfig,
+    CVAEObjective,
+    CVAETraining,
+    Frames,
+    cosines,
+    falling,
+    settling,
+)
 from poise.motion import ClipLibrary
-from poise.nets.cosine_cvae import CosineCVAE, cosines
-from poise.nets.cvae import CVAE, Code, CVAEConfig
-from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
-from poise.synth.codes import Codes
-from poise.synth.generator import Kinematic
-from poise.synth.place_free import ROOT, coordinates, features_of
+from poise.motion.rotations import axis_angle_to_quat, quat_mul, quat_rotate
+from poise.synthesis.generator import ROOT, Codes, Kinematic, coordinates, features_of
 from toy_policy import walk
 
 SMALL = CVAEConfig(past=10, future=12, latent=8, hidden=32, layers=(32,))

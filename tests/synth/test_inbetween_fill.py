@@ -10,14 +10,13 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.learn.adapt import Adaptation
-from poise.learn.model import InbetweenModel, load_model, make_net, save_model
+from poise.formats.own import pack_clips, unpack_clips
+from poise.learn.between import Between
+from poise.learn.inbetween import Adaptation, InbetweenModel, load_model, make_net, save_model
 from poise.motion import Clip, Skeleton
-from poise.motion.pack import pack_clips, unpack_clips
-from poise.nets.between import Between
-from poise.spatial import quat_conj, quat_distance, quat_mul
-from poise.synth.inbetween import Filling, fill_keyframes
-from poise.synth.other_rig import OtherRig
+from poise.motion.rotations import quat_conj, quat_distance, quat_mul
+from poise.synthesis.filler import Filling, OtherRig
+from poise.synthesis.inbetween import fill_keyframes
 from toy_human import human, swing
 from toy_windows import SMALL, SMALL_RTN, bank, layout
 

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from poise.jobs.inbetween.fill import inbetween
-from poise.spatial import quat_angle, quat_conj, quat_mul
-from poise.synth.limits import calmed, excess, fastest, off_floor
-from poise.synth.seams import spread
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
+from poise.synthesis.limits import calmed, excess, fastest, off_floor, spread
 from toy_human import human, swing, turn
 
 FPS = 30.0

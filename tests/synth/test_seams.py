@@ -7,8 +7,7 @@ import torch
 
 from poise.errors import PoiseError
 from poise.motion import Skeleton
-from poise.motion.windows import foot_joints
-from poise.spatial import (
+from poise.motion.rotations import (
     axis_angle_to_quat,
     forward_kinematics,
     normalize,
@@ -16,9 +15,10 @@ from poise.spatial import (
     quat_conj,
     quat_mul,
 )
-from poise.synth.footlock import lock_feet
-from poise.synth.gaps import check_keyframes, split_gaps
-from poise.synth.seams import fade, meet, sampled
+from poise.motion.windows import foot_joints
+from poise.synthesis.filler import check_keyframes, split_gaps
+from poise.synthesis.footsteps import lock_feet
+from poise.synthesis.limits import fade, meet, sampled
 from toy_human import swing, turn
 
 

@@ -14,10 +14,10 @@ from poise.errors import PoiseError
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track.direction import direction_of
-from poise.kin.directed import PELVIS, TouchPoint, directed
+from poise.kinematics.directed import PELVIS, TouchPoint, directed
 from poise.motion import Clip, read_clip, write_clip
 from poise.plan import LookaheadConfig
-from poise.synth.sparse import Partial, moved_to, partials_of, timed, times_of
+from poise.synthesis.inbetween import Partial, moved_to, partials_of, timed, times_of
 from toy_human import swing
 from toy_policy import walk
 

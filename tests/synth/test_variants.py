@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from test_inbetween_fill import model
 
-from poise.learn.model import make_net
+from poise.learn.between import Between
+from poise.learn.inbetween import make_net
 from poise.motion.windows import FrameBank
-from poise.nets.between import Between
-from poise.synth.inbetween import Filling, fill_keyframes
-from poise.synth.variants import ASIDE_M, TURNED, Detour, drawn, through
+from poise.synthesis.filler import ASIDE_M, TURNED, Detour, Filling, drawn, through
+from poise.synthesis.inbetween import fill_keyframes
 from toy_human import swing
 from toy_windows import SMALL, bank, layout
 

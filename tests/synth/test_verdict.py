@@ -7,13 +7,12 @@ import pytest
 import torch
 from test_inbetween_fill import model
 
-from poise.kin.doctor.faults import KINDS
+from poise.kinematics.repair.faults import KINDS
 from poise.motion import Clip
-from poise.synth.filler import Filler
-from poise.synth.gaps import Gap
-from poise.synth.inbetween import Filling, fill_keyframes
-from poise.synth.limits import Feet
-from poise.synth.verdict import JUDGED, GapFault, distance, judged, told, weight
+from poise.synthesis.filler import Filler, Filling, Gap
+from poise.synthesis.inbetween import fill_keyframes
+from poise.synthesis.limits import Feet
+from poise.synthesis.rounds import JUDGED, GapFault, distance, judged, told, weight
 from toy_human import swing
 
 

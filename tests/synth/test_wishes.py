@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import torch
 
-from poise.env.goals import EndlessGoal
+from poise.env.generator import EndlessGoal
 from poise.jobs.endless.model import load_generator
 from poise.jobs.open import open_run
-from poise.synth.codes import Codes
-from poise.synth.wishes import FEWEST, Wishes
+from poise.synthesis.generator import FEWEST, Codes, Wishes
 
 SIZES = (FEWEST, FEWEST - 1, FEWEST + 4, FEWEST)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from poise.view.data import Report, Shape, Track
+from poise.score.report.data import Report, Shape, Track
 
 BODIES = (
     "pelvis",

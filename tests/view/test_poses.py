@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
-from poise.view import PoseRow, pose_rows
-from poise.view.poses import _busiest
+from poise.score.report import PoseRow, pose_rows
+from poise.score.report.svg import _busiest
 from toy_human import swing
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from fake_report import make_report
 
-from poise.view.data import Shape
-from poise.view.report import render
+from poise.score.report.data import Shape
+from poise.score.report.page import render
 
 _CHROMIUM = next(
     (

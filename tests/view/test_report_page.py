@@ -15,8 +15,8 @@ from fake_report import make_report, score
 from markupsafe import escape
 
 from poise.errors import PoiseError
-from poise.view.data import Shape, Track, foot_bodies, hold_finite, payload, safe_json
-from poise.view.report import render, write_report
+from poise.score.report.data import Shape, Track, foot_bodies, hold_finite, payload, safe_json
+from poise.score.report.page import render, write_report
 
 FRAMES = 40
 

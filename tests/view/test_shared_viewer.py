@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from fake_report import make_report
 
-from poise.view.report import render
+from poise.score.report.page import render
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 

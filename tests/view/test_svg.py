@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from poise.view.svg import bar_plot, line_plot, short, ticks
+from poise.score.report.svg import bar_plot, line_plot, short, ticks
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 from fake_report import make_report, score
 
-from poise.view.report import render
-from poise.view.table import amount, score_rows
-from poise.view.verdict import THRESHOLDS, grades, help_given, overall, percent, sentence
+from poise.score.report.page import amount, render, score_rows
+from poise.score.report.verdict import THRESHOLDS, grades, help_given, overall, percent, sentence
 
 
 def test_sentence_of_a_good_run():
@@ -64,7 +63,7 @@ def test_thresholds_are_stated_beside_the_figures():
 
 
 def test_thresholds_are_those_of_the_score_card():
-    verdicts = pytest.importorskip("poise.eval.card")
+    verdicts = pytest.importorskip("poise.score.card")
     for key, bounds in THRESHOLDS.items():
         card = verdicts.THRESHOLDS[key]
         assert (card.good, card.fair) == bounds, key

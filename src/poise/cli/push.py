@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from poise.cli.answer import LOST, Answer
-from poise.cli.console import print_card, say
-from poise.cli.options import Flag, InPlace, Reading, check_range
-from poise.cli.output import places
-from poise.cli.progress import working
+from poise.cli.console import LOST, Answer, print_card, say
+from poise.cli.options import Flag, InPlace, Reading, check_range, places
+from poise.cli.training import working
 from poise.errors import PoiseError
 from poise.jobs.keep import claimed, may_deliver
 

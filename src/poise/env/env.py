@@ -9,17 +9,16 @@ import torch
 from torch import Tensor
 
 from poise.control import Wrench
-from poise.env import observables
+from poise.env import frame as observables
 from poise.env.controls import Controls
+from poise.env.evaluate import Sources, Terms, seen_by
 from poise.env.frame import FIELDS, Frame, Pose, placed
-from poise.env.goals.goal import Goal
-from poise.env.make import displaced_goal, goal_of, plugins_of
+from poise.env.goal import Goal
 from poise.env.plugins import Ended, Plugin, combined, ends_of
 from poise.env.reference import Reference
 from poise.env.snapshot import Snapshot, put, put_state, state_of, take
 from poise.env.style import ClipFeatures, ClipWindows
-from poise.env.task import EnvStep, StepLog, TaskConfig
-from poise.env.terms.evaluate import Sources, Terms, seen_by
+from poise.env.task import EnvStep, StepLog, TaskConfig, displaced_goal, goal_of, plugins_of
 from poise.errors import PoiseError
 from poise.machine import one_thread
 from poise.sim import Backend, NanGuard
@@ -35,7 +34,7 @@ class ImitationEnv:
 
     Args:
         goal: what the characters are to do; a `Reference` is followed clip by clip.
-        task: the terms, and what the environment holds beside them (`env.make`).
+        task: the terms, and what the environment holds beside them (`env.task`).
         substeps: physics steps of a control step.
         weights: `(C,)` odds with which clips are drawn, see `Starts`.
         fused: terms are recorded once and replayed as a whole, see `Terms`; off, one by one.

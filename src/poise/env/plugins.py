@@ -18,7 +18,7 @@ from poise.env.frame import Frame, Observable
 from poise.sim import Drive
 
 if TYPE_CHECKING:
-    from poise.env.goals import Goal
+    from poise.env.goal import Goal
 
 #: Coordinates of episodes' starts: qpos `(n, nq)` and qvel `(n, nv)`, float64.
 Start = tuple[Tensor, Tensor]
@@ -73,7 +73,7 @@ class Plugin:
 
     @property
     def observables(self) -> Mapping[str, Observable]:
-        """Observables by name; they come before those of `env.observables`."""
+        """Observables by name; they come before those of `env.frame`."""
         return {}
 
     def sources(self) -> Mapping[str, Tensor]:

@@ -35,9 +35,9 @@ from poise.jobs.tracker import (
     policy_of_run,
 )
 from poise.learn import PolicyBundle, load_checkpoint
-from poise.learn.model import MODEL, InbetweenModel, load_model
-from poise.recipes.perpetual.config import config_of as perpetual_config
-from poise.recipes.perpetual.task import RECIPE as PERPETUAL
+from poise.learn.inbetween import MODEL, InbetweenModel, load_model
+from poise.recipes.perpetual import RECIPE as PERPETUAL
+from poise.recipes.perpetual_settings import config_of as perpetual_config
 from poise.recipes.residual_force import RECIPE as RESIDUAL_FORCE
 from poise.recipes.residual_force import build, config_of
 from poise.settings import check_data, from_data
@@ -45,9 +45,9 @@ from poise.settings import check_data, from_data
 if TYPE_CHECKING:
     import numpy as np
 
-    from poise.eval import ScoreCard, Transitions
     from poise.motion import Clip
     from poise.recipes.imitation import Imitation
+    from poise.score import ScoreCard, Transitions
 
 #: The name of the recipe of in-betweening networks.
 INBETWEEN = "inbetween"

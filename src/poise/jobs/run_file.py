@@ -23,9 +23,9 @@ from torch import Tensor
 from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.errors import PoiseError
+from poise.formats.own import pack_clips, unpack_clips
 from poise.learn import LATEST, load_checkpoint, save_checkpoint
 from poise.motion import ClipLibrary, Skeleton
-from poise.motion.pack import pack_clips, unpack_clips
 from poise.settings import to_data
 
 #: The file that says what a run is.

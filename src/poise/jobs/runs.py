@@ -16,19 +16,6 @@ from poise.body import Humanoid
 from poise.env import Acts, ImitationEnv
 from poise.env.help import scale_in
 from poise.errors import PoiseError
-from poise.eval import (
-    TRACKING,
-    Nothing,
-    Recording,
-    RolloutSet,
-    ScoreCard,
-    Transitions,
-    record_transitions,
-    run_episodes,
-    run_in_batches,
-    score_rollouts,
-    start_frames,
-)
 from poise.jobs.run_file import (
     FINAL,
     RUN_FILE,
@@ -48,11 +35,24 @@ from poise.learn import (
     load_policy,
     run,
 )
-from poise.learn.lock import only_writer
+from poise.learn.checkpoint import only_writer
 from poise.learn.parallel import ALONE, Comm, together
 from poise.motion import ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import RECIPE, ResidualForce, build, config_of, most_help
+from poise.score import (
+    TRACKING,
+    Nothing,
+    Recording,
+    RolloutSet,
+    ScoreCard,
+    Transitions,
+    record_transitions,
+    run_episodes,
+    run_in_batches,
+    score_rollouts,
+    start_frames,
+)
 from poise.settings import to_data
 
 

@@ -21,19 +21,18 @@ from poise.body import BodyTable, Humanoid
 from poise.body.humanoid import make_humanoid
 from poise.env.recovery.clips import RecoveryClips
 from poise.errors import PoiseError
+from poise.formats.own import pack_clips, unpack_clips
 from poise.jobs.library.clips import Target
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.run_file import FINAL, RUN_FILE, RunFile
 from poise.jobs.runs import policy_for
-from poise.kin import RetargetConfig, onto_own, own_body
+from poise.kinematics import RetargetConfig, onto_own, own_body
 from poise.learn import LATEST, PolicyBundle, Value, load_checkpoint, save_checkpoint
-from poise.learn.checkpoint import PolicyMeta
+from poise.learn.checkpoint import PolicyMeta, prefixed, under
 from poise.learn.policy import policy_in
-from poise.learn.state import prefixed, under
 from poise.motion import Clip, trim
-from poise.motion.pack import pack_clips, unpack_clips
-from poise.recipes.perpetual import RECIPE, Perpetual
-from poise.recipes.perpetual.config import config_of
+from poise.recipes.perpetual import RECIPE
+from poise.recipes.perpetual_settings import Perpetual, config_of
 from poise.settings import check_data, to_data
 from poise.version import __version__
 

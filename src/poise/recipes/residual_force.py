@@ -8,9 +8,9 @@ Yuan and Kitani, NeurIPS 2020; the motion imitation half.
 | Sec. 5 additive action u = q^ + du      | `control.PDTargets` (additive), the default            |
 | Sec. 4.1 RFC-Explicit, Eqs. 2, 3        | `control.ExplicitResidual`                             |
 | Sec. 4.2 RFC-Implicit, Eqs. 4, 5        | `control.ImplicitResidual`                             |
-| App. B.1 world reward, Eqs. 7 to 11     | `env.terms.reward`, `world_rewards`                    |
-| App. B.2 local reward, Eqs. 12 to 14    | `env.terms.reward`, `local_rewards`                    |
-| App. C early termination                | `env.terms.done.root_too_low`                          |
+| App. B.1 world reward, Eqs. 7 to 11     | `env.rewards`, `world_rewards`                    |
+| App. B.2 local reward, Eqs. 12 to 14    | `env.rewards`, `local_rewards`                    |
+| App. C early termination                | `env.rewards.root_too_low`                          |
 | Table 4 PPO                             | `learn.PPOConfig.paper()`                              |
 """
 
@@ -34,8 +34,11 @@ from poise.control import (
     SuccessHelp,
 )
 from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
+from poise.env import observations as next_frames
+from poise.env import observations as obs
+from poise.env import rewards as done
+from poise.env import rewards as reward
 from poise.env.frame import TermFunction
-from poise.env.terms import done, next_frames, obs, reward
 from poise.learn import PPOConfig
 from poise.motion import Clip
 from poise.recipes.imitation import Clips, Imitation, fitted
@@ -61,7 +64,7 @@ class ResidualForce:
             `help_steps`, control steps of each world (Skeleton2Humanoid Eq. 9, `control.LinearHelp`).
         reward: world (App. B.1) or local (App. B.2).
         observation: reference (state and next reference frame), phase (the paper's), or
-            Skeleton2Humanoid's state with one or two next frames (`env.terms.next_frames`).
+            Skeleton2Humanoid's state with one or two next frames (`env.observations`).
         action: additive or absolute.
         faithful: to the paper or to its authors' code where their values disagree (rotation angle or
             half of it; reward weights).

@@ -13,7 +13,7 @@ from torch import Tensor
 from poise.errors import PoiseError
 from poise.sim.backend import Backend, SimState
 from poise.sim.drive import Drive
-from poise.sim.index import Place
+from poise.sim.links import Place
 from poise.sim.worlds import check_state, row_index
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from poise.errors import PoiseError, did_you_mean
+from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.sim.links import FAR_M
 from poise.sim.make import make_backend
 from poise.sim.rows import CharacterRows
 from poise.sim.scene import Scene, alone
-from poise.spatial import quat_conj, quat_mul, quat_rotate
 
 #: m; things that begin deeper in one another are a mistake.
 DEEP_M = 0.03

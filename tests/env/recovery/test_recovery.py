@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from poise.env import DoneTerm, ImitationEnv, ObsTerm, Recovery
-from poise.env.recovery.clock import RecoveryClock
-from poise.env.recovery.config import CONTINUED, FALLEN, FAR, TRACKED, toward
+from poise.env import observations as phc_obs
+from poise.env import rewards as done
+from poise.env import rewards as phc_reward
+from poise.env.recovery.clock import CONTINUED, FALLEN, FAR, TRACKED, RecoveryClock, toward
 from poise.env.recovery.falls import Drop, lies
-from poise.env.terms import done, phc_obs, phc_reward
 from poise.errors import PoiseError
 from poise.learn import AmpConfig, PPOConfig
 from toy_human import swing

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.motion import Clip, shifted
-from poise.spatial import quat_mul, rotvec_to_quat
+from poise.motion.rotations import quat_mul, rotvec_to_quat
 
 
 def teleport(clip: Clip, frame: int, metres: float = 0.5) -> Clip:

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from poise.body import BodyTable, generate_table
-from poise.kin import lowest_height
-from poise.kin.balance import balance_point, hull_distance
-from poise.kin.doctor.alone import AloneRules, longest_alone, not_alone
-from poise.kin.ground import fit_heights
-from poise.kin.solids import extreme_points
+from poise.kinematics import lowest_height
+from poise.kinematics.forward import extreme_points
+from poise.kinematics.ground import fit_heights
+from poise.kinematics.rate import balance_point, hull_distance
+from poise.kinematics.repair.needs import AloneRules, longest_alone, not_alone
 from poise.motion import Clip, shifted
 from toy_human import human, swing, turn
 

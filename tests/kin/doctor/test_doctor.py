@@ -22,9 +22,9 @@ from planted_faults import (
     turned,
 )
 
-from poise.kin import Fault, examine, heal, swap_sides
+from poise.kinematics import Fault, examine, heal, swap_sides
 from poise.motion import Clip, read_clip
-from poise.spatial import quat_distance
+from poise.motion.rotations import quat_distance
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import poise
-from poise.kin.doctor.doctor import examine, heal
-from poise.kin.doctor.drift import drift_faults, find_drift, mend_drift
+from poise.kinematics.repair.doctor import examine, heal
+from poise.kinematics.repair.timing import drift_faults, find_drift, mend_drift
 from poise.motion import Clip, read_clip
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
@@ -75,7 +75,7 @@ def test_the_doctor_mends_a_drift(total: float) -> None:
 
 def test_a_clean_walk_stays_as_it_is() -> None:
     clip = read_clip(WALK)
-    from poise.kin.doctor.support import anatomy_of, support_of
+    from poise.kinematics.repair.support import anatomy_of, support_of
 
     support = support_of(clip, anatomy_of(clip))
     assert support is not None and mend_drift(clip, support.sole_low) is clip

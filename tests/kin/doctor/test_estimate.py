@@ -12,16 +12,14 @@ import torch
 from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
-from poise.kin import examine, heal
-from poise.kin.doctor import clean
-from poise.kin.doctor.clean import clean_clip
-from poise.kin.doctor.estimate import denoise, find_lost, noise_faults, refill
+from poise.formats.point_fit import fit_clip
+from poise.kinematics import examine, heal
+from poise.kinematics.repair import estimate as clean
+from poise.kinematics.repair.estimate import clean_clip, denoise, find_lost, noise_faults, refill
 from poise.motion import Clip, read_clip
 from poise.motion.keypoints import Keypoints
-from poise.motion.points import fit_clip
-from poise.motion.smoothing import filled
-from poise.motion.spectrum import Spectrum, white_mm
-from poise.spatial import quat_mul, rotvec_to_quat, unwrap_quats
+from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
+from poise.motion.smoothing import Spectrum, filled, white_mm
 
 CUTOFFS = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 10.0)
 

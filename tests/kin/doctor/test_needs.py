@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from poise.body import BodyTable, generate_table
-from poise.kin.doctor.needs import Need, find_needs
-from poise.kin.ground import fit_heights
-from poise.kin.solids import poses_of
+from poise.kinematics.forward import poses_of
+from poise.kinematics.ground import fit_heights
+from poise.kinematics.repair.needs import Need, find_needs
 from poise.motion import Clip, read_clip, shifted
 from toy_human import human, swing, turn
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from poise.body import find_anatomy
-from poise.kin.doctor import speeds
-from poise.kin.doctor.clean import CleanReport
-from poise.kin.doctor.speeds import (
+from poise.kinematics.repair import speeds
+from poise.kinematics.repair.estimate import CleanReport
+from poise.kinematics.repair.speeds import (
     ARM_SPEED,
     TRUNK_SPEED,
     limit_speeds,
@@ -19,7 +19,7 @@ from poise.kin.doctor.speeds import (
     without_rougher,
 )
 from poise.motion import Clip
-from poise.spatial import quat_angle, quat_conj, quat_mul
+from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 from toy_human import human, swing, turn
 
 JOINT = human().index("LeftArm")

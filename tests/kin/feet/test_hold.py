@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from poise.body import BodyTable, generate_table
-from poise.kin import anatomy_of, hold_feet, lowest_height
-from poise.kin.doctor.support import Support
-from poise.kin.feet import hold as feet_hold
-from poise.kin.feet.lead import led
+from poise.kinematics import anatomy_of, hold_feet, lowest_height
+from poise.kinematics import hold as feet_hold
+from poise.kinematics.hold import led
+from poise.kinematics.repair.support import Support
 from poise.metrics import foot_slide
 from poise.motion import Clip, read_clip
 
@@ -77,7 +77,7 @@ def test_a_turning_body_keeps_its_soles_from_turning(walk: Clip, table: BodyTabl
     still = standing(walk, table)
     angle = np.radians(4.0) * np.sin(2 * np.pi * 1.0 * np.arange(still.frames) / still.fps)
     turn = np.stack((np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)), -1)
-    from poise.spatial import quat_mul
+    from poise.motion.rotations import quat_mul
 
     rot = torch.tensor(still.rot)
     rot[:, 0] = quat_mul(torch.tensor(turn), rot[:, 0])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from poise.kin.feet.contact import Sole
-from poise.kin.feet.lead import RETURN_PER_S, SMOOTH_S, lead
-from poise.spatial import axis_angle_to_quat, quat_rotate
+from poise.kinematics.feet import Sole
+from poise.kinematics.hold import RETURN_PER_S, SMOOTH_S, lead
+from poise.motion.rotations import axis_angle_to_quat, quat_rotate
 
 
 def test_the_banded_solution_is_that_of_the_plain_least_squares() -> None:

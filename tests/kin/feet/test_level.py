@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from poise.body import generate_table
-from poise.kin.feet.level import level_feet
+from poise.kinematics.feet import level_feet
 from poise.motion import Clip
-from poise.spatial import axis_angle_to_quat, quat_mul, quat_rotate
+from poise.motion.rotations import axis_angle_to_quat, quat_mul, quat_rotate
 from toy_human import swing
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from poise.kin.feet.contact import standing_labels
+from poise.kinematics.feet import standing_labels
 from poise.motion.windows import step_contacts
 
 

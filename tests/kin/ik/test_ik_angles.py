@@ -10,7 +10,8 @@ import pytest
 import torch
 from paper_humanoid import count_jumps
 
-from poise.kin.ik.angles import (
+from poise.kinematics.ik_body import arc, frame_of, prefix_product, rotate, square_to
+from poise.kinematics.ik_frames import (
     continuous_euler,
     euler_angles,
     one_turn_check,
@@ -19,8 +20,7 @@ from poise.kin.ik.angles import (
     zyx_angles,
     zyx_matrix,
 )
-from poise.kin.ik.bend import arc, frame_of, prefix_product, rotate, square_to
-from poise.spatial import euler_to_quat, normalize, quat_to_matrix
+from poise.motion.rotations import euler_to_quat, normalize, quat_to_matrix
 
 ORDERS = ["".join(p) for p in itertools.permutations("XYZ")]
 

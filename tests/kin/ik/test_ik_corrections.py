@@ -12,9 +12,9 @@ from paper_humanoid import body_points, count_jumps, paper_humanoid
 import toy_human
 from poise.body import generate_table
 from poise.errors import PoiseError
-from poise.kin import CORRECTIONS, IkBody, IkConfig, Kinematics, analytic_ik, ik_body
+from poise.kinematics import CORRECTIONS, IkBody, IkConfig, Kinematics, analytic_ik, ik_body
 from poise.motion import Skeleton
-from poise.spatial import quat_to_matrix
+from poise.motion.rotations import quat_to_matrix
 
 #: Hips in front of the root and three spine joints, as in LAFAN1, so that the paper's equations apply.
 _ROWS = (

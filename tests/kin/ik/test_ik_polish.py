@@ -12,8 +12,8 @@ from paper_humanoid import body_points
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import IkBody, Kinematics, clip_ik, polish
-from poise.spatial import quat_to_matrix
+from poise.kinematics import IkBody, Kinematics, clip_ik, polish
+from poise.motion.rotations import quat_to_matrix
 
 pytest.importorskip("mink")
 

@@ -7,7 +7,7 @@ import pytest
 from walker import hops, in_place, leap, played, walk
 
 from poise.body import generate_table
-from poise.kin.rate.evidence import Moved
+from poise.kinematics.rate import Moved
 from toy_human import human
 
 TABLE = generate_table(human())

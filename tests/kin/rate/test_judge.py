@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from walker import hops, in_place, leap, played, walk
 
-from poise.kin import examine, find_faults, find_guesses, fit_humanoid
-from poise.kin.rate.judge import RateJudgement, Reason, judge_rate
+from poise.kinematics import examine, find_faults, find_guesses, fit_humanoid
+from poise.kinematics.rate import RateJudgement, Reason, judge_rate
 from poise.motion import Clip, read_clip
 from toy_human import swing
 

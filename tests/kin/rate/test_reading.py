@@ -9,7 +9,7 @@ import pytest
 from walker import leap, played, walk
 
 import poise
-from poise.kin.rate.reading import read_clip, settled
+from poise.kinematics.rate import read_clip, settled
 from poise.motion import Clip
 
 NOTE = "AMC files state no frame rate: 120 frames per second taken"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from poise.motion import Clip
-from poise.spatial import euler_to_quat, quat_conj, quat_mul
+from poise.motion.rotations import euler_to_quat, quat_conj, quat_mul
 from toy_human import human, swing
 
 G, THIGH, SHIN, ANKLE, HIP = 9.81, 0.42, 0.40, 0.05, 0.1

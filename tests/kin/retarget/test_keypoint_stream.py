@@ -10,16 +10,15 @@ import torch
 
 from poise.body import BodyTable, generate_table
 from poise.errors import PoiseError
-from poise.kin import RetargetConfig, retarget
-from poise.kin.ground import fit_heights
-from poise.kin.retarget.keypoint_body import PointBody
-from poise.kin.retarget.keypoint_stream import KeypointStream, StreamConfig
+from poise.formats.point_fit import fit_clip
+from poise.formats.point_raw import assemble_points
+from poise.formats.point_tables import trc_points
+from poise.formats.raw import ReadOptions as Options
+from poise.kinematics import RetargetConfig, retarget
+from poise.kinematics.ground import fit_heights
+from poise.kinematics.retarget.keypoint_goal import KeypointStream, PointBody, StreamConfig
 from poise.motion import Clip, read_clip, resample, trim
-from poise.motion.io.points.raw import assemble_points
-from poise.motion.io.points.trc import trc_points
-from poise.motion.io.raw import ReadOptions as Options
 from poise.motion.keypoints import Keypoints
-from poise.motion.points import fit_clip
 from toy_human import swing
 
 RATE = 30.0

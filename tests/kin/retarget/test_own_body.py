@@ -9,10 +9,10 @@ import pytest
 
 from poise.body import BodyConfig, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
-from poise.kin import place_on_body, retarget
-from poise.kin.retarget.own_body import onto_own, own_body, own_skeleton
+from poise.kinematics import place_on_body, retarget
+from poise.kinematics.retarget.own_body import onto_own, own_body, own_skeleton
 from poise.motion import Clip, Skeleton
-from poise.motion.joint_map import map_joints
+from poise.motion.roles import map_joints
 from toy_human import human, swing
 
 LIMBS = ("thigh", "shin", "foot", "upper_arm", "forearm", "hand")

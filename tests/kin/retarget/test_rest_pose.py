@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.kin import find_guesses, with_rest_pose
+from poise.kinematics import find_guesses, with_rest_pose
 from poise.motion import Clip, Skeleton, read_clip, trim, write_clip
 from poise.motion.roles import SIDES, find_roles
-from poise.spatial import normalize, quat_between, quat_mul, quat_rotate_inv
+from poise.motion.rotations import normalize, quat_between, quat_mul, quat_rotate_inv
 from toy_human import swing
 
 

@@ -11,14 +11,21 @@ import torch
 
 from poise.body.topology import subtree
 from poise.errors import PoiseError
-from poise.kin import RetargetConfig, retarget
-from poise.kin.feet.contact import rest_height
-from poise.kin.limbs import match_positions
-from poise.kin.retarget.common_pose import common_pose
-from poise.kin.retarget.plant import BLEND_S, contact_weight
-from poise.kin.retarget.standing import World, hinge_axis
+from poise.kinematics import RetargetConfig, retarget
+from poise.kinematics.feet import rest_height
+from poise.kinematics.limbs import match_positions
+from poise.kinematics.retarget.common_pose import common_pose
+from poise.kinematics.retarget.plant import BLEND_S, contact_weight
+from poise.kinematics.retarget.standing import World, hinge_axis
 from poise.motion import Clip, Skeleton, find_roles, read_clip, resample, trim
-from poise.spatial import euler_to_quat, normalize, quat_conj, quat_distance, quat_mul, quat_rotate
+from poise.motion.rotations import (
+    euler_to_quat,
+    normalize,
+    quat_conj,
+    quat_distance,
+    quat_mul,
+    quat_rotate,
+)
 from toy_human import human, swing
 
 CLIPS = {

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from poise.control import LinearHelp
-from poise.env.terms import done, next_frames
+from poise.env import observations as next_frames
+from poise.env import rewards as done
 from poise.errors import PoiseError
+from poise.motion.rotations import quat_conj, quat_mul, quat_rotate
 from poise.papers.skeleton2humanoid.recipe import FALLS, INITIAL, LEFT, Budget, build, settings
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce
-from poise.spatial import quat_conj, quat_mul, quat_rotate
 from toy_human import swing
 
 

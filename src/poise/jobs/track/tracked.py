@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from poise.errors import PoiseError
-from poise.eval import ScoreCard
-from poise.jobs.deliver import Delivery, as_high_as_source, deliver, finished, simulated_clip
+from poise.formats import home_suffix, write_clip
+from poise.jobs.deliver import Delivery, as_high_as_source, deliver, finished, settled, simulated_clip
 from poise.jobs.result import Result, Shown
 from poise.jobs.runs import Evaluation
-from poise.jobs.settled import settled
-from poise.jobs.track.best import Merit, merit
-from poise.jobs.track.in_place import InPlace
-from poise.jobs.track.missing import shortfalls
-from poise.jobs.track.parts import Part
-from poise.jobs.track.placement import Placed, home
+from poise.jobs.track.controllers import Merit, merit
+from poise.jobs.track.placement import Placed, fitted, home, noise_read, place
 from poise.jobs.track.pushed import Pushed
+from poise.jobs.track.rates import InPlace
 from poise.jobs.track.recovering import Losses
+from poise.jobs.track.retaking import changed_s, spliced, written_as
 from poise.jobs.track.simulation import FILE, Retake, Simulation
-from poise.jobs.track.splice import changed_s, spliced, written_as
+from poise.jobs.track.story import Part, shortfalls
 from poise.jobs.track.supports import at_home, write_supports
 from poise.jobs.tracker import Tracker
-from poise.kin.directed import Pin, pinned
-from poise.kin.supports import Support
-from poise.kin.travel import travelled
+from poise.kinematics.directed import Pin, pinned
+from poise.kinematics.forward import Kinematics
+from poise.kinematics.repair.faults import Fault
+from poise.kinematics.supports import Support
+from poise.kinematics.travel import travelled
+from poise.metrics import mpjpe_global, mpjpe_root
 from poise.motion import Clip
-from poise.motion.io import home_suffix, write_clip
+from poise.motion.keypoints import Keypoints
 from poise.plan import SamplingResult
 from poise.recipes.imitation import Imitation
+from poise.score import ScoreCard
 
 
 @dataclass(frozen=True)
@@ -236,3 +241,57 @@ def _with_supports(t: Tracked, done: Delivery, out: Path, hold: bool) -> Deliver
     first = next(iter(p for name, p in done.paths.items() if name.startswith("simulated")))
     stands = at_home(t.supports, t.placed)
     return replace(done, paths=done.paths | write_supports(stands, t.delivered(0, hold), out, first))
+
+
+@dataclass(frozen=True)
+class BesideRaw:
+    """mpjpe_mm, mpjpe_global_mm: the character's error beside what came in, up to where it failed; NaN
+    where that is not known. noise: the largest that was taken off."""
+
+    mpjpe_mm: float
+    mpjpe_global_mm: float
+    noise: Fault
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The score card's `raw`."""
+        return {
+            "mpjpe_mm": self.mpjpe_mm,
+            "mpjpe_global_mm": self.mpjpe_global_mm,
+            "noise_mm": self.noise.size,
+            "noise_hz": math.nan if self.noise.hz is None else self.noise.hz,
+        }
+
+    def sentence(self) -> str:
+        """The motion that the score is against, in words."""
+        beside = ""
+        if math.isfinite(self.mpjpe_mm):
+            beside = f"; the character is {self.mpjpe_mm:.0f} mm from the motion with it"
+        return f"The score is that against the motion without its tremble{beside}."
+
+
+def beside_raw(
+    tracker: Tracker, motion: Clip | Keypoints, placed: Placed, sim: Tensor, judged: Tensor
+) -> BesideRaw | None:
+    """The character `sim (T, B, 3)` m in the frames `judged (T)`, None where no tremble was taken off.
+
+    motion: what was placed, keypoints where it came as such.
+    """
+    of_clip = [f for f in placed.report.clips[0].clean.noise if f.kind == "tremble"]
+    noise = [*noise_read(placed.source), *of_clip]
+    if not noise:
+        return None
+    worst = max(noise, key=lambda f: f.size)
+    if isinstance(motion, Keypoints):
+        came = fitted(replace(motion, source=replace(motion.source, raw=True)))
+    elif of_clip:
+        came = motion.replaced(skeleton=motion.skeleton.with_source(raw=True))
+    else:
+        # The keypoints that a clip was made of are gone.
+        return BesideRaw(math.nan, math.nan, worst)
+    pos = Kinematics(tracker.humanoid.table)(torch.tensor(place(came, tracker).qpos)).pos.to(sim)
+    # Samples that jump at an end of keypoints may have cut some frames off.
+    frames = min(len(pos), len(sim))
+    here, there, kept = sim[:frames], pos[:frames], judged[:frames]
+    local, whole = (float(of(here, there)[kept].mean()) for of in (mpjpe_root, mpjpe_global))
+    return BesideRaw(local, whole, worst)

@@ -1,0 +1,282 @@
+"""The score card as a value, as a file, `score.json` with stable keys (docs/metrics.md), and in words:
+labelled rows, each judged good, fair or poor by stated thresholds."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+from poise.errors import PoiseError
+from poise.learn.checkpoint import write_atomic
+from poise.settings import plain
+from poise.version import __version__
+
+NAN = float("nan")
+Weighting = Literal["frame", "episode"]
+
+
+@dataclass(frozen=True)
+class Help:
+    """The residual wrench's budget and use; `limit_*` inf means unlimited (null in JSON)."""
+
+    limit_n: float
+    limit_nm: float
+    force_mean_n: float
+    force_p95_n: float
+    torque_mean_nm: float
+    torque_p95_nm: float
+    work_j_per_s: float
+    share_of_body_weight: float
+
+
+#: Where nothing can help.
+NO_HELP = Help(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ScoreCard:
+    """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.
+
+    NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
+    `kinematics.repair.needs`. `raw` is there where the motion came with noise that was taken off: the error
+    beside what came in (`mpjpe_mm`, `mpjpe_global_mm`), and that noise (`noise_mm`, and `noise_hz`, NaN
+    from frame to frame). `detail` is what is left of the reference's movement at each frequency, of one
+    clip that is tracked, see `metrics.detail`, and `changed` its spells that physics changed most, see
+    `metrics.deviations`. `variants` holds the tracking figures by weighting
+    ("frame", "episode"), for successes alone ("succ_frame", "succ_episode"), and over all frames, those
+    after a failure among them ("uncut_frame", "uncut_episode"). `nothing` holds success and tracking
+    figures of action 0 from the same starts, `spread` their standard deviations over `starts` perturbed
+    starts; empty where that was not measured.
+    """
+
+    succ: float
+    succ_rule: str
+    mpjpe_mm: float
+    mpjpe_global_mm: float
+    vel_mm_per_frame: float
+    acc_mm_per_frame2: float
+    foot_slide_mm_per_s: float
+    penetration_mm: float
+    float_mm: float
+    jerk: float
+    reward: Mapping[str, float]
+    help: Help
+    seconds: float
+    samples: int
+    seed: int
+    version: str = __version__
+    clip: str = ""
+    method: str = ""
+    episodes: int = 0
+    frames: int = 0
+    mpjpe_succ_mm: float = NAN
+    tracked: float = NAN
+    needs: tuple[Mapping[str, Any], ...] = ()
+    raw: Mapping[str, float] = field(default_factory=dict)
+    detail: Mapping[str, float] = field(default_factory=dict)
+    changed: tuple[Mapping[str, Any], ...] = ()
+    reference: Mapping[str, float] = field(default_factory=dict)
+    per_clip: tuple[Mapping[str, Any], ...] = ()
+    weighting: Weighting = "frame"
+    variants: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    nothing: Mapping[str, float] = field(default_factory=dict)
+    starts: int = 1
+    spread: Mapping[str, float] = field(default_factory=dict)
+    delivered: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def survived(self) -> bool:
+        """Whether all episodes succeed by the rule, and yet not all are tracked."""
+        return self.succ == 1.0 and self.tracked < 1.0
+
+    @property
+    def cut(self) -> bool:
+        """Whether each clip was played once, from its start, and lost: figures end there."""
+        return (
+            self.succ == 0.0 and bool(self.per_clip) and all(c["episodes"] == 1 for c in self.per_clip)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values with the keys in field order; what is not finite becomes None. `raw`,
+        `detail` and `changed` are left out where they are empty."""
+        return {k: v for k, v in plain(self).items() if v or k not in ("raw", "detail", "changed")}
+
+
+def write_score(card: ScoreCard, path: str | Path) -> Path:
+    """Writes `score.json` whole or not at all."""
+    path = Path(path)
+    write_atomic(path, (json.dumps(card.to_dict(), indent=2, allow_nan=False) + "\n").encode())
+    return path
+
+
+def _numbers(value: Any) -> Any:
+    """Null back to NaN, inside lists and objects too."""
+    if isinstance(value, dict):
+        return {k: _numbers(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return tuple(_numbers(v) for v in value)
+    return NAN if value is None else value
+
+
+def read_score(path: str | Path) -> ScoreCard:
+    """Read a `score.json`; null becomes NaN (unlimited help: inf) and keys not known here are left out.
+
+    Raises:
+        PoiseError: no such file, no JSON, or a key is missing.
+    """
+    path = Path(path)
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as problem:
+        raise PoiseError(f"cannot be read: {problem.strerror}", path) from None
+    except json.JSONDecodeError as problem:
+        raise PoiseError(f"is no JSON: {problem.msg}", f"{path}, line {problem.lineno}") from None
+    if not isinstance(raw, dict):
+        raise PoiseError("is no score card: the file must hold one JSON object", path)
+    # A figure that is newer than the file has its default.
+    told = [f for f in fields(ScoreCard) if f.name in raw or f.default is MISSING]
+    _require(raw, [f.name for f in told if f.default_factory is MISSING], path)
+    if not isinstance(raw["help"], dict):
+        raise PoiseError("is no score card: 'help' must be an object", path)
+    _require(raw["help"], [f.name for f in fields(Help)], path)
+    values: dict[str, Any] = {f.name: _numbers(raw[f.name]) for f in told if f.name in raw}
+    aid: dict[str, Any] = {f.name: _numbers(raw["help"][f.name]) for f in fields(Help)}
+    for name in ("limit_n", "limit_nm"):
+        aid[name] = math.inf if raw["help"][name] is None else aid[name]
+    values["help"] = Help(**aid)
+    return ScoreCard(**values)
+
+
+def _require(raw: dict[str, Any], names: list[str], path: Path) -> None:
+    missing = [n for n in names if n not in raw]
+    if missing:
+        raise PoiseError(
+            f"the score card lacks the key '{missing[0]}'",
+            path,
+            "Score the run again with this version.",
+        )
+
+
+Verdict = Literal["good", "fair", "poor", ""]
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """Up to `good` is good, up to `fair` is fair, beyond is poor; at least instead when `more`."""
+
+    good: float
+    fair: float
+    more: bool = False
+
+    def verdict(self, value: float) -> Verdict:
+        """ "" for a value that was not measured."""
+        if not math.isfinite(value):
+            return ""
+        sign = -1.0 if self.more else 1.0
+        if sign * value <= sign * self.good:
+            return "good"
+        return "fair" if sign * value <= sign * self.fair else "poor"
+
+
+THRESHOLDS: Mapping[str, Threshold] = MappingProxyType(
+    {
+        "succ": Threshold(0.95, 0.80, more=True),
+        "tracked": Threshold(0.95, 0.80, more=True),
+        "mpjpe_mm": Threshold(40.0, 80.0),
+        "mpjpe_global_mm": Threshold(60.0, 120.0),
+        "vel_mm_per_frame": Threshold(10.0, 20.0),
+        "acc_mm_per_frame2": Threshold(7.0, 15.0),
+        "foot_slide_mm_per_s": Threshold(100.0, 250.0),
+        "penetration_mm": Threshold(5.0, 15.0),
+        "float_mm": Threshold(10.0, 30.0),
+        "jerk_ratio": Threshold(1.5, 3.0),
+        "share_of_body_weight": Threshold(0.02, 0.10),
+        "torque_mean_nm": Threshold(5.0, 25.0),
+    }
+)
+"""By key of the score card, in its units; reasons in docs/metrics.md. `jerk_ratio` is jerk over the
+reference's jerk."""
+
+
+class Row(NamedTuple):
+    """One line of the table; `value` is NaN where nothing was measured."""
+
+    label: str
+    value: float
+    unit: str
+    verdict: Verdict
+
+
+_ROWS = (
+    ("mpjpe_mm", "Joint error, root-relative", "mm"),
+    ("mpjpe_global_mm", "Joint error, global", "mm"),
+    ("vel_mm_per_frame", "Velocity error", "mm/frame"),
+    ("acc_mm_per_frame2", "Acceleration error", "mm/frame²"),
+    ("foot_slide_mm_per_s", "Foot slide", "mm/s"),
+    ("penetration_mm", "Penetration", "mm"),
+    ("float_mm", "Floating", "mm"),
+    ("jerk", "Jerk", "m/s³"),
+)
+
+
+def table(card: ScoreCard) -> list[tuple[str, float, str, Verdict]]:
+    """Rows (label, value, unit, verdict) for the command line and the report, most important first.
+
+    Each row is followed by what stands beside it, without a verdict: the error over all frames, the
+    spread over perturbed starts, what doing nothing comes to, the reference's own figure. Figures of a
+    motion that is lost are of what comes before, so that none of them is called good or fair.
+    """
+    t = THRESHOLDS
+
+    def judged(key: str, value: float) -> Verdict:
+        verdict = t[key].verdict(value)
+        return "" if card.cut and verdict != "poor" else verdict
+
+    rows: list[tuple[str, float, str, Verdict]] = [
+        Row(f"Success ({card.succ_rule})", 100.0 * card.succ, "%", t["succ"].verdict(card.succ)),
+        *_beside(card, "succ", "Success", "%", 100.0),
+    ]
+    if math.isfinite(card.tracked):
+        rows.append(Row("Tracked", 100.0 * card.tracked, "%", t["tracked"].verdict(card.tracked)))
+    for key, label, unit in _ROWS:
+        value = getattr(card, key)
+        reference = card.reference.get(key, math.nan)
+        if key == "jerk":
+            ratio = value / reference if reference > 0 else math.nan
+            rows.append(Row(label, value, unit, judged("jerk_ratio", ratio)))
+        else:
+            rows += [
+                Row(label, value, unit, judged(key, value)),
+                *_beside(card, key, label, unit),
+            ]
+        if math.isfinite(reference):
+            rows.append(Row(f"{label}, reference", reference, unit, ""))
+    aid = card.help
+    share = t["share_of_body_weight"].verdict(aid.share_of_body_weight)
+    torque = t["torque_mean_nm"].verdict(aid.torque_mean_nm)
+    rows += [
+        Row("Help, share of body weight", 100.0 * aid.share_of_body_weight, "%", share),
+        Row("Help, mean force", aid.force_mean_n, "N", ""),
+        Row("Help, mean torque", aid.torque_mean_nm, "N m", torque),
+        Row("Help, mean power", aid.work_j_per_s, "J/s", ""),
+        Row("Reward per step", card.reward.get("total", math.nan), "", ""),
+    ]
+    return rows
+
+
+def _beside(card: ScoreCard, key: str, label: str, unit: str, times: float = 1.0) -> list[Row]:
+    """What stands beside a figure of tracking, as far as it was measured."""
+    uncut = card.variants.get(f"uncut_{card.weighting}", {}).get(key, math.nan)
+    # Without a failure all frames count anyway.
+    uncut = math.nan if card.succ == 1.0 else uncut
+    found = (
+        ("all frames", uncut),
+        (f"spread over {card.starts} starts", card.spread.get(key, math.nan)),
+        ("doing nothing", card.nothing.get(key, math.nan)),
+    )
+    return [Row(f"{label}, {w}", times * v, unit, "") for w, v in found if math.isfinite(v)]
