@@ -28,7 +28,7 @@ import poise.cli.inbetween
 import poise.cli.track
 import poise.jobs.runs
 from poise.errors import PoiseError
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 _TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path += [str(_TESTS), str(_TESTS / "jobs")]

@@ -32,9 +32,9 @@ from scipy.stats import spearmanr
 import poise
 from poise.control import Compliance, Stiffness
 from poise.env.pushes import Pushes
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
-from poise.motion import read_clip
 from poise.papers.compliant.figures import Measured, measure, slope, throws
 from poise.papers.compliant.motions import AT_SOMEBODY, WAYS, hopping, standing
 from poise.papers.compliant.play import play

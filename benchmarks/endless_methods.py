@@ -15,7 +15,8 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env import Acts, EnvStep, ImitationEnv, Reference
 from poise.env.generator import MotionGenerator
-from poise.jobs.endless.training import Motions, codes_of
+from poise.jobs.endless.model import Motions
+from poise.jobs.endless.training import codes_of
 from poise.jobs.tracker import Tracker
 from poise.kinematics import qpos_velocity
 from poise.learn.cvae import CVAEConfig, CVAEObjective, CVAETraining, make_cvae

@@ -19,10 +19,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.formats import read_clip
 from poise.jobs.inbetween.fill import shipped_model
 from poise.learn.inbetween import load_model
 from poise.metrics.plausibility import foot_slide
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.rotations import quat_conj, quat_mul, quat_to_rotvec
 from poise.motion.windows import foot_joints
 from poise.score.report.svg import PoseRow, pose_rows

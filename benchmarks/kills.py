@@ -29,8 +29,9 @@ import torch
 
 import poise
 from poise.cli.main import main as command_line
+from poise.formats import read_clip, write_clip
 from poise.learn.checkpoint import load_checkpoint
-from poise.motion import Clip, read_clip, trim, write_clip
+from poise.motion import Clip, trim
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 #: Kills of one run at most.

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from speed import machine
 
+from poise.formats import read_clip
 from poise.formats.point_fit import fit_clip
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
@@ -28,7 +29,7 @@ from poise.live.commands import LiveConfig
 from poise.live.session import Live
 from poise.live.stream import Packet
 from poise.metrics import success_rule
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.sim import difference
 

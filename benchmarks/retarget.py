@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from poise.formats import read_clip
 from poise.kinematics import RetargetReport, retarget
-from poise.motion import Clip, read_clip, trim
+from poise.motion import Clip, trim
 from poise.motion.rotations import quat_distance
 
 CLIPS = {

@@ -28,9 +28,10 @@ import rfc_order_tables
 import torch
 
 from poise.body import BodyConfig
+from poise.formats import read_clip
 from poise.jobs.runs import begin, evaluate, train
 from poise.learn import LATEST, Until, load_policy
-from poise.motion import Clip, ClipLibrary, read_clip
+from poise.motion import Clip, ClipLibrary
 from poise.recipes.imitation import Imitation
 from poise.recipes.residual_force import ResidualForce, build
 from poise.score import start_frames

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from poise.env import Reference
+from poise.formats import read_clip
 from poise.jobs.inbetween.fill import inbetween
 from poise.jobs.open import open_run
 from poise.jobs.runs import begin, evaluate, train, trained_policy
@@ -34,7 +35,7 @@ from poise.kinematics import IkBody, clip_ik, fit_humanoid
 from poise.kinematics.forward import lowest_height
 from poise.learn import Until
 from poise.metrics import l2p
-from poise.motion import Clip, ClipLibrary, read_clip, shifted, trim
+from poise.motion import Clip, ClipLibrary, shifted, trim
 from poise.motion.rotations import forward_kinematics
 from poise.motion.windows import pack_frames
 from poise.papers.compliant.training import digest_of

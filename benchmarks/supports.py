@@ -21,7 +21,7 @@ from poise.errors import PoiseError
 from poise.jobs.open import open_run
 from poise.jobs.track import Tracked, track
 from poise.jobs.track.placement import place
-from poise.jobs.track.story import needs_of
+from poise.jobs.track.tracked import needs_of
 from poise.jobs.track.tracking import imitation_of, read_motion
 from poise.jobs.tracker import Tracker
 from poise.kinematics.find_supports import find_supports

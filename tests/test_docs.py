@@ -61,9 +61,9 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def net(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an untrained in-betweening network for the embedded walk."""
+    from poise.formats import read_clip
     from poise.learn.inbetween import MODEL, InbetweenModel, make_net, save_model
     from poise.learn.transition import Layout
-    from poise.motion import read_clip
     from poise.motion.windows import pack_frames
     from toy_windows import SMALL
 

@@ -23,6 +23,7 @@ from poise.errors import PoiseError
 from poise.version import __version__
 
 if TYPE_CHECKING:
+    from poise.formats import write_clip as write
     from poise.jobs.complete import Completed, complete
     from poise.jobs.endless.dreaming import dream
     from poise.jobs.endless.dreamt import Dream, Dreamt
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from poise.jobs.track import TrackConfig, Tracked, track
     from poise.kinematics.rate import read_clip as read
     from poise.motion import Clip, ClipLibrary
-    from poise.motion import write_clip as write
     from poise.recipes import ResidualForce
     from poise.recipes.perpetual_settings import Perpetual
 
@@ -61,7 +61,7 @@ _PLACES = {
     "push": "poise.jobs.push",
     "read": "poise.kinematics.rate:read_clip",
     "track": "poise.jobs.track",
-    "write": "poise.motion:write_clip",
+    "write": "poise.formats:write_clip",
 }
 
 __all__ = [

@@ -16,11 +16,12 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import write_clip
 from poise.jobs.perpetual import run as perpetual_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.learn import ConvergenceConfig, Until
 from poise.learn.composer import Composer
-from poise.motion import ClipLibrary, write_clip
+from poise.motion import ClipLibrary
 from poise.recipes import perpetual as task
 from poise.recipes.perpetual import build
 from poise.recipes.perpetual_settings import Perpetual

@@ -9,7 +9,7 @@ from repair import dirty
 from repair_rivals import foot_lock, standing
 
 from poise.body import find_anatomy
-from poise.motion import read_clip
+from poise.formats import read_clip
 from poise.motion.smoothing import find_runs
 
 

@@ -14,8 +14,9 @@ from speed.standing import measure, scaled, stand
 
 from poise.body import Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.kinematics import Kinematics, fit_humanoid, lowest_height
-from poise.motion import Clip, read_clip, trim
+from poise.motion import Clip, trim
 from rigs import rig
 from toy_human import human, swing
 

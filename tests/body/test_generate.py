@@ -12,8 +12,9 @@ import torch
 
 from poise.body import BodyConfig, Humanoid, generate_table, make_humanoid
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.kinematics import Kinematics, contact_labels, fit_humanoid, lowest_height
-from poise.motion import Clip, read_clip, trim
+from poise.motion import Clip, trim
 from poise.motion.rotations import quat_rotate
 from poise.sim import alone
 from toy_human import human, swing

@@ -14,8 +14,9 @@ from tiny_clips import bvh, put
 from poise.cli.doctor import _hidden_rate, worsened
 from poise.cli.info import _guess
 from poise.cli.main import main
+from poise.formats import read_clip, write_clip
 from poise.kinematics import Examination, Fault
-from poise.motion import read_clip, shifted, write_clip
+from poise.motion import shifted
 
 WALK = Path(str(files("poise") / "data/walk.bvh"))
 
@@ -213,8 +214,8 @@ def test_keypoints_state_their_evidence(tmp_path: Path, answered) -> None:
 
 def test_feet_without_names_are_not_called_named(tmp_path: Path) -> None:
     """Feet that their place alone tells are said to be told so."""
+    from poise.formats import read_clip
     from poise.kinematics.repair.guesses import find_guesses
-    from poise.motion import read_clip
 
     clip = read_clip(WALK)
     named = next(g for g in find_guesses(clip) if g.what == "feet")

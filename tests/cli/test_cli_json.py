@@ -16,7 +16,8 @@ import poise
 from poise.cli.console import Answer, document
 from poise.cli.main import VERBS, main
 from poise.errors import PoiseError
-from poise.motion import read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import trim
 from poise.settings import plain
 from toy_policy import WALK, toy_run
 

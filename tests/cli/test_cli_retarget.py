@@ -13,8 +13,9 @@ from poise.body import BodyConfig
 from poise.cli.main import main
 from poise.cli.retarget import pairs
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_bvh, write_clip
 from poise.jobs.library.clips import target_of
-from poise.motion import Clip, Skeleton, read_clip, write_bvh, write_clip
+from poise.motion import Clip, Skeleton
 from toy_human import human, swing
 
 

@@ -11,7 +11,8 @@ from handmade_motion_files import ASF, amc_text, put
 from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
-from poise.motion import Clip, describe, read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip, describe, trim
 from poise.motion.rotations import forward_kinematics
 
 UNIT = 0.0254 / 0.45

@@ -9,8 +9,8 @@ import pytest
 from handmade_rigs import bvh_of, walker
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.table import read_skeleton
-from poise.motion import read_clip
 
 
 @pytest.mark.parametrize("second", ["B_", ""])

@@ -11,8 +11,8 @@ import torch
 from handmade_motion_files import BVH_HEADER, bvh_rows, bvh_text, put
 
 from poise.errors import PoiseError
-from poise.formats import WRITERS
-from poise.motion import Clip, Skeleton, read_clip, trim, write_bvh, write_clip
+from poise.formats import WRITERS, read_clip, write_bvh, write_clip
+from poise.motion import Clip, Skeleton, trim
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 
 TRAVEL = """HIERARCHY

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from handmade_motion_files import deepmimic_row, deepmimic_text, put
 
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 
 def test_straight_body_faces_x_in_z_up(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
 from poise.formats import fbx as fbx_read
+from poise.formats import read_clip
 from poise.formats.fbx_scene import skeleton
-from poise.motion import read_clip
 
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx")
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.named_arrays import SKELETONS
 from poise.formats.smpl import LAYOUTS
 from poise.kinematics import anatomy_of, examine, retarget, support_of
-from poise.motion import Clip, read_clip, trim
+from poise.motion import Clip, trim
 from poise.motion.clip import backwards
 from poise.motion.roles import find_roles
 from poise.motion.skeleton import rest_positions

@@ -16,7 +16,7 @@ from handmade_numpy_files import odd_clip, poselib, save_npy
 from test_opensim_files import mot
 
 from poise.errors import PoiseError
-from poise.motion import read_clip, write_clip
+from poise.formats import read_clip, write_clip
 
 
 def refusal(path: Path, data: bytes) -> str:

@@ -10,8 +10,9 @@ from handmade_gltf_files import Gltf
 from handmade_rigs import FPS, Rig, gltf_of, walker
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.table import read_skeleton
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 LEGS_L = ("thigh_l", "calf_l", "foot_l", "ball_l")
 LEGS_R = ("thigh_r", "calf_r", "foot_r", "ball_r")

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from poise.formats import read_clip
 from poise.formats.figure import SceneBox, box_mesh
 from poise.formats.gltf_write import write_gltf
-from poise.motion import read_clip
 from toy_policy import walk
 
 BOX = SceneBox("seat1", (0.4, 0.2, 0.5), (1.0, 2.0, 0.25), math.pi / 2)

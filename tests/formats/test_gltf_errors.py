@@ -16,8 +16,8 @@ import pytest
 from handmade_gltf_files import Gltf, put, turn, walker
 
 from poise.errors import PoiseError
-from poise.formats import gltf_file
-from poise.motion import describe, read_clip
+from poise.formats import gltf_file, read_clip
+from poise.motion import describe
 
 HUGE = 1 << 34
 

@@ -12,7 +12,7 @@ from handmade_gltf_files import QUARTER_X, Gltf, person, put, turn, walker
 
 from poise.body import generate_table
 from poise.errors import PoiseError
-from poise.motion import read_clip
+from poise.formats import read_clip
 from poise.motion.rotations import quat_to_matrix, slerp
 
 

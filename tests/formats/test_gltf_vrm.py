@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from handmade_gltf_files import Gltf, put, turn
 
-from poise.motion import Skeleton, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Skeleton
 from poise.motion.roles import find_roles, map_joints
 from toy_human import swing
 

@@ -16,7 +16,8 @@ from handmade_gltf_files import QUARTER_X, Gltf, person, put, turn
 from handmade_motion_files import bvh_text, deepmimic_text
 
 from poise.errors import PoiseError
-from poise.motion import Clip, read_clip, trim, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip, trim
 from poise.motion.rotations import quat_distance
 from toy_human import swing
 

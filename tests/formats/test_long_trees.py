@@ -11,9 +11,10 @@ from handmade_gltf_files import Gltf
 
 from poise.body.topology import find_limbs
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.nodes import unique_names
 from poise.formats.text import MAX_JOINTS
-from poise.motion import find_roles, read_clip
+from poise.motion import find_roles
 from poise.motion.info import describe
 
 

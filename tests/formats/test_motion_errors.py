@@ -19,9 +19,9 @@ from handmade_motion_files import (
 )
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats import text as limits
 from poise.formats.table import READABLE
-from poise.motion import read_clip
 
 
 def refusal(path: Path, **options: object) -> str:

@@ -12,7 +12,8 @@ import pytest
 from handmade_motion_files import ASF, amc_text, bvh_text, deepmimic_text
 
 from poise.errors import PoiseError
-from poise.motion import describe, read_clip
+from poise.formats import read_clip
+from poise.motion import describe
 
 MUTATIONS = 1000
 TRICKY = (

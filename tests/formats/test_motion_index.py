@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from poise.motion import Clip, describe, read_clip
+from poise.formats import read_clip
+from poise.motion import Clip, describe
 
 INCH = 0.0254
 ASF_UNIT = 0.0254 / 0.45

@@ -9,7 +9,8 @@ import pytest
 from handmade_motion_files import BVH_HEADER, bvh_rows, bvh_text, deepmimic_text, put
 
 from poise.errors import PoiseError
-from poise.motion import describe, read_clip, write_bvh
+from poise.formats import read_clip, write_bvh
+from poise.motion import describe
 
 
 def scaled(factor: float) -> str:

@@ -14,8 +14,9 @@ from test_gltf_errors import walker
 from test_points_files import NAMES, trc_text, walking
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.formats import text as bounded
-from poise.motion import read_clip, resample, write_clip
+from poise.motion import resample
 from poise.motion.clip import MAX_POSES, check_poses
 
 RATE = "the frame rate must be from 0.1 to 2000 per second, got "

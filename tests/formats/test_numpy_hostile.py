@@ -17,8 +17,8 @@ from handmade_numpy_files import amass, odd_clip, save_npz
 from numpy.lib import format as npy
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.formats.arrays import MAX_ARRAY_BYTES, Archive, npz_bytes
-from poise.motion import read_clip, write_clip
 
 
 def refusal(path: Path, **options: Any) -> str:

@@ -11,7 +11,8 @@ from handmade_motion_files import put
 from handmade_numpy_files import save_npz
 
 from poise.errors import PoiseError
-from poise.motion import Clip, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip
 
 PELVIS = ("pelvis_tilt", "pelvis_list", "pelvis_rotation", "pelvis_tx", "pelvis_ty", "pelvis_tz")
 LEGS = ("hip_flexion_r", "hip_flexion_l", "knee_angle_r", "knee_angle_l")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.own import pack_clips, unpack_clips
-from poise.motion import Channel, Clip, Source, read_clip, trim
+from poise.motion import Channel, Clip, Source, trim
 from toy_human import swing
 
 

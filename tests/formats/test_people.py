@@ -11,10 +11,11 @@ from handmade_numpy_files import aist, amass, save_npz, save_pickle
 from handmade_people import NAMES, csv, trc, walk
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.people import person_of
 from poise.formats.point_arrays import HUMANML3D
 from poise.formats.point_raw import without_zeros
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 ASIDE = np.array([3.0, 0.0, 0.0])
 TWO = np.concatenate((walk(), walk() + ASIDE), 1)

@@ -17,9 +17,8 @@ import pytest
 from handmade_numpy_files import aist, poselib, save_npy, save_npz, save_pickle
 
 from poise.errors import PoiseError
-from poise.formats import pickles
+from poise.formats import pickles, read_clip, write_clip
 from poise.formats.pickles import load_plain, loads_restricted, named_arrays
-from poise.motion import read_clip, write_clip
 
 
 def load_restricted(path):  # type: ignore[no-untyped-def]

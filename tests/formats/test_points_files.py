@@ -10,13 +10,14 @@ import pytest
 from handmade_numpy_files import amass, save_npz
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.c3d import c3d_points
 from poise.formats.point_arrays import HUMANML3D, array_points, mdm_points
 from poise.formats.point_fit import FitConfig, fit_clip, fit_distances
 from poise.formats.point_raw import assemble_points
 from poise.formats.point_tables import csv_points, trc_points
 from poise.formats.raw import ReadOptions
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 # A standing person in a file's Y-up axes, facing +Z, left at +X, m.
 PERSON = {

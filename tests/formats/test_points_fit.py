@@ -12,11 +12,12 @@ import torch
 
 from poise.body.parts import find_anatomy
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.markers import find_places, split_label
 from poise.formats.point_fit import FitConfig, fit_clip, fit_distances
 from poise.formats.point_noise import drop_spikes, fill, longest_stretch, smooth
 from poise.formats.point_skeleton import hold_lengths, steady_twist
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.rotations import quat_angle, quat_between
 

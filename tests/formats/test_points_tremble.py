@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
+from poise.formats import read_clip
 from poise.formats.point_fit import FitConfig, fit_clip
 from poise.kinematics import examine
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.skeleton import Source
 

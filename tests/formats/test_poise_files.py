@@ -11,8 +11,9 @@ from handmade_motion_files import bvh_text, put
 from handmade_numpy_files import odd_clip, save_npz
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.formats.own import columns
-from poise.motion import Clip, read_clip, write_clip
+from poise.motion import Clip
 
 
 def check_same(a: Clip, b: Clip) -> None:

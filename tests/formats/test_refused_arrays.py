@@ -16,9 +16,8 @@ from test_points_files import NAMES, walking, write_c3d
 
 from poise.errors import PoiseError
 from poise.formats import arrays as array_files
-from poise.formats import c3d, pickles
+from poise.formats import c3d, pickles, read_clip, write_clip
 from poise.formats.arrays import directory_bytes
-from poise.motion import read_clip, write_clip
 
 
 def refusal(path: Path) -> str:

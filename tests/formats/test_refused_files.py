@@ -13,11 +13,10 @@ from handmade_motion_files import bvh_text, deepmimic_text, put
 from handmade_numpy_files import amass, odd_clip, save_npz
 
 from poise.errors import PoiseError
-from poise.formats import apart, text
+from poise.formats import apart, read_clip, text, write_clip
 from poise.formats import table as formats
 from poise.formats.bvh import write_bvh
 from poise.formats.table import check_writable, home_suffix
-from poise.motion import read_clip, write_clip
 
 
 def refusal(path: Path, **options: Any) -> str:

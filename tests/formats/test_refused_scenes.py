@@ -13,7 +13,7 @@ from handmade_fbx_files import fbx_text
 from handmade_gltf_files import Gltf, person, put, turn, walker
 
 from poise.errors import PoiseError
-from poise.motion import read_clip
+from poise.formats import read_clip
 
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx")
 

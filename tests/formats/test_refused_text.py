@@ -15,9 +15,8 @@ from test_points_files import csv_text as points_text
 
 from poise.errors import PoiseError
 from poise.formats import acclaim as asf_file
-from poise.formats import bvh_file
+from poise.formats import bvh_file, read_clip
 from poise.formats import text as text_files
-from poise.motion import read_clip
 
 #: What is read, the damage, and what the sentence says behind the file's name.
 CASES: dict[str, tuple[str, Callable[[str], str], str]] = {

@@ -10,9 +10,9 @@ import pytest
 from handmade_rigs import bvh_of, fbx_of, gltf_of, skeleton_of, usda_of, walker
 from scipy.spatial.transform import Rotation
 
+from poise.formats import read_clip, write_clip
 from poise.formats.table import read_skeleton
 from poise.kinematics import RetargetConfig, retarget
-from poise.motion import read_clip, write_clip
 
 
 @pytest.mark.parametrize("suffix", ["bvh", "glb", "usda", "fbx"])

@@ -12,8 +12,9 @@ from handmade_numpy_files import aist, amass, save_npz, save_pickle
 from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.formats.smpl import LAYOUTS, PELVIS, smpl_skeleton, write_amass
-from poise.motion import Clip, read_clip, write_clip
+from poise.motion import Clip
 
 WIDTHS = {66: 22, 72: 24, 156: 52, 165: 55}
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from handmade_rigs import FPS, Rig, bvh_of, fbx_of, gltf_of, skeleton_of, usda_of, walker
 
-from poise.motion import Clip, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip
 from poise.motion.clip import trim
 
 FORMATS = ("bvh", "glb", "usda", "fbx")

@@ -11,8 +11,8 @@ from handmade_numpy_files import amass, save_npz
 from handmade_people import trc, walk
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.guess import guess_unit
-from poise.motion import read_clip
 
 HOW = "from the bones between head and ankles"
 

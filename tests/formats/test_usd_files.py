@@ -13,7 +13,8 @@ from handmade_motion_files import bvh_text, deepmimic_text
 from handmade_numpy_files import odd_clip
 
 from poise.errors import PoiseError
-from poise.motion import Clip, read_clip, write_clip
+from poise.formats import read_clip, write_clip
+from poise.motion import Clip
 from poise.motion.rotations import quat_distance
 
 

@@ -12,8 +12,9 @@ from handmade_rigs import FPS, Rig, skeleton_of, usda_of, walker
 from scipy.spatial.transform import Rotation
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.formats.table import read_skeleton
-from poise.motion import Clip, read_clip, write_clip
+from poise.motion import Clip
 
 pytest.importorskip("pxr")
 

@@ -10,9 +10,10 @@ from handmade_numpy_files import amass, save_npz
 from handmade_people import NAMES, crawl, csv, handstand, in_file, push_ups, trc, walk
 
 import poise
+from poise.formats import read_clip, write_bvh
 from poise.formats.guess import UPS
 from poise.formats.raw import quats_from_z_up, quats_to_z_up, vectors_from_z_up, vectors_to_z_up
-from poise.motion import Clip, read_clip, write_bvh
+from poise.motion import Clip
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 

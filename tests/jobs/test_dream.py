@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.endless import dreamt as frames
 from poise.jobs.endless.dreaming import begun, dream, past_of
 from poise.jobs.endless.dreamt import NUMBER, Body, Dream, FrameStore, MotionWriter, Pieces
@@ -23,7 +24,7 @@ from poise.jobs.track.placement import place
 from poise.jobs.tracker import Tracker
 from poise.kinematics import hold_feet
 from poise.learn.cvae import CVAEConfig, CVAETraining
-from poise.motion import ClipLibrary, read_clip, trim
+from poise.motion import ClipLibrary, trim
 from poise.plan import LookaheadConfig
 from poise.score.card import NO_HELP
 from toy_policy import walk

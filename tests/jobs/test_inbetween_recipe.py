@@ -10,6 +10,7 @@ import pytest
 
 from poise.cli.main import main
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_bvh
 from poise.jobs.inbetween.training import (
     FRAMES,
     Inbetween,
@@ -24,7 +25,6 @@ from poise.jobs.inbetween.training import (
 from poise.jobs.run_file import RUN_FILE
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint
 from poise.learn.inbetween import load_model, save_model
-from poise.motion import read_clip, write_bvh
 from toy_human import swing
 
 

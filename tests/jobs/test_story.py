@@ -14,7 +14,7 @@ from test_best import episodes
 from poise.jobs.track import controllers
 from poise.jobs.track.controllers import Done, Merit, done_by, merit
 from poise.jobs.track.settings import TrackConfig
-from poise.jobs.track.story import story
+from poise.jobs.track.tracked import story
 from poise.metrics import success_rule
 from poise.plan import SamplingResult
 from poise.score import score_rollouts

@@ -13,6 +13,7 @@ import torch
 
 from poise.env import ImitationEnv
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.point_fit import JOINT_PLACES
 from poise.formats.raw import ReadOptions as Options
 from poise.jobs.open import open_run
@@ -22,7 +23,7 @@ from poise.jobs.track.controllers import NO_CRITIC
 from poise.jobs.track.placement import home, place, points_of
 from poise.jobs.tracker import Tracker
 from poise.kinematics.coords import within_turns
-from poise.motion import Clip, Skeleton, ground_shift, read_clip
+from poise.motion import Clip, Skeleton, ground_shift
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import Jitter
 from poise.motion.roles import map_joints

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track import track
@@ -18,7 +19,7 @@ from poise.jobs.track.simulation import Retake
 from poise.jobs.tracker import Tracker
 from poise.kinematics.directed import TouchPoint
 from poise.kinematics.loops import overlap_of
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.rotations import quat_distance
 from toy_policy import walk
 from toy_walker import walker

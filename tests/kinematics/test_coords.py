@@ -10,8 +10,9 @@ import torch
 
 from poise.body import generate_table
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.kinematics import Kinematics, clip_to_qpos, fit_humanoid, qpos_to_clip
-from poise.motion import Clip, read_clip, trim, write_clip
+from poise.motion import Clip, trim
 from toy_human import human, swing
 
 #: Clip, its ASF, first frame (an inserted T-pose is left out).

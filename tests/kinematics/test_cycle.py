@@ -10,6 +10,7 @@ import torch
 
 from poise.body import generate_table
 from poise.env import Reference
+from poise.formats import read_clip
 from poise.kinematics import (
     clip_to_qpos,
     close_cycle,
@@ -19,7 +20,7 @@ from poise.kinematics import (
     qpos_velocity,
 )
 from poise.kinematics.loops import join_cycle
-from poise.motion import ClipLibrary, read_clip
+from poise.motion import ClipLibrary
 from poise.motion.rotations import heading_quat, quat_angle, quat_conj, quat_mul, rotvec_to_quat
 from toy_human import human, swing
 

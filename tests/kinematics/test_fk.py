@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
+from poise.formats import read_clip
 from poise.kinematics import Kinematics, fit_humanoid, lowest_height, qpos_velocity
-from poise.motion import read_clip
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul
 from toy_human import human, swing
 

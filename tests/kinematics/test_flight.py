@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from poise.body import generate_table, make_humanoid
+from poise.formats import read_clip
 from poise.kinematics import Kinematics, clip_to_qpos, fit_ground, fit_humanoid
 from poise.kinematics.forward import centre_of_mass, low_and_com, poses_of
 from poise.kinematics.rate import Flight, clear_fall, find_flights
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from toy_human import human, swing
 
 TABLE = generate_table(human())

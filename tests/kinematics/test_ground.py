@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from poise.body import generate_table
+from poise.formats import read_clip
 from poise.kinematics import (
     Kinematics,
     clip_to_qpos,
@@ -17,7 +18,7 @@ from poise.kinematics import (
 )
 from poise.kinematics.feet import stance_heights
 from poise.kinematics.ground import SINK_M
-from poise.motion import read_clip, resample
+from poise.motion import resample
 from toy_human import human, swing
 
 

@@ -10,9 +10,9 @@ import torch
 
 import toy_human
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.kinematics import limb_of, match_positions, two_bone
 from poise.kinematics.limbs import soft_reach
-from poise.motion import read_clip
 from poise.motion.rotations import (
     forward_kinematics,
     frame_quat,

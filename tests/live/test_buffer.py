@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from poise.live import passage as q
+from poise.live import quats as q
 from poise.live.stream import FADE_S, JitterBuffer, margin
 
 STILL = np.array([[1.0, 0, 0, 0]])

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
-from poise.live import passage as q
+from poise.live import quats as q
 from poise.live.commands import LiveConfig
 from poise.live.passage import world_of
 from poise.live.people import OntoBody
@@ -35,7 +36,7 @@ from poise.live.vmc import (
     t_pose,
     to_unity,
 )
-from poise.motion import Clip, Skeleton, read_clip
+from poise.motion import Clip, Skeleton
 from test_docs import WALK
 
 

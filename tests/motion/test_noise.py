@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.point_noise import smooth
 from poise.formats.point_raw import assemble_points
 from poise.formats.point_tables import trc_points
 from poise.formats.raw import ReadOptions
-from poise.motion import read_clip, resample
+from poise.motion import resample
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import (
     TRIANGULATED,

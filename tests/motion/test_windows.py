@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
-from poise.motion import Clip, Skeleton, read_clip
+from poise.formats import read_clip
+from poise.motion import Clip, Skeleton
 from poise.motion.rotations import forward_kinematics, quat_rotate
 from poise.motion.windows import (
     centred,

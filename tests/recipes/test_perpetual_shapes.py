@@ -11,13 +11,15 @@ import torch
 
 from poise.body import make_humanoid
 from poise.env import observations as phc_obs
-from poise.env.reference import BodyAssignment, differing
+from poise.env.plugins import BodyAssignment
+from poise.env.reference import differing
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.stage_trainer import StageTrainer
 from poise.kinematics import Kinematics, retarget
 from poise.learn import LATEST, Until, load_checkpoint
-from poise.motion import ClipLibrary, read_clip, resample
+from poise.motion import ClipLibrary, resample
 from poise.recipes import perpetual as task
 from poise.recipes.imitation import Imitation
 from poise.recipes.perpetual import build

@@ -15,8 +15,8 @@ from poise.env import observations as phc_obs
 from poise.env import rewards as done
 from poise.env import rewards as phc_reward
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.learn import Amp, AmpConfig, PPOConfig
-from poise.motion import read_clip
 from poise.recipes import ResidualForce, build
 from poise.recipes.imitation import Imitation
 

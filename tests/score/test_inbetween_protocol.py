@@ -15,8 +15,8 @@ import torch
 from inbetween import truth_rows
 from inbetween_baselines import Baseline
 
+from poise.formats import read_clip
 from poise.learn.transition import Layout
-from poise.motion import read_clip
 from poise.motion.windows import LAFAN1_FACING, pack_frames, without_still_root
 from poise.score.gaps import BANDAI, LAFAN1, Protocol, deviation, evaluate, slide, test_set
 from poise.score.gaps import TestSet as InbetweenTestSet

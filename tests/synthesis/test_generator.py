@@ -12,8 +12,8 @@ from torch import Tensor
 
 from poise.env.generator import GeneratorGoal
 from poise.errors import PoiseError
-from poise.jobs.endless.model import GeneratorModel, load_generator
-from poise.jobs.endless.training import Endless, Motions, balanced, motions_of, train_generator
+from poise.jobs.endless.model import GeneratorModel, Motions, load_generator
+from poise.jobs.endless.training import Endless, balanced, motions_of, train_generator
 from poise.jobs.open import open_run
 from poise.jobs.tracker import Tracker
 from poise.learn.checkpoint import load_checkpoint, save_checkpoint

@@ -11,11 +11,12 @@ import pytest
 from poise.body import find_anatomy
 from poise.cli.main import main
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.jobs.complete import complete
 from poise.jobs.open import open_run
 from poise.jobs.track.direction import direction_of
 from poise.kinematics.directed import PELVIS, TouchPoint, directed
-from poise.motion import Clip, read_clip, write_clip
+from poise.motion import Clip
 from poise.plan import LookaheadConfig
 from poise.synthesis.inbetween import Partial, moved_to, partials_of, timed, times_of
 from toy_human import swing

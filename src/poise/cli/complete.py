@@ -107,7 +107,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.jobs.track import TrackConfig
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
     from poise.plan import LookaheadConfig
     from poise.synthesis.filler import check_keyframes
     from poise.synthesis.inbetween import partials_of, times_of

@@ -124,7 +124,8 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     may_deliver(out, motion, o.force or held, o.clip)
     job = Job((o.clip,), out, out / "run", o.training, config, o.reading, again, o.in_place)
     if not from_nothing(o, out / "run"):
-        if (answer := practise(job, o.going_on, motion, o.hold_feet)) is not None:
+        answer = practise(job, o.going_on, motion, o.hold_feet)
+        if answer is not None:
             return answer
     from poise.learn.parallel import joined
 
@@ -166,7 +167,7 @@ def practise(job: Job, policy: str | None, motion: Path | None, hold: bool) -> A
     from poise.jobs.practice import practise as practised
     from poise.jobs.run_file import RUN_FILE, learning_curve
     from poise.jobs.track import write
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
     from poise.learn import Until
 
     t, held = job.training, (job.run / RUN_FILE).exists()
@@ -221,7 +222,7 @@ class First:
 
     def __call__(self, first: Tracked) -> None:
         from poise.jobs.track import write
-        from poise.jobs.track.story import story
+        from poise.jobs.track.tracked import story
 
         done = write(first, self.out, self.motion, self.hold)
         tell(f"First result: {story(first, hint=False).sentence} See {done.paths['report']}")

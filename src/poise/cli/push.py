@@ -84,7 +84,7 @@ def run(options: Options, argv: Sequence[str]) -> Answer:
     from poise.cli.track import follow
     from poise.jobs.open import open_run
     from poise.jobs.track import TrackConfig, write
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
 
     config = TrackConfig(
         seed=o.seed, controller=o.controller, threads=o.threads, body=o.body, push=push,

@@ -164,7 +164,7 @@ def track_one(options: Options, tracker: Tracker | None = None, folder: Path | N
     from poise.jobs.track.direction import direction_of
     from poise.jobs.track.noise import noise_of
     from poise.jobs.track.simulation import retake_of
-    from poise.jobs.track.story import story
+    from poise.jobs.track.tracked import story
     from poise.jobs.tracker import save_tracker
     from poise.plan import LookaheadConfig, SamplingConfig
 

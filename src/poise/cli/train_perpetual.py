@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias
 
 from tyro.conf import arg
 
@@ -116,7 +116,6 @@ def shown() -> Iterator[Callable[[Progress], None]]:
 
 
 if TYPE_CHECKING:
-    from poise.cli.train import Options
     from poise.jobs.tracker import Tracker
     from poise.recipes.imitation import Imitation
     from poise.recipes.perpetual_settings import Perpetual
@@ -199,7 +198,24 @@ def settings(
     return training.settings("perpetual", default, body, values)
 
 
-def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
+class TrainOptions(Protocol):
+    """The options of `poise train`, as far as this recipe reads them."""
+
+    @property
+    def library(self) -> Library: ...
+    @property
+    def primitives(self) -> Primitives: ...
+    @property
+    def out(self) -> Path: ...
+    @property
+    def training(self) -> Training: ...
+    @property
+    def body(self) -> Body: ...
+    @property
+    def recipe_settings(self) -> Any: ...
+
+
+def check_going_on(o: TrainOptions, returns: bool = True) -> dict[str, Any]:
     """Refuses options that the policy decides from which training goes on; the settings in --set that it
     does not, by dotted names.
 
@@ -228,7 +244,7 @@ def check_going_on(o: Options, returns: bool = True) -> dict[str, Any]:
     return more
 
 
-def goes_on(o: Options, config: Perpetual) -> tuple[Tracker, Perpetual]:
+def goes_on(o: TrainOptions, config: Perpetual) -> tuple[Tracker, Perpetual]:
     """The policy of --from, and the settings of a run that goes on from it.
 
     config: what the command line states without it.
@@ -251,7 +267,7 @@ def goes_on(o: Options, config: Perpetual) -> tuple[Tracker, Perpetual]:
     return tracker, configured(config, more)
 
 
-def run(o: Options, config: Perpetual, again: str) -> Answer:
+def run(o: TrainOptions, config: Perpetual, again: str) -> Answer:
     """Trains until nothing fails, a limit is reached, or Ctrl-C."""
     library, primitives, out, training = o.library, o.primitives, o.out, o.training
     library.folder("perpetual")

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from poise.env.goal import Goal
-from poise.env.plugins import Felt, Plugin, Start
+from poise.env.plugins import Felt, Plugin
+from poise.env.reference import Start
 from poise.errors import PoiseError, did_you_mean
 from poise.sim import Backend, CharacterRows, Drive, SceneSim, Touch
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,8 +12,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env.bins import Outcomes
 from poise.env.frame import Layout
-from poise.env.plugins import Start
-from poise.env.reference import Reference
+from poise.env.reference import Reference, Start
 from poise.env.starts import Starts
 from poise.errors import PoiseError
 from poise.sim import displaced

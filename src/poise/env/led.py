@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from poise.env.goal import ClipGoal, Goal
-from poise.env.plugins import Start
 from poise.env.recovery.clips import GetUpPlanner, RecoveryClips
 from poise.env.recovery.planner import entry, way_into
-from poise.env.reference import Reference
+from poise.env.reference import Reference, Start
 from poise.metrics import has_lost
 
 #: m/s of the bodies on average, below which a character has come to rest; s for which that is waited.

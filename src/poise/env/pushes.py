@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from poise.env.goal import Goal
-from poise.env.plugins import Felt, Plugin, Start
+from poise.env.plugins import Felt, Plugin
+from poise.env.reference import Start
 from poise.errors import PoiseError
 from poise.sim import Backend, Drive
 

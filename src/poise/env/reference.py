@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -15,13 +15,10 @@ from torch import Tensor
 from poise.body import Humanoid, make_spec
 from poise.env.bins import MotionBins
 from poise.env.evaluate import Recorded
-from poise.env.frame import FIELDS, Layout, Observable, Pose
-from poise.env.observations import shape_of
-from poise.env.plugins import Plugin
+from poise.env.frame import FIELDS, Layout, Pose
 from poise.errors import PoiseError
 from poise.kinematics import Kinematics, cycle_step, cycle_velocity, qpos_velocity
 from poise.motion.rotations import heading_quat, quat_mul, quat_rotate
-from poise.sim import Backend, alone
 
 #: Bodies in the one model that makes poses of many frames: a call is for so many at once.
 MANY = 16
@@ -148,7 +145,7 @@ class Reference:
     """Reference motion at the control rate, all clips end to end.
 
     Frames of clip c are rows `start[c] .. start[c] + length[c] - 1`. The last frame of a cyclic clip is
-    its first one cycle later (`poise.kinematics.close_cycle`); the clip goes on with its first frames, moved
+    its first one cycle later (`kinematics.close_cycle`); the clip goes on with its first frames, moved
     and turned to where the last frame stands.
 
     Args:
@@ -434,39 +431,5 @@ def differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     return out
 
 
-class BodyAssignment(Plugin):
-    """The bodies of a backend's worlds, as a plug-in.
-
-    Attributes:
-        body: `(N,)`, which body each world has.
-        sizes: `(S, K)` float32 of the bodies, see `shape_of`.
-
-    Args:
-        backend: its model is that of the first body, which all worlds have at first.
-        humanoids: S bodies.
-    """
-
-    def __init__(self, backend: Backend, humanoids: Sequence[Humanoid]):
-        fields = differing([backend.model, *(alone(h) for h in humanoids[1:])])
-        self._live = {name: backend.expand(name) for name in fields}
-        self._values = {
-            name: torch.from_numpy(fields[name]).to(live).view(len(humanoids), *live.shape[1:])
-            for name, live in self._live.items()
-        }
-        self.sizes = torch.stack([shape_of(h) for h in humanoids]).to(backend.device)
-        self.body = torch.zeros(backend.num_envs, dtype=torch.long, device=backend.device)
-
-    @property
-    def observables(self) -> Mapping[str, Observable]:
-        """The sizes of each character's body."""
-        return {"sizes": lambda frame: self.sizes.index_select(0, frame.place.body.long())}
-
-    def assign(self, rows: Tensor | None, body: Tensor) -> None:
-        old = self.body if rows is None else self.body[rows]
-        changed = (body != old).nonzero().squeeze(-1)
-        if not len(changed):
-            return
-        ids, new = changed if rows is None else rows[changed], body[changed]
-        self.body[ids] = new
-        for name, live in self._live.items():
-            live[ids] = self._values[name].index_select(0, new)
+#: Coordinates of episodes' starts: qpos `(n, nq)` and qvel `(n, nv)`, float64.
+Start = tuple[Tensor, Tensor]

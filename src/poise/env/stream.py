@@ -14,8 +14,7 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.env.evaluate import Recorded
 from poise.env.goal import Goal, extrapolated
-from poise.env.plugins import Start
-from poise.env.reference import Poser
+from poise.env.reference import Poser, Start
 from poise.errors import PoiseError
 from poise.sim import difference
 

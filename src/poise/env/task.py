@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,10 +13,10 @@ from poise.control import Compliance, HelpSchedule, PDTargets, Residual, Stiffne
 from poise.env.frame import DoneTerm, Observable, ObsTerm, RewardTerm
 from poise.env.goal import ClipGoal, Goal
 from poise.env.help import HelpBudget
-from poise.env.plugins import Plugin
+from poise.env.plugins import AdaptiveSampling, BodyAssignment, Plugin
 from poise.env.recovery.clock import Recovery, RecoveryClock
-from poise.env.reference import BodyAssignment, Reference
-from poise.env.starts import AdaptiveSampling, Starts
+from poise.env.reference import Reference
+from poise.env.starts import Starts
 from poise.env.yielding import DisplacedGoal, Yielding
 from poise.errors import PoiseError
 from poise.sim import Backend, SimState

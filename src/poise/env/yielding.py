@@ -25,8 +25,8 @@ from poise.control.compliance import (
 )
 from poise.env.bins import Outcomes
 from poise.env.goal import ClipGoal, Goal, Group
-from poise.env.plugins import Felt, Plugin, Start
-from poise.env.reference import Poser
+from poise.env.plugins import Felt, Plugin
+from poise.env.reference import Poser, Start
 from poise.errors import PoiseError
 from poise.motion.rotations import quat_conj, quat_rotate
 from poise.sim import Backend, CharacterRows, Drive, Mechanics, displaced

@@ -23,7 +23,7 @@ from poise.jobs.track import TrackConfig, Tracked, track, write
 from poise.jobs.track.controllers import Merit
 from poise.jobs.track.direction import Weight
 from poise.jobs.track.rates import InPlace, with_travel
-from poise.jobs.track.story import story
+from poise.jobs.track.tracked import story
 from poise.jobs.tracker import Tracker
 from poise.kinematics import without_noise
 from poise.kinematics.rate import judge_rate

@@ -25,7 +25,8 @@ from poise.jobs.result import Result, Shown, clip_of
 from poise.jobs.run_file import learning_curve
 from poise.jobs.runs import Evaluation, begin, evaluate, train, trained_policy
 from poise.jobs.track import Tracked, write
-from poise.jobs.track.rates import Mode, with_travel
+from poise.jobs.track.rates import with_travel
+from poise.jobs.track.settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import TrainingCallbacks
 from poise.learn import IterationStats, PolicyBundle, Until

@@ -35,7 +35,8 @@ from poise.jobs.track.learning import (
     with_help,
 )
 from poise.jobs.track.placement import place
-from poise.jobs.track.rates import InPlace, Mode, with_travel
+from poise.jobs.track.rates import InPlace, with_travel
+from poise.jobs.track.settings import Mode
 from poise.jobs.tracker import Tracker
 from poise.learn import Until
 from poise.motion import Clip

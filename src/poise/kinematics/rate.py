@@ -527,7 +527,7 @@ def _walks(moved: Moved, at: float, share: float) -> Reason | None:
 
 
 def read_clip(path: str | Path, **stated: Any) -> Clip:
-    """Reads a motion file as a clip in metres, Z up, see `poise.motion.read_clip`, which has the same
+    """Reads a motion file as a clip in metres, Z up, see `poise.formats.read_clip`, which has the same
     arguments and errors.
 
     Where neither the file nor the caller states a frame rate, and the evidence against the usual one is

@@ -16,7 +16,7 @@ from poise.errors import PoiseError
 from poise.kinematics import RetargetConfig, place_on_body
 from poise.kinematics.coords import wrapped
 from poise.kinematics.stream_noise import FadingFilter
-from poise.live import passage as q
+from poise.live import quats as q
 from poise.live.passage import FramePassage, Hinges, doublings, world_of
 from poise.live.stream import PEOPLE, Earlier, JitterBuffer, Packet, Pose, Tremble, leapt
 from poise.motion import Clip, Skeleton

@@ -13,11 +13,11 @@ import numpy as np
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
-from poise.formats import write_clip
+from poise.formats import read_clip, write_clip
 from poise.formats.own import csv_text
 from poise.formats.table import check_writable
 from poise.kinematics import qpos_to_clip
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 #: Frames that wait for the disk at most, and s between two writes.
 WAIT, EVERY_S = 900, 0.4

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live import passage as q
+from poise.live import quats as q
 from poise.live.commands import (
     JOINTS,
     name,

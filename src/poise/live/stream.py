@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from poise.errors import PoiseError
-from poise.live.passage import normalized, slerp
+from poise.live.quats import normalized, slerp
 from poise.motion import Clip, Skeleton
 
 #: Packets of one person that wait at most; the newest win.

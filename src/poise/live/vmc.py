@@ -16,7 +16,7 @@ import numpy as np
 
 from poise.body import BodyTable
 from poise.errors import PoiseError
-from poise.live import passage as q
+from poise.live import quats as q
 from poise.live.passage import FramePassage, local_of, world_of
 from poise.live.people import Elsewhere
 from poise.live.sockets import Listener

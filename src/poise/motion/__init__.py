@@ -1,6 +1,5 @@
-"""Motion data: skeletons, frozen clips, libraries of clips, and the files they come from."""
+"""Motion data: skeletons, frozen clips, libraries of clips."""
 
-from poise.formats import read_clip, write_bvh, write_clip
 from poise.motion.clip import Clip, ClipLibrary, ground_shift, resample, shifted, trim
 from poise.motion.info import describe, standing_height
 from poise.motion.roles import Role, Roles, find_roles
@@ -17,11 +16,8 @@ __all__ = [
     "describe",
     "find_roles",
     "ground_shift",
-    "read_clip",
     "resample",
     "shifted",
     "standing_height",
     "trim",
-    "write_bvh",
-    "write_clip",
 ]

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from poise.env.env import ImitationEnv
-from poise.env.snapshot import Snapshot
+from poise.env.env import ImitationEnv, Snapshot
 from poise.env.task import Acts
 from poise.errors import PoiseError
 from poise.kinematics.forward import shapes_of

@@ -456,7 +456,7 @@ class LqrTeacher:
 
         u = u_trajectory + K d, where d is how far the character is from its trajectory
 
-    A residual force is never used. A teacher for `poise.learn.clone`, and a policy that `poise.score` can
+    No residual force is used. A teacher for `poise.learn.clone`, and a policy that `poise.score` can
     score.
 
     Args:

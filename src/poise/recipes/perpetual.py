@@ -27,7 +27,7 @@ from poise.metrics import foot_points
 from poise.motion import Clip, ClipLibrary
 from poise.motion.noise import VIDEO, perturb_clip, scaled
 from poise.recipes.imitation import Clips, Imitation, fitted
-from poise.recipes.perpetual_settings import Perpetual, Recovers, RecoveryPlan
+from poise.recipes.perpetual_settings import Perpetual, Recovers
 from poise.recipes.shapes import motions_of, shaped
 
 

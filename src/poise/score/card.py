@@ -43,7 +43,7 @@ class ScoreCard:
     """The figures of one evaluation; every field is a key of `score.json`, defined in docs/metrics.md.
 
     NaN means "not measured" and becomes null. `needs` is what a motion lacks besides a floor, see
-    `kinematics.repair.needs`. `raw` is there where the motion came with noise that was taken off: the error
+    `kinematics.repair.needs`. `raw` is there where the motion came with noise that was taken off: error
     beside what came in (`mpjpe_mm`, `mpjpe_global_mm`), and that noise (`noise_mm`, and `noise_hz`, NaN
     from frame to frame). `detail` is what is left of the reference's movement at each frequency, of one
     clip that is tracked, see `metrics.detail`, and `changed` its spells that physics changed most, see

@@ -19,9 +19,8 @@ from poise.sim.guard import Cause, Failure, NanGuard, Replay, UnstableError, dia
 from poise.sim.links import Link, Place
 from poise.sim.make import check_device, make_backend
 from poise.sim.mechanics import Mechanics, difference, displaced
-from poise.sim.rows import CharacterRows
 from poise.sim.scene import Character, Scene, SceneModel, Touch, alone
-from poise.sim.scene_sim import Contact, Pull, SceneSim
+from poise.sim.scene_sim import CharacterRows, Contact, Pull, SceneSim
 from poise.sim.warp import WarpBackend
 from poise.sim.worlds import add_contact_sensors, contact_columns
 

@@ -16,11 +16,9 @@ from poise.formats.own import unpack_clips
 from poise.kinematics.directed import LIMBS, PELVIS, TouchPoint, end_of
 from poise.learn.inbetween import InbetweenModel
 from poise.motion import Clip
-from poise.motion.clip import Clip
 from poise.motion.rotations import slerp
 from poise.motion.windows import foot_joints, still_root, without_still_root
 from poise.synthesis.filler import (
-    EACH_GAP,
     Filler,
     Filling,
     Gap,

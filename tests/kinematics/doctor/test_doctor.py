@@ -22,8 +22,9 @@ from planted_faults import (
     turned,
 )
 
+from poise.formats import read_clip
 from poise.kinematics import Fault, examine, heal, swap_sides
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.rotations import quat_distance
 
 

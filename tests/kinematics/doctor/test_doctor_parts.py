@@ -13,6 +13,7 @@ from planted_faults import exchanged, lifted
 
 from poise.body import Anatomy
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.kinematics import anatomy_of, examine, find_guesses, fit_humanoid, grounded, heal, support_of
 from poise.kinematics.hold import mend_slides
 from poise.kinematics.repair.doctor import Examination, limit_faults, new_faults
@@ -21,7 +22,7 @@ from poise.kinematics.repair.speeds import trembling
 from poise.kinematics.repair.support import foot_slips, slide_faults
 from poise.kinematics.repair.timing import find_gaps, find_holds, mend_teleports
 from poise.kinematics.repair.turns import side_votes
-from poise.motion import Channel, Clip, Skeleton, Source, read_clip
+from poise.motion import Channel, Clip, Skeleton, Source
 from poise.motion.rotations import quat_mul, quat_rotate_inv, rotvec_to_quat
 from toy_human import human, swing
 

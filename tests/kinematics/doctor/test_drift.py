@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import poise
+from poise.formats import read_clip
 from poise.kinematics.repair.doctor import examine, heal
 from poise.kinematics.repair.timing import drift_faults, find_drift, mend_drift
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 WALK = Path(poise.__file__).parent / "data/walk.bvh"
 FPS = 60.0

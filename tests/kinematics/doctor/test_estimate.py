@@ -12,11 +12,12 @@ import torch
 from scipy.signal import butter, sosfiltfilt
 
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.point_fit import fit_clip
 from poise.kinematics import examine, heal
 from poise.kinematics.repair import estimate as clean
 from poise.kinematics.repair.estimate import clean_clip, denoise, find_lost, noise_faults, refill
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.keypoints import Keypoints
 from poise.motion.rotations import quat_mul, rotvec_to_quat, unwrap_quats
 from poise.motion.smoothing import Spectrum, filled, white_mm

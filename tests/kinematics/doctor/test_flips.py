@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from poise.body import find_anatomy, generate_table
+from poise.formats import read_clip
 from poise.kinematics import clean_clip, clip_to_qpos, fit_humanoid, qpos_to_clip
 from poise.kinematics.repair.speeds import TRUNK_SPEED
 from poise.kinematics.repair.turns import Flip, neutral_pose, unflip
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.rotations import quat_angle, quat_conj, quat_mul, rotvec_to_quat
 from poise.motion.smoothing import find_runs
 from toy_human import human, swing

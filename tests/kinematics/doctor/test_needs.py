@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from poise.body import BodyTable, generate_table
+from poise.formats import read_clip
 from poise.kinematics.forward import poses_of
 from poise.kinematics.ground import fit_heights
 from poise.kinematics.repair.needs import Need, find_needs
-from poise.motion import Clip, read_clip, shifted
+from poise.motion import Clip, shifted
 from toy_human import human, swing, turn
 
 FPS = 30.0

@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from poise.body import BodyTable, generate_table
+from poise.formats import read_clip
 from poise.kinematics import anatomy_of, hold_feet, lowest_height
 from poise.kinematics import hold as feet_hold
 from poise.kinematics.hold import led
 from poise.kinematics.repair.support import Support
 from poise.metrics import foot_slide
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 
 
 @pytest.fixture(scope="module")

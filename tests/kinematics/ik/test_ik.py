@@ -12,8 +12,9 @@ from paper_humanoid import body_points, count_jumps, paper_humanoid
 import toy_human
 from poise.body import generate_table, make_humanoid
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.kinematics import IkBody, IkConfig, Kinematics, analytic_ik, clip_ik, clip_to_qpos, ik_body
-from poise.motion import Skeleton, read_clip
+from poise.motion import Skeleton
 from poise.motion.rotations import normalize, quat_angle, quat_conj, quat_mul, quat_to_matrix
 
 FILES = (

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from walker import hops, in_place, leap, played, walk
 
+from poise.formats import read_clip
 from poise.kinematics import examine, find_faults, find_guesses, fit_humanoid
 from poise.kinematics.rate import RateJudgement, Reason, judge_rate
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from toy_human import swing
 
 MOTIONS = {"walk": walk, "hops": hops, "leap": leap}

@@ -10,6 +10,7 @@ import torch
 
 from poise.body import BodyTable, generate_table
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.point_fit import fit_clip
 from poise.formats.point_raw import assemble_points
 from poise.formats.point_tables import trc_points
@@ -17,7 +18,7 @@ from poise.formats.raw import ReadOptions as Options
 from poise.kinematics import RetargetConfig, retarget
 from poise.kinematics.ground import fit_heights
 from poise.kinematics.retarget.keypoint_goal import KeypointStream, PointBody, StreamConfig
-from poise.motion import Clip, read_clip, resample, trim
+from poise.motion import Clip, resample, trim
 from poise.motion.keypoints import Keypoints
 from toy_human import swing
 

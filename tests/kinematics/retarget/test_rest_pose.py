@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from poise.errors import PoiseError
+from poise.formats import read_clip, write_clip
 from poise.kinematics import find_guesses, with_rest_pose
-from poise.motion import Clip, Skeleton, read_clip, trim, write_clip
+from poise.motion import Clip, Skeleton, trim
 from poise.motion.roles import SIDES, find_roles
 from poise.motion.rotations import normalize, quat_between, quat_mul, quat_rotate_inv
 from toy_human import swing

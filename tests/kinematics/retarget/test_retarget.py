@@ -11,13 +11,14 @@ import torch
 
 from poise.body.topology import subtree
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.kinematics import RetargetConfig, retarget
 from poise.kinematics.feet import rest_height
 from poise.kinematics.limbs import match_positions
 from poise.kinematics.retarget.common_pose import common_pose
 from poise.kinematics.retarget.plant import BLEND_S, contact_weight
 from poise.kinematics.retarget.standing import World, hinge_axis
-from poise.motion import Clip, Skeleton, find_roles, read_clip, resample, trim
+from poise.motion import Clip, Skeleton, find_roles, resample, trim
 from poise.motion.rotations import (
     euler_to_quat,
     normalize,

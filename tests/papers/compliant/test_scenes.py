@@ -16,10 +16,10 @@ from poise.env.events import InScene, ScenePart
 from poise.env.pushes import Push
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.open import open_run
 from poise.jobs.track import imitation_of
 from poise.jobs.track.placement import place
-from poise.motion import read_clip
 from poise.papers.compliant.scenes import (
     SCENES,
     Balance,

@@ -14,8 +14,9 @@ from poise.body import Humanoid
 from poise.control import PDTargets
 from poise.env import frame as observables
 from poise.env.frame import Frame, Layout, LazyPose, Observable, PointGoal, Pose
-from poise.env.plugins import Plugin, Start
+from poise.env.plugins import Plugin
 from poise.env.recovery.falls import Drop, fall_states, rest_angles
+from poise.env.reference import Start
 from poise.errors import PoiseError
 from poise.sim import Backend
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 import torch
@@ -15,13 +15,9 @@ from torch import Tensor
 from poise.body import Humanoid
 from poise.errors import PoiseError
 from poise.learn.checkpoint import load_checkpoint, load_module, prefixed, save_checkpoint, take
-from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, make_cvae
+from poise.learn.cvae import CVAE, CosineCVAE, CVAEConfig, Frames, make_cvae
 from poise.settings import from_data
 from poise.synthesis.generator import ROOT, Codes, Kinematic
-
-if TYPE_CHECKING:
-    from poise.jobs.endless.training import Motions
-
 
 #: The file in a run's folder.
 GENERATOR = "generator.safetensors"
@@ -230,3 +226,36 @@ def clips_of_seeds(motions: Motions, past: int) -> Tensor:
 def spread(count: int, most: int) -> Tensor:
     """At most so many of `count` numbers from 0 on, evenly spread."""
     return torch.tensor(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
+#: Share of the mean weight that every number has.
+LEAST = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """A library as a kinematic policy learns it.
+
+    Attributes:
+        frames: windows of frames that know no place, see `synthesis.generator`.
+        seeds: `(S, p, 7 + n)` pasts of the library, evenly spread.
+        bounds: `(2, n)` rad, least and most of each hinge.
+        reach: `(10 + n)` m, how far a deviation of each number moves the body, see `reach_of`.
+        hinges: names.
+        fps: frames a second.
+        clips: names.
+    """
+
+    frames: Frames
+    seeds: Tensor
+    bounds: Tensor
+    reach: Tensor
+    hinges: tuple[str, ...]
+    fps: float
+    clips: tuple[str, ...]
+
+    @property
+    def weights(self) -> Tensor:
+        """Of the squares of a frame's numbers: all hinges are not worth the same."""
+        share = self.reach.square() / self.reach.square().mean()
+        return (share + LEAST) / (1 + LEAST)

@@ -19,6 +19,7 @@ from poise.jobs.endless.model import (
     GENERATOR,
     GeneratorModel,
     Label,
+    Motions,
     clips_of_seeds,
     kinds_of,
     names_of,
@@ -40,8 +41,8 @@ from poise.synthesis.generator import ROOT, Codes, coordinates, features_of
 SEEDS = 256
 #: Windows below which a library is too small.
 LEAST_WINDOWS = 50
-#: Share of the mean weight that every number has, and how long velocities are thought to last, s.
-LEAST, LASTS = 0.3, 0.5
+#: How long velocities are thought to last, s.
+LASTS = 0.5
 
 
 @dataclass(frozen=True)
@@ -77,35 +78,6 @@ class Endless:
     def paper(cls) -> Endless:
         """What the paper states: 1,000 epochs of 10,000 windows in minibatches of 256."""
         return cls(CVAEConfig(), CVAETraining.paper(), steps=40_000, ema=0.0, codes=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Motions:
-    """A library as a kinematic policy learns it.
-
-    Attributes:
-        frames: windows of frames that know no place, see `synthesis.generator`.
-        seeds: `(S, p, 7 + n)` pasts of the library, evenly spread.
-        bounds: `(2, n)` rad, least and most of each hinge.
-        reach: `(10 + n)` m, how far a deviation of each number moves the body, see `reach_of`.
-        hinges: names.
-        fps: frames a second.
-        clips: names.
-    """
-
-    frames: Frames
-    seeds: Tensor
-    bounds: Tensor
-    reach: Tensor
-    hinges: tuple[str, ...]
-    fps: float
-    clips: tuple[str, ...]
-
-    @property
-    def weights(self) -> Tensor:
-        """Of the squares of a frame's numbers: all hinges are not worth the same."""
-        share = self.reach.square() / self.reach.square().mean()
-        return (share + LEAST) / (1 + LEAST)
 
 
 def motions_of(

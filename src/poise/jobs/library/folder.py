@@ -2,7 +2,7 @@
 
 Perpetual Humanoid Control (Luo et al. 2023, section 4) trains on AMASS without the sequences in which
 a performer sits on furniture, hangs or is carried, by a list made by hand. Here rules tell them
-(`kinematics.repair`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules them.
+(`kinematics.repair`), each clip that is cut or left out says why, and `LibraryConfig.keep` overrules.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 
 from poise.env import Reference
+from poise.jobs.open import policy_of_run
 from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.jobs.perpetual.run import PerpetualResult, begin, going_on, train
 from poise.jobs.perpetual.stage_order import Progress
@@ -17,11 +18,10 @@ from poise.jobs.run_file import RUN_FILE, read_run
 from poise.jobs.runs import evaluate
 from poise.jobs.track.controllers import RULE
 from poise.jobs.track.placement import Placed, place
-from poise.jobs.track.story import needs_of
 from poise.jobs.track.supports import Wanted, with_supports
-from poise.jobs.track.tracked import Tracked
+from poise.jobs.track.tracked import Tracked, needs_of
 from poise.jobs.track.tracking import imitation_of
-from poise.jobs.tracker import Tracker, policy_of_run
+from poise.jobs.tracker import Tracker
 from poise.jobs.warm_start import widened
 from poise.kinematics.repair.estimate import clean_clip
 from poise.learn import LATEST, PolicyBundle, Until

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from poise.recipes.imitation import Imitation
 from poise.score import ClipJudge, simulate
 
 if TYPE_CHECKING:
-    from poise.jobs.track.settings import TrackConfig
+    from poise.jobs.track.settings import Mode, TrackConfig
 
 
 #: The rates that a lost motion is tried at, over its own, if files have them within `USUAL`.
@@ -126,9 +126,6 @@ def _done(task: Imitation, acts: Acts, show: Show | None = None, what: str = "")
     return bool(judge.alive.all())
 
 
-#: What becomes of a clip in place: "keep" simulates it as it is, "travel" writes it
-#: with its travel, "auto" writes it in place again.
-Mode = Literal["auto", "keep", "travel"]
 #: A loop is simulated for this long (s), as at least and at most so many periods.
 LOOP_S, LEAST, MOST = 4.0, 4, 10
 

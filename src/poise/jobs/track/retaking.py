@@ -14,12 +14,13 @@ from torch import Tensor
 from poise.env import Acts, ImitationEnv, Reference
 from poise.env.recovery.clips import mixed
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.jobs.track.controllers import RULE, Done, Show, Told, episode, look_ahead
 from poise.jobs.track.settings import TrackConfig
 from poise.jobs.track.simulation import Retake, Simulation, States
 from poise.jobs.tracker import Tracker
 from poise.metrics import has_lost, mpjpe_global, success_rule
-from poise.motion import Clip, read_clip
+from poise.motion import Clip
 from poise.motion.rotations import slerp
 from poise.plan import Lookahead
 from poise.plan.lookahead import PAST

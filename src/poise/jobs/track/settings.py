@@ -8,7 +8,6 @@ from typing import Literal
 from poise.errors import PoiseError
 from poise.jobs.track.direction import Direction
 from poise.jobs.track.pushed import PushConfig
-from poise.jobs.track.rates import Mode
 from poise.jobs.track.simulation import Retake
 from poise.kinematics.supports import Support
 from poise.motion.noise import Noise
@@ -139,3 +138,8 @@ class TrackConfig:
         """Whether what is lost is searched."""
         single = not (self.recover or self.reset_on_fail or self.count > 1 or self.push)
         return self.controller == "search" or (self.controller == "auto" and single)
+
+
+#: What becomes of a clip in place: "keep" simulates it as it is, "travel" writes it
+#: with its travel, "auto" writes it in place again.
+Mode = Literal["auto", "keep", "travel"]

@@ -18,6 +18,7 @@ from torch import Tensor
 from poise.body.humanoid import make_humanoid
 from poise.env import Reference
 from poise.errors import PoiseError
+from poise.formats import read_clip
 from poise.formats.raw import ReadOptions
 from poise.jobs.open import Run, open_run
 from poise.jobs.runs import Evaluation, scored
@@ -27,15 +28,23 @@ from poise.jobs.track.pushed import with_push
 from poise.jobs.track.rates import InPlace, rate_doubts, rate_notes, with_travel
 from poise.jobs.track.retaking import retaken
 from poise.jobs.track.settings import TrackConfig
-from poise.jobs.track.story import Span, cut, needs_of, parts_of, with_parts
 from poise.jobs.track.supports import places, with_supports
-from poise.jobs.track.tracked import Clean, Tracked, beside_raw
+from poise.jobs.track.tracked import (
+    Clean,
+    Span,
+    Tracked,
+    beside_raw,
+    cut,
+    needs_of,
+    parts_of,
+    with_parts,
+)
 from poise.jobs.tracker import Tracker
 from poise.kinematics.fit import widen
 from poise.kinematics.rate import settled
 from poise.kinematics.supports import Support
 from poise.metrics import detail, deviations, has_lost, mpjpe_global
-from poise.motion import Clip, ClipLibrary, read_clip
+from poise.motion import Clip, ClipLibrary
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import perturb_clip, perturb_points
 from poise.recipes import perpetual as task
@@ -62,7 +71,7 @@ def track(
     """Lets a trained policy do a motion that it need not know, without help and without training.
 
     The motion is tracked from its first frame to its last. Keypoints reach a policy with goals of
-    keypoints frame by frame (`kinematics.retarget`); any other policy gets the clip that is fitted to them.
+    keypoints frame by frame (`kinematics.retarget`); any other gets the clip that is fitted to them.
 
     Args:
         clip: a clip, keypoints, or a file; keypoints in a file stay keypoints. Several of them are done

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from poise.control import Compliance, Stiffness
-from poise.env import ImitationEnv, Reference
+from poise.env import Reference
 from poise.env.controls import steps
 from poise.env.env import ImitationEnv
 from poise.env.events import InScene, touches_of
 from poise.env.frame import Frame, Observable
 from poise.env.goal import Goal
-from poise.env.plugins import Plugin, Start
+from poise.env.plugins import Plugin
+from poise.env.reference import Start
 from poise.env.task import Acts, EnvStep
 from poise.env.yielding import DisplacedGoal
 from poise.errors import PoiseError

@@ -12,7 +12,7 @@ import numpy as np
 
 from poise.errors import PoiseError
 from poise.formats.text import write_whole
-from poise.score.report.data import Report, Shape, Track, body_weight, number, payload, safe_json
+from poise.score.report.data import Report, body_weight, number, payload, safe_json
 from poise.score.report.svg import bar_plot, line_plot
 from poise.score.report.verdict import cut, grades, overall, percent, sentence
 
