@@ -22,8 +22,8 @@ from poise.kinematics import qpos_velocity
 from poise.learn.cvae import CVAEConfig, CVAEObjective, CVAETraining, make_cvae
 from poise.learn.inbetween import InbetweenTrainer
 from poise.motion import ClipLibrary
-from poise.recipes import perpetual as universal_task
 from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import task as universal_task
 from poise.recipes.residual_force import ResidualForce, task
 from poise.score import Nothing
 from poise.synthesis.generator import ROOT, Kinematic

@@ -22,8 +22,7 @@ from poise.jobs.perpetual.evaluation import evaluate_clips
 from poise.learn import ConvergenceConfig, Until
 from poise.learn.composer import Composer
 from poise.motion import ClipLibrary
-from poise.recipes import perpetual as task
-from poise.recipes.perpetual import build
+from poise.recipes.perpetual import build, task
 from poise.recipes.perpetual_settings import Perpetual
 from poise.recipes.shapes import BodyShapes, shaped
 from toy_policy import PPO, toy_run, walk

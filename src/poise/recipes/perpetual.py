@@ -13,9 +13,7 @@ from torch import Tensor
 from poise.body import BodyTable, Humanoid
 from poise.control import Compliance, ImplicitResidual, PDTargets, SuccessHelp, range_scale
 from poise.env import DoneTerm, ObsTerm, Recovery, Reference, RewardTerm, TaskConfig
-from poise.env import observations as phc_obs
-from poise.env import rewards as done
-from poise.env import rewards as phc_reward
+from poise.env import observations as obs
 from poise.env import rewards as reward
 from poise.env.pushes import Pushes
 from poise.env.recovery.clips import QUICK, RecoveryClips, find_recovery_clips
@@ -153,11 +151,11 @@ def task(config: Perpetual, humanoid: Humanoid, guided: bool = False) -> TaskCon
 def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None) -> TaskConfig:
     """The task of a stage that learns to recover as PHC's recovery "primitive" or as its "composer", or
     tracks alone (None). The observations are of the same size in all of them."""
-    own = (ObsTerm("self_state", phc_obs.self_state),)
+    own = (ObsTerm("self_state", obs.self_state),)
     if config.shape or config.shapes.several:
-        own += (ObsTerm("shape", phc_obs.shape, {"sizes": phc_obs.shape_of(humanoid)}),)
+        own += (ObsTerm("shape", obs.shape, {"sizes": obs.shape_of(humanoid)}),)
     left = None if config.heading == "twist" else torch.tensor(humanoid.left)
-    goal = phc_obs.rotation_goal if config.goal == "rotations" else phc_obs.keypoint_goal
+    goal = obs.rotation_goal if config.goal == "rotations" else obs.keypoint_goal
     limit, gamma = config.help_start, config.ppo.gamma
     recovery = None
     if recovers is not None:
@@ -181,8 +179,8 @@ def stage_task(config: Perpetual, humanoid: Humanoid, recovers: Recovers | None)
         first=config.first,
         adaptive=config.adaptive_sampling,
         adaptive_over=config.adaptive_over,
-        style=phc_obs.style_terms(humanoid) if config.style else (),
-        velocities=phc_obs.velocity_columns(
+        style=obs.style_terms(humanoid) if config.style else (),
+        velocities=obs.velocity_columns(
             len(humanoid.bodies), shape=len(own) > 1, rotations=config.goal == "rotations"
         ),
         recovery=recovery,
@@ -198,11 +196,11 @@ def _more_seen(config: Perpetual, humanoid: Humanoid) -> tuple[ObsTerm, ...]:
         "turns": config.goal == "rotations",
     }
     later = tuple(
-        ObsTerm(f"goal_in_{k}", phc_obs.goal_later, {"step": i, **given})
+        ObsTerm(f"goal_in_{k}", obs.goal_later, {"step": i, **given})
         for i, k in enumerate(config.window)
     )
-    last = (ObsTerm("last_action", phc_obs.last_action),) if config.filter else ()
-    yields = (ObsTerm("yielding", phc_obs.yielding),) if config.pushes else ()
+    last = (ObsTerm("last_action", obs.last_action),) if config.filter else ()
+    yields = (ObsTerm("yielding", obs.yielding),) if config.pushes else ()
     return (*last, *later, *yields)
 
 
@@ -221,25 +219,23 @@ def pushed(task: TaskConfig, config: Perpetual, humanoid: Humanoid) -> TaskConfi
 
 def _rewards(config: Perpetual, humanoid: Humanoid, recovers: bool) -> tuple[RewardTerm, ...]:
     """Eqs. 1 and 2, ours, and where recovery is learned Eq. 4."""
-    rewards = phc_reward.imitation_terms(config.faithful)
+    rewards = reward.imitation_terms(config.faithful)
     if config.root:
-        rewards += (RewardTerm("root_position", phc_reward.root_position, config.root),)
+        rewards += (RewardTerm("root_position", reward.root_position, config.root),)
     halved = config.style.task_weight if config.style else 1.0
     if config.energy:
-        rewards += (phc_reward.energy_term(halved, config.energy_form, config.energy),)
+        rewards += (reward.energy_term(halved, config.energy_form, config.energy),)
     if config.action_rate:
-        rewards += (phc_reward.cost_term(phc_reward.action_rate, config.action_rate, halved),)
+        rewards += (reward.cost_term(reward.action_rate, config.action_rate, halved),)
     if config.torque_rate:
         limits = torch.tensor(humanoid.model.actuator_forcerange[:, 1]).float()
-        rewards += (
-            phc_reward.cost_term(phc_reward.torque_rate, config.torque_rate, halved, limits=limits),
-        )
+        rewards += (reward.cost_term(reward.torque_rate, config.torque_rate, halved, limits=limits),)
     if config.acceleration:
-        rough = phc_reward.cost_term(phc_reward.acceleration, config.acceleration, halved)
+        rough = reward.cost_term(reward.acceleration, config.acceleration, halved)
         rewards += (replace(rough, when="near"),)
     if config.foot_slide:
         soles = _soles(humanoid)
-        rewards += (phc_reward.cost_term(phc_reward.foot_slide, config.foot_slide, halved, **soles),)
+        rewards += (reward.cost_term(reward.foot_slide, config.foot_slide, halved, **soles),)
     if config.help_start:
         rewards += (RewardTerm("residual", reward.residual, 0.1, imitation=False),)
     return recovery_terms(rewards, config.faithful) if recovers else rewards
@@ -269,11 +265,11 @@ def _help(config: Perpetual) -> SuccessHelp:
 def _failure(config: Perpetual, humanoid: Humanoid) -> DoneTerm:
     """When an episode of training has failed."""
     if config.termination == "all":
-        return DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5})
-    free = {"bodies": done.all_but_feet(humanoid)}
+        return DoneTerm("bodies_too_far", reward.bodies_too_far, {"limit": 0.5})
+    free = {"bodies": reward.all_but_feet(humanoid)}
     if config.termination == "code":
-        return DoneTerm("any_body_too_far", done.any_body_too_far, {**free, "limit": 0.25, "grace": 1})
-    return DoneTerm("bodies_too_far", done.bodies_too_far, {**free, "limit": 0.5})
+        return DoneTerm("any_body_too_far", reward.any_body_too_far, {**free, "limit": 0.25, "grace": 1})
+    return DoneTerm("bodies_too_far", reward.bodies_too_far, {**free, "limit": 0.5})
 
 
 def _targets(config: Perpetual, humanoid: Humanoid) -> PDTargets:

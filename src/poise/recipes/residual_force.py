@@ -34,9 +34,7 @@ from poise.control import (
     SuccessHelp,
 )
 from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
-from poise.env import observations as next_frames
 from poise.env import observations as obs
-from poise.env import rewards as done
 from poise.env import rewards as reward
 from poise.env.frame import TermFunction
 from poise.learn import PPOConfig
@@ -249,13 +247,13 @@ def observations(config: ResidualForce, humanoid: Humanoid, frames: int) -> tupl
         return out
     # Where there is no head, the pelvis takes its place.
     head = {"head": humanoid.head or 0}
-    out += (ObsTerm("joints_from_head", next_frames.joints_from_head, head),)
+    out += (ObsTerm("joints_from_head", obs.joints_from_head, head),)
     for k in range(frames):
         at = {"step": k}
         out += (
-            ObsTerm(f"angles_{k + 1}", next_frames.next_angles, at),
-            ObsTerm(f"joints_{k + 1}", next_frames.next_joints, at | head),
-            ObsTerm(f"velocities_{k + 1}", next_frames.next_velocities, at),
+            ObsTerm(f"angles_{k + 1}", obs.next_angles, at),
+            ObsTerm(f"joints_{k + 1}", obs.next_joints, at | head),
+            ObsTerm(f"velocities_{k + 1}", obs.next_velocities, at),
         )
     return out
 
@@ -268,9 +266,9 @@ def task(config: ResidualForce, humanoid: Humanoid) -> TaskConfig:
         weight = 0.05 if config.faithful == "code" else 0.1
         rewards += (RewardTerm("residual", reward.residual, weight, imitation=False),)
     dones = {
-        "bodies": DoneTerm("bodies_too_far", done.bodies_too_far, {"limit": 0.5}),
-        "height": DoneTerm("root_too_low", done.root_too_low, {"margin": 0.1}),
-        "below": DoneTerm("root_below", done.root_below, {"margin": 0.5}),
+        "bodies": DoneTerm("bodies_too_far", reward.bodies_too_far, {"limit": 0.5}),
+        "height": DoneTerm("root_too_low", reward.root_too_low, {"margin": 0.1}),
+        "below": DoneTerm("root_below", reward.root_below, {"margin": 0.5}),
     }
     frames = {"next frame": (1,), "next two": (1, 2)}.get(config.observation, ())
     return TaskConfig(

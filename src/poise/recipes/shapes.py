@@ -26,7 +26,7 @@ from torch import Tensor
 from poise.body import BodyTable, Humanoid, make_humanoid
 from poise.body.table import BodyRow, Geom, Strength
 from poise.env import Reference, TaskConfig
-from poise.env import observations as phc_obs
+from poise.env import observations as obs
 from poise.errors import PoiseError
 from poise.kinematics import clean_clip, place_on_body
 from poise.kinematics.fit import widen
@@ -192,7 +192,7 @@ def _finished(
     bodies = [make_humanoid(s, t) for s, t in zip(skeletons, tables, strict=True)]
     reference = Reference(bodies[0], motions, rate, library.names, cyclic, bodies, body)
     task = make_task(bodies[0])
-    if not any(term.fn is phc_obs.shape for term in task.obs):
+    if not any(term.fn is obs.shape for term in task.obs):
         raise PoiseError(
             f"a policy for {len(bodies)} bodies must observe them", hint="Set Perpetual(shape=True)"
         )

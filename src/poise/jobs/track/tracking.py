@@ -47,8 +47,8 @@ from poise.metrics import detail, deviations, has_lost, mpjpe_global
 from poise.motion import Clip, ClipLibrary
 from poise.motion.keypoints import Keypoints
 from poise.motion.noise import perturb_clip, perturb_points
-from poise.recipes import perpetual as task
 from poise.recipes.imitation import Imitation
+from poise.recipes.perpetual import task
 from poise.settings import changed
 
 #: What the score of a motion with a push is against.

@@ -15,7 +15,7 @@ from poise.body import BodyConfig, Humanoid
 from poise.control import Compliance, PDTargets
 from poise.env import DoneTerm, ObsTerm, RewardTerm, TaskConfig
 from poise.env import observations as obs
-from poise.env import rewards as done
+from poise.env import rewards as reward
 from poise.env.frame import Frame
 from poise.env.pushes import Pushes
 from poise.env.rewards import pose
@@ -168,8 +168,8 @@ def task(config: CompliantImitation, humanoid: Humanoid) -> TaskConfig:
         obs=observations(config),
         rewards=(RewardTerm(paid.__name__, paid, 1.0),),
         dones=(
-            DoneTerm("root_below", done.root_below, {"margin": 0.35}),
-            DoneTerm("root_far", done.bodies_too_far, {"limit": 1.0, "bodies": root}),
+            DoneTerm("root_below", reward.root_below, {"margin": 0.35}),
+            DoneTerm("root_far", reward.bodies_too_far, {"limit": 1.0, "bodies": root}),
         ),
         pd=PDTargets(config.action),
         horizon=config.horizon,
