@@ -1,5 +1,6 @@
 """What a term sees: the simulated and the reference character at one control step, by name."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

@@ -1,5 +1,6 @@
 """Which supports a motion needs: found by inverse dynamics, where floor and feet cannot bear it."""
 
+# pyright: reportMissingTypeStubs=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

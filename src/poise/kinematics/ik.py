@@ -1,5 +1,6 @@
 """Analytic inverse kinematics: from joint positions to hinge angles, and the last millimetres."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import time

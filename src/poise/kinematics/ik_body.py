@@ -1,6 +1,6 @@
 """What inverse kinematics must know of a humanoid, and the plane in which a limb bends."""
 
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from __future__ import annotations
 
 import math

@@ -1,5 +1,6 @@
 """The frame rate that a motion has by physics: how it falls, balances, walks; and the judgement."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

@@ -1,5 +1,6 @@
 """Trains, stores and adapts a network of kinematic motion."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import copy
@@ -147,7 +148,8 @@ class InbetweenTrainer:
         # The first steps would otherwise weigh as much as a thousand later ones.
         keep = min(self.ema, (1 + self.step) / (10 + self.step))
         own = self.objective.modules()["net"]
-        torch._foreach_lerp_(list(self.averaged.parameters()), list(own.parameters()), 1 - keep)
+        for a, b in zip(self.averaged.parameters(), own.parameters(), strict=True):
+            a.lerp_(b, 1 - keep)
         for a, b in zip(self.averaged.buffers(), own.buffers(), strict=True):
             a.copy_(b)
 

@@ -1,5 +1,6 @@
 """Runs a trainer until a limit, with checkpoints, logs and a polite Ctrl-C."""
 
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 from __future__ import annotations
 
 import csv

@@ -1,5 +1,6 @@
 """Errors of pose estimators, made on purpose: kinds, their composition, ladders of strength."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

@@ -1,5 +1,6 @@
 """Perpetual Humanoid Control: one policy for a whole library."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 from collections.abc import Sequence

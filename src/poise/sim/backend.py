@@ -1,5 +1,6 @@
 """What a simulator must offer: the Backend protocol, the state that it shows, physics settings."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable

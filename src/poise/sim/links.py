@@ -1,5 +1,6 @@
 """Links of a scene, bodies that hold one another, and where each thing stands in the model's arrays."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -1,5 +1,6 @@
 """Props of a scene: whatever is no character."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 from collections import Counter

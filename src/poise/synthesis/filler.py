@@ -1,5 +1,6 @@
 """Gaps between keyframes, and how a network's frames fill one at the clip's own rate, in variants."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

@@ -1,5 +1,6 @@
 """How characters go about without end, and what they did: motion, figures, files written meanwhile."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import json

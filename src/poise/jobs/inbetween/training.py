@@ -115,7 +115,7 @@ def motion_files(library: Path) -> list[Path]:
 
 def read_all(files: list[Path], tell: Callable[[str], None]) -> tuple[list[Clip], tuple[str, ...]]:
     """The clips of all files that can be read, and a sentence for each of the others."""
-    clips, notes = [], []
+    clips, notes = list[Clip](), list[str]()
     for k, file in enumerate(files, 1):
         try:
             clips.append(read_clip(file))

@@ -1,5 +1,6 @@
 """What came of tracking: the motion, its score, its files, each part of a chain, told in a sentence."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import math

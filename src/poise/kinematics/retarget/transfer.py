@@ -1,5 +1,6 @@
 """A motion on another skeleton: the same directions of all bones, the same steps, at its own size."""
 
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 from __future__ import annotations
 
 import itertools
