@@ -45,19 +45,20 @@ def record(plain: TensorFunction, given: tuple[Tensor, ...]) -> TensorFunction:
     It is the same operations in the same order, without Python's share: half of the time for hundreds
     of worlds, most of it for one. It runs in torch's inference mode: copy what it makes before giving
     it to code that may want gradients. A function with operations that depend on values, such as an `if`
-    on a tensor, cannot be recorded: it is given back as it is.
+    on a tensor, cannot be recorded: it is given back as it is, as every function is where torch has
+    renamed what records and replays, which belongs to its inner parts.
     """
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
             graph = _traced(plain, given)
-        except RuntimeError:
+            _drop_whole_slices(graph)
+            recorded = torch._C._create_function_from_graph("replayed", graph)
+        except (RuntimeError, AttributeError, TypeError):
             return plain
     # What a recording would freeze, such as a value that was asked for, torch only warns of.
     if any(issubclass(w.category, torch.jit.TracerWarning) for w in told):
         return plain
-    _drop_whole_slices(graph)
-    recorded = torch._C._create_function_from_graph("replayed", graph)
 
     def replay(*given: Tensor) -> tuple[Tensor, ...]:
         # What every operation otherwise notes for gradients is a sixth of the time of one world.
